@@ -1,0 +1,49 @@
+"""Result codes of numerical work: one per lane of a batch, the first failure wins."""
+
+import enum
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+
+class Result(enum.IntEnum):
+    """What became of one trajectory, experiment or solve. `Result.OK` is success."""
+
+    OK = 0
+    SECTION_MISSED = 1
+    EVENT_MISSED = 2
+    EVENT_ORDER = 3
+    GRAZING = 4
+    ZENO = 5
+    BLOW_UP = 6
+    STEP_LIMIT = 7
+    NOT_CONVERGED = 8
+    SINGULAR = 9
+    BAD_INPUT = 10
+
+    @property
+    def message(self) -> str:
+        """One sentence for people."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Result.OK: "ok",
+    Result.SECTION_MISSED: "the section was not crossed within the time allowed",
+    Result.EVENT_MISSED: "the planned event did not happen within the time allowed",
+    Result.EVENT_ORDER: "events came in another order than on the limit cycle",
+    Result.GRAZING: "a guard or section was touched tangentially (grazing)",
+    Result.ZENO: "events accumulate in finite time (Zeno)",
+    Result.BLOW_UP: "the state left all bounds, or the field returned NaN or infinity",
+    Result.STEP_LIMIT: "the limit on steps was reached",
+    Result.NOT_CONVERGED: "the iteration did not converge",
+    Result.SINGULAR: "J - I is singular: the cycle is not isolated",
+    Result.BAD_INPUT: "the start or the input is NaN or infinite",
+}
+
+
+def update_result(
+    result: Int[Array, "*lanes"], failed: Bool[Array, "*lanes"], code: Result
+) -> Int[Array, "*lanes"]:
+    """Record `code` where `failed`, unless an earlier failure is there already."""
+    return jnp.where((result == Result.OK) & failed, jnp.int32(code), result)
