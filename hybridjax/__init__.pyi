@@ -8,5 +8,7 @@ from ._core.errors import (
 )
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
+from .periodic.htf import HTF as HTF
+from .periodic.ldtp import LDTP as LDTP
 
 __version__: str
