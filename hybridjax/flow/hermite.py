@@ -1,0 +1,84 @@
+"""Zero crossings of the cubic Hermite interpolant of a guard over one step.
+
+The interpolant is cut at its extrema into at most three monotone pieces, so that the first
+crossing is found also where the guard dips below zero and returns within the step.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+# An extremum within this fraction of the guard's values at the step's ends is a touch (grazing) ...
+TOUCH = 1e-10
+# ... and within this fraction a near miss, which a shorter step must settle.
+NEAR = 1e-2
+
+
+class Crossing(NamedTuple):
+    """What a guard does within a step."""
+
+    s: Float[Array, " L"]
+    """Position of the first falling zero as a fraction of the step; infinity if there is none."""
+    touch: Bool[Array, " L"]
+    """The guard touches zero without a clear crossing."""
+    near: Bool[Array, " L"]
+    """It comes so close to zero without crossing that the interpolant cannot be trusted."""
+
+
+def first_crossing(
+    v0: Float[Array, " L"],
+    v1: Float[Array, " L"],
+    d0: Float[Array, " L"],
+    d1: Float[Array, " L"],
+    armed: Bool[Array, " L"],
+) -> Crossing:
+    """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
+
+    A guard that is not armed at the start counts only after it has become positive.
+    """
+    rise = v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
+
+    def cubic(s):
+        return v0 + s * (d0 + s * (b + s * c))
+
+    def slope(s):
+        return d0 + s * (2 * b + s * 3 * c)
+
+    # Extrema: roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
+    disc = b * b - 3 * c * d0
+    pivot = -(b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(disc, 0.0)))
+    r1 = _divide(pivot, 3 * c)
+    r2 = _divide(d0, pivot)
+    r1, r2 = (jnp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
+    sa, sb = jnp.minimum(r1, r2), jnp.maximum(r1, r2)
+    va, vb = jnp.where(sa < 1, cubic(sa), v1), jnp.where(sb < 1, cubic(sb), v1)
+
+    first = armed & (va <= 0)
+    second = (va > 0) & (vb <= 0) & (sb > sa)
+    third = (vb > 0) & (v1 <= 0) & (sb < 1)
+    lo = jnp.where(first, 0.0, jnp.where(second, sa, sb))
+    hi = jnp.where(first, sa, jnp.where(second, sb, 1.0))
+    found = first | second | third
+
+    s = 0.5 * (lo + hi)
+    for _ in range(10):  # Newton, kept inside the shrinking bracket
+        value = cubic(s)
+        lo, hi = jnp.where(value > 0, s, lo), jnp.where(value > 0, hi, s)
+        newton = s - _divide(value, slope(s))
+        s = jnp.where((newton >= lo) & (newton <= hi), newton, 0.5 * (lo + hi))
+
+    scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
+    touch = near = jnp.zeros_like(armed)
+    for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
+        dips = before & (node < 1) & (b + 3 * c * node > 0)
+        touch = touch | (dips & (jnp.abs(value) <= TOUCH * scale))
+        near = near | (dips & (value > 0) & (value < NEAR * scale))
+    return Crossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
+
+
+def _divide(a, b):
+    return jnp.where(b == 0, jnp.inf, a / jnp.where(b == 0, 1.0, b))

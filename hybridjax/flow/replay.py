@@ -1,0 +1,86 @@
+"""Differentiable flow: the moves on a tape, repeated.
+
+What a search decided (step sizes, the order of events) is fixed here; only smooth arithmetic is
+left, so that this function has exact derivatives in forward and reverse mode. The times of
+crossings follow from two Newton steps on the true guard, which is the saltation formula.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..systems.structure import Structure
+from ..systems.transition import Scheduled
+from .lanes import for_each_chart, Lanes, only
+from .search import apply_resets, ARRIVE_LEVEL, ARRIVE_TIME, chart_field, IDLE, settle
+from .step import rk_step
+from .target import Target
+
+
+def replay(
+    s: Structure,
+    lanes: Lanes,
+    u: Float[Array, "nu L"],
+    target: Target,
+    h: Float[Array, "R L"],
+    code: Int[Array, "R L"],
+) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
+    """Times and states at the end of the moves `h` with outcomes `code` (see `search.Tape`)."""
+    scheduled = jnp.array([isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False])
+
+    def row(carry, row):
+        h, code = row
+
+        def move(carry):
+            t, q, chart = carry
+            by_clock = (code >= 0) & scheduled[code]
+            due = _scheduled_time(s, code, t + h)
+            h1 = jnp.where(code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h))
+            which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
+            which = jnp.where(by_clock, -1, which)
+            t, q = _advance(s, t, q, chart, code != IDLE, u, target, h1, which)
+            fired = jnp.maximum(code, -1)
+            moved = Lanes(t, chart, q, lanes.armed, lanes.events, lanes.pace)
+            q, chart = jax.lax.cond(
+                (fired >= 0).any(),
+                lambda: apply_resets(s, moved, fired, u),
+                lambda: (q, chart),
+            )
+            return t, q, chart
+
+        return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
+
+    (t, q, _), _ = jax.lax.scan(row, (lanes.t, lanes.q, lanes.chart), (h, code))
+    return t, q
+
+
+def _advance(s, t, q, chart, moves, u, target, h, which):
+    """A step of every lane that moves, ended on the zero of its crossing function, if any."""
+
+    def work(a, here, out):
+        t_out, q_out = out
+        n = s.dims[a]
+        t0, q0, u0 = only(here, t), only(here, q[:n]), only(here, u)
+        h0, index = only(here, h), only(here, target.index)
+        crossing = jnp.where(here, which, -1)
+        q1, t1 = rk_step(chart_field(s, a, u0), t0, q0, h0).q, t0 + h0
+
+        def land():
+            past, q2, *_ = settle(s, a, t1, q1, u0, index, crossing, target)
+            return t1 + past, q2
+
+        t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
+        return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+
+    return for_each_chart(s, chart, moves, work, (t, q))
+
+
+def _scheduled_time(s: Structure, code, t):
+    """Time of the scheduled event `code` that lies at t up to rounding, as a smooth function."""
+    time = t
+    for g, transition in enumerate(s.transitions):
+        schedule = transition.guard
+        if isinstance(schedule, Scheduled):
+            k = jax.lax.stop_gradient(jnp.round((t - schedule.offset) / schedule.period))
+            time = jnp.where(code == g, schedule.offset + k * schedule.period, time)
+    return time

@@ -1,0 +1,45 @@
+"""Where a piece of flow ends: at a time, at the zero of a level function, or at an event."""
+
+import abc
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+from .._core.results import Result
+from ..systems.structure import Structure
+
+
+class AbstractLevels(eqx.Module):
+    """Level functions of state-based sections, by section index."""
+
+    @abc.abstractmethod
+    def present(self, s: Structure, a: int) -> bool:
+        """Whether any of the sections can be crossed in chart a."""
+
+    @abc.abstractmethod
+    def level(self, s: Structure, a: int, i, t, q):
+        """Level of section i at a single state of chart a; it falls through zero at the section.
+
+        1 for a section that cannot be crossed in chart a.
+        """
+
+
+class Target(eqx.Module):
+    """The ends of a piece of flow, one per lane."""
+
+    time: Float[Array, " L"]
+    """End at this time; infinity if the end is not at a known time."""
+    index: Int[Array, " L"]
+    """End at the section of this index, if `levels` is given."""
+    event: Int[Array, " L"]
+    """End right after the transition of this index; -1 for none."""
+    limit: Float[Array, " L"]
+    """Give up at this time."""
+    hint: Float[Array, " L"]
+    """Expected duration, a first guess of the step; infinity for none."""
+    order: Int[Array, " E"] | None
+    """Transitions expected on one turn of the limit cycle, counted from the first event after
+    the start; `None` if any order will do."""
+    levels: AbstractLevels | None
+    missed: Result = eqx.field(static=True)
+    """The code of a lane that does not arrive."""

@@ -1,0 +1,48 @@
+"""A chart: one mode of a hybrid system, with its own states and its own vector field."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+class Chart(eqx.Module):
+    """One chart V_a of a hybrid system (paper Sec. II): named states and a smooth field.
+
+    Subclass it, name the states, and write the field for a single state; batching, padding and
+    differentiation happen elsewhere.
+
+    ```python
+    class Flight(hj.Chart):
+        states = ("y", "v")
+        ball: "Ball"
+
+        def field(self, t, q, u):
+            y, v = q
+            return v, -self.ball.g
+    ```
+
+    Class attributes:
+
+    - `states`: the names of the states, in the order in which they stand in `q`.
+    - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
+        stand in `u` (the map g_a of the paper: the others are thrown away). `None` means all.
+    - `absent`: values of states that this chart does not carry although outputs and sections may
+        ask for them there, e.g. `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
+    """
+
+    states: eqx.AbstractClassVar[tuple[str, ...]]
+    inputs: ClassVar[tuple[str, ...] | None] = None
+    absent: ClassVar[Mapping[str, float]] = {}
+
+    @abc.abstractmethod
+    def field(self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]) -> Any:
+        """The vector field dq/dt = f(t, q, u), eq. (2).
+
+        It should extend smoothly a little beyond the chart's guards, since integration steps end
+        beyond a guard before the crossing is located.
+
+        **Returns:** n numbers, as an array or a tuple.
+        """

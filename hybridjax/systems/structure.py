@@ -1,0 +1,221 @@
+"""The static structure of a hybrid system, and its functions brought to one form.
+
+Everything below `systems` sees a system through `Structure`: charts and transitions by index,
+functions that return arrays, guards that fall through zero at their event.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.errors import DefinitionError
+from .chart import Chart
+from .output import Output
+from .system import HybridSystem
+from .transition import Scheduled, Transition
+
+
+def as_vector(value: Any) -> jax.Array:
+    """Numbers returned by a user's function, as one floating-point vector."""
+    if isinstance(value, tuple | list):
+        return jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
+    return jnp.asarray(value, float)
+
+
+class Structure:
+    """Charts and transitions of `system` by index. Built anew inside every trace: it is cheap."""
+
+    def __init__(self, system: HybridSystem):
+        self.system = system
+        self.charts: list[Chart] = list(system.charts().values())
+        self.names: tuple[str, ...] = tuple(system.charts())
+        self.transitions: list[Transition] = list(system.transitions())
+        self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
+        self.d = max(self.dims)
+        self.nu = len(system.inputs)
+
+    def chart_index(self, name: str) -> int:
+        if name not in self.names:
+            raise DefinitionError(f"there is no chart '{name}'; charts are {_list(self.names)}.")
+        return self.names.index(name)
+
+    def transition_index(self, name: str) -> int:
+        names = [t.name for t in self.transitions]
+        if name not in names:
+            raise DefinitionError(f"there is no event '{name}'; events are {_list(names)}.")
+        return names.index(name)
+
+    def chart_input(self, a: int, u: jax.Array) -> jax.Array:
+        """g_a(û): the inputs that chart a uses."""
+        names = self.charts[a].inputs
+        if names is None:
+            return u
+        return u[np.array([self.system.inputs.index(n) for n in names], int)]
+
+    def field(self, a: int, t, q, u) -> jax.Array:
+        return as_vector(self.charts[a].field(t, q, self.chart_input(a, u)))
+
+    def guards(self, a: int) -> list[int]:
+        """Indices of the state-dependent transitions out of chart a."""
+        return [g for g, tr in self._out(a) if not isinstance(tr.guard, Scheduled)]
+
+    def schedules(self, a: int) -> list[int]:
+        """Indices of the scheduled transitions out of chart a."""
+        return [g for g, tr in self._out(a) if isinstance(tr.guard, Scheduled)]
+
+    def _out(self, a: int):
+        return [(g, tr) for g, tr in enumerate(self.transitions) if tr.source == self.names[a]]
+
+    def guard(self, g: int, t, q, u) -> jax.Array:
+        """Transition g's guard, signed so that it falls through zero at the event."""
+        tr = self.transitions[g]
+        a = self.chart_index(tr.source)
+        return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, u)), float)
+
+    def reset(self, g: int, t, q, u) -> jax.Array:
+        tr = self.transitions[g]
+        return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), u)))
+
+    def enabled(self, g: int, t, q, u) -> jax.Array:
+        tr = self.transitions[g]
+        if tr.enabled is None:
+            return jnp.asarray(True)
+        return jnp.asarray(tr.enabled(t, q, self.chart_input(self.chart_index(tr.source), u)), bool)
+
+    def state_function(self, name: str, a: int) -> Callable[[Any, Any, Any], Any] | None:
+        """The state called `name` in chart a as a function (t, q, u), `None` if it is not there."""
+        chart = self.charts[a]
+        if name in chart.states:
+            k = chart.states.index(name)
+            return lambda t, q, u: q[k]
+        if name in chart.absent:
+            return lambda t, q, u: jnp.asarray(chart.absent[name], float)
+        return None
+
+    def state_names(self) -> tuple[str, ...]:
+        """All state names, in order of first appearance."""
+        return tuple(dict.fromkeys(n for c in self.charts for n in c.states))
+
+    def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
+        """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
+        if isinstance(outputs, str | Output):
+            outputs = (outputs,)
+        return Outputs(self, tuple(outputs))
+
+
+class Outputs:
+    """Several outputs of a system as one vector function per chart."""
+
+    def __init__(self, structure: Structure, outputs: Sequence[str | Output]):
+        self.structure = structure
+        defined = {o.name: o for o in structure.system.outputs()}
+        self.items: list[str | Output] = []
+        for item in outputs:
+            if isinstance(item, str) and item in defined:
+                item = defined[item]
+            if isinstance(item, str) and item not in structure.state_names():
+                known = (*structure.state_names(), *defined)
+                raise DefinitionError(f"there is no output '{item}'; outputs are {_list(known)}.")
+            self.items.append(item)
+        self.names = tuple(o if isinstance(o, str) else o.name for o in self.items)
+
+    def __call__(self, a: int, t, q, u) -> jax.Array:
+        """All outputs in chart a, shape (ny,); NaN where a chart does not define one."""
+        values = []
+        for item in self.items:
+            function = self._function(item, a)
+            value = jnp.nan if function is None else function(t, q, u)
+            values.append(jnp.asarray(value, float).reshape(()))
+        return jnp.stack(values) if values else jnp.zeros(0)
+
+    def require(self, a: int) -> None:
+        """Raise if some output is not defined in chart a."""
+        for item, name in zip(self.items, self.names, strict=True):
+            if self._function(item, a) is None:
+                raise DefinitionError(
+                    f"output '{name}' is not defined in chart '{self.structure.names[a]}': give "
+                    f"its value there (`absent = {{'{name}': ...}}` in the chart, or an `Output` "
+                    "with a function for every chart)."
+                )
+
+    def _function(self, item: str | Output, a: int):
+        if isinstance(item, str):
+            return self.structure.state_function(item, a)
+        function = item.function
+        if not callable(function):
+            function = function.get(self.structure.names[a])
+        if function is None:
+            return None
+        return lambda t, q, u: function(t, q, self.structure.chart_input(a, u))
+
+
+def check_system(system: HybridSystem) -> None:
+    """Check that a system is well formed: names, shapes of every function, finite parameters.
+
+    **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
+    """
+    if not isinstance(system, HybridSystem):
+        raise DefinitionError(
+            f"expected a HybridSystem, got {type(system).__name__}; pass an instance of the model, "
+            "e.g. `VerticalHopper()`."
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+        if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(leaf)):
+            raise DefinitionError(
+                f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
+                f"{np.asarray(leaf)}; every parameter must be finite."
+            )
+    s = Structure(system)
+    if not s.charts:
+        raise DefinitionError(f"{type(system).__name__} has no charts.")
+    t, u = jnp.zeros(()), jnp.zeros(s.nu)
+    for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
+        for unknown in set(chart.inputs or ()) - set(system.inputs):
+            raise DefinitionError(
+                f"chart '{name}' uses input '{unknown}', which the system does not have; inputs "
+                f"are {_list(system.inputs)}."
+            )
+        if len(set(chart.states)) < len(chart.states):
+            raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
+        shape = _shape(f"field of chart '{name}'", lambda q, a=a: s.field(a, t, q, u), s.dims[a])
+        if shape != (s.dims[a],):
+            raise DefinitionError(
+                f"the field of chart '{name}' returns shape {shape}, but the chart has the "
+                f"{s.dims[a]} states {_list(chart.states)}."
+            )
+    seen: set[str] = set()
+    for g, tr in enumerate(s.transitions):
+        if tr.name in seen:
+            raise DefinitionError(
+                f"two transitions are called '{tr.name}'; give each its own name."
+            )
+        seen.add(tr.name)
+        a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+        label = f"transition '{tr.name}' ({tr.source} -> {tr.target})"
+        if not isinstance(tr.guard, Scheduled):
+            shape = _shape(f"guard of {label}", lambda q, g=g: s.guard(g, t, q, u), s.dims[a])
+            if shape != ():
+                raise DefinitionError(f"the guard of {label} returns shape {shape}, not a number.")
+        shape = _shape(f"reset of {label}", lambda q, g=g: s.reset(g, t, q, u), s.dims[a])
+        if shape != (s.dims[b],):
+            raise DefinitionError(
+                f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
+                f"{s.dims[b]} states {_list(s.charts[b].states)}."
+            )
+
+
+def _shape(what: str, function: Callable, n: int) -> tuple[int, ...]:
+    try:
+        return jax.eval_shape(function, jax.ShapeDtypeStruct((n,), jnp.result_type(float))).shape
+    except DefinitionError:
+        raise
+    except Exception as error:
+        raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
+
+
+def _list(names) -> str:
+    return ", ".join(f"'{n}'" for n in names) or "none"

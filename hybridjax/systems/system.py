@@ -1,0 +1,79 @@
+"""A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .chart import Chart
+from .output import Output
+from .transition import Transition
+
+
+def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
+    """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
+
+    An array is differentiable and may change its value without recompilation; a Python float
+    would be neither.
+    """
+    metadata = {"doc": doc, "unit": unit}
+    options = {} if default is None else {"default": default}
+    return eqx.field(converter=lambda x: jnp.asarray(x, float), metadata=metadata, **options)
+
+
+class Guess(eqx.Module):
+    """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
+
+    chart: str = eqx.field(static=True)
+    state: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    time: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+
+
+class HybridSystem(eqx.Module):
+    """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
+
+    ```python
+    class Ball(hj.HybridSystem):
+        g: jax.Array = hj.parameter(9.81)
+        restitution: jax.Array = hj.parameter(0.7)
+
+        def charts(self):
+            return {"flight": Flight(self)}
+
+        def transitions(self):
+            bounce = lambda t, q, u: (q[0], -self.restitution * q[1])
+            return (hj.Transition("bounce", "flight", "flight", lambda t, q, u: q[0], reset=bounce),)
+    ```
+
+    `charts` (and where there are events, `transitions`) are written by every system; `period`,
+    `outputs` and `guess` where they apply. The class attribute `inputs` names the exogenous
+    inputs û; `inputs = ()` for a system without.
+    """
+
+    inputs: ClassVar[tuple[str, ...]] = ("u",)
+
+    @abc.abstractmethod
+    def charts(self) -> dict[str, Chart]:
+        """The charts by name."""
+
+    def transitions(self) -> Sequence[Transition]:
+        """The transitions between charts. The order breaks exact ties in time."""
+        return ()
+
+    def period(self) -> Any | None:
+        """The period of the clock that drives the system, or `None` if it is autonomous.
+
+        Fields, guards, resets and outputs of a clocked system must have this period in t.
+        """
+        return None
+
+    def outputs(self) -> Sequence[Output]:
+        """Outputs that can be asked for by name, besides the states."""
+        return ()
+
+    def guess(self) -> Guess | None:
+        """A start for the search of the limit cycle, if the model knows one."""
+        return None

@@ -1,0 +1,63 @@
+"""Transitions between charts: guards, scheduled events and resets."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._core.errors import DefinitionError
+
+
+Direction = Literal["falling", "rising"]
+
+
+class Scheduled(eqx.Module):
+    """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
+
+    period: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    offset: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+
+
+def _identity(t, q, u):
+    return q
+
+
+class Transition(eqx.Module):
+    """An event that ends a stay in chart `source` and begins one in chart `target`.
+
+    **Fields:**
+
+    - `name`: how the event is called in plots and errors, e.g. "touchdown".
+    - `source`, `target`: names of charts.
+    - `guard`: threshold function (t, q, u) -> number whose zero crossing in the stated direction
+        is the event, or a `Scheduled` (then `direction` has no meaning).
+    - `direction`: "falling" (from positive to negative) or "rising".
+    - `reset`: (t, q, u) -> state in `target`, as an array or a tuple. Identity by default.
+    - `enabled`: optional predicate (t, q, u) -> bool, evaluated at the crossing; where it is false
+        the crossing is passed without an event.
+
+    A guard is armed once it has left zero on the side from which it crosses: a guard that is zero
+    right after a reset does not fire at once.
+    """
+
+    name: str = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    guard: Callable[..., Any] | Scheduled
+    direction: str = eqx.field(static=True, default="falling")
+    reset: Callable[..., Any] = _identity
+    enabled: Callable[..., Any] | None = None
+
+    def __check_init__(self):
+        if self.direction not in ("falling", "rising"):
+            raise DefinitionError(
+                f"transition '{self.name}': direction is {self.direction!r}; say 'falling' (from "
+                "positive to negative) or 'rising'."
+            )
+
+    @property
+    def sign(self) -> float:
+        """+1 or -1, so that sign * guard falls through zero at the event."""
+        return 1.0 if self.direction == "falling" else -1.0
