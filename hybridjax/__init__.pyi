@@ -8,6 +8,20 @@ from ._core.errors import (
 )
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
+from .experiments.data import (
+    ExperimentData as ExperimentData,
+    simulate_experiments as simulate_experiments,
+)
+from .experiments.design import Design as Design
+from .experiments.multisine import (
+    multisine as multisine,
+    paper_design as paper_design,
+    single_cosine as single_cosine,
+)
+from .identify.nonparametric import (
+    estimate_htf as estimate_htf,
+    missing_frequencies as missing_frequencies,
+)
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
 

@@ -1,0 +1,198 @@
+"""What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.errors import DefinitionError
+from .._core.results import Result
+from ..periodic._checks import names
+from ..periodic.ldtp import LDTP
+from .design import Design
+
+
+class ExperimentData(eqx.Module):
+    """Inputs and outputs of S experiments, sampled at the sections of a limit cycle.
+
+    **Fields**, all on the host:
+
+    - `u`: inputs, (S, n, nu); `u[:, i]` is held from sample i to i + 1. Sample 0 lies on
+      section 0, n is a whole number of periods.
+    - `y`: outputs at the sections minus those on the limit cycle, (S, n, ny), sampled before
+      `u[:, i]` acts. NaN from the failure on where an experiment failed.
+    - `result`: (S,) codes of `Result`. `failed_at`: (S,) the sample at which an experiment
+      failed, -1 where it did not.
+    - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
+    - `sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
+    - `inputs`, `outputs`: names. `family`: name of the section family, for labels.
+    """
+
+    u: Float[np.ndarray, "S n nu"]
+    y: Float[np.ndarray, "S n ny"]
+    result: Int[np.ndarray, " S"]
+    failed_at: Int[np.ndarray, " S"]
+    cycle_outputs: Float[np.ndarray, "N ny"] | None
+    sections: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    family: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        u: Float[np.ndarray | Array, "S n nu"],
+        y: Float[np.ndarray | Array, "S n ny"],
+        *,
+        sections: int,
+        periods: int,
+        inputs: Sequence[str] | None = None,
+        outputs: Sequence[str] | None = None,
+        result: Int[np.ndarray | Array, " S"] | None = None,
+        failed_at: Int[np.ndarray | Array, " S"] | None = None,
+        cycle_outputs: Float[np.ndarray | Array, "N ny"] | None = None,
+        family: str = "",
+    ):
+        """**Arguments:** the fields. Without `result` every experiment counts as good; names
+        default to `u` and `y`, or `u0`, `u1`, ... where there are several.
+
+        **Raises:** `DefinitionError` for shapes that do not fit together, a record that is not a
+        whole number of periods or shorter than the window, and for NaN in a good experiment.
+        """
+        self.u = np.asarray(u, float)
+        self.y = np.asarray(y, float)
+        if self.u.ndim != 3 or self.y.ndim != 3 or self.u.shape[:2] != self.y.shape[:2]:
+            raise DefinitionError(
+                "u must have the shape (experiments, samples, inputs) and y (experiments, "
+                f"samples, outputs), not {self.u.shape} and {self.y.shape}."
+            )
+        S = len(self.u)
+        self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
+        self.failed_at = np.full(S, -1) if failed_at is None else np.asarray(failed_at, int)
+        self.cycle_outputs = None if cycle_outputs is None else np.asarray(cycle_outputs, float)
+        self.sections, self.periods, self.family = sections, periods, family
+        self.inputs = names("inputs", inputs, self.u.shape[2])
+        self.outputs = names("outputs", outputs, self.y.shape[2])
+
+    def __check_init__(self):
+        S, n, _ = self.u.shape
+        N, P, ny = self.sections, self.periods, self.y.shape[2]
+        if N < 1 or P < 1:
+            raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
+        if n % N:
+            raise DefinitionError(
+                f"the record has {n} samples, not a multiple of N = {N} sections: cut it to whole "
+                "periods, beginning at section 0."
+            )
+        if n < N * P:
+            raise DefinitionError(
+                f"the window of P = {P} periods is longer than the record, {n // N} periods of "
+                f"{N} sections."
+            )
+        if self.result.shape != (S,) or self.failed_at.shape != (S,):
+            raise DefinitionError(f"result and failed_at must have one entry for each of {S}.")
+        if self.cycle_outputs is not None and self.cycle_outputs.shape != (N, ny):
+            raise DefinitionError(
+                f"cycle_outputs must have the shape (sections, outputs) = ({N}, {ny}), not "
+                f"{self.cycle_outputs.shape}."
+            )
+        for name, values in (("u", self.u), ("y", self.y)):
+            bad = ~np.isfinite(values).all(axis=2) & self.ok[:, None]
+            if bad.any():
+                s, i = (int(x) for x in np.argwhere(bad)[0])
+                raise DefinitionError(
+                    f"experiment {s}: {name} is NaN or infinite at sample {i}; repair the record, "
+                    "or mark the experiment as failed in `result`."
+                )
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " S"]:
+        """Which experiments ran to their end."""
+        return self.result == Result.OK
+
+    @property
+    def window(self) -> slice:
+        """The samples that estimates use: the last P periods."""
+        return slice(self.u.shape[1] - self.sections * self.periods, None)
+
+    def summary(self, limit: int = 5) -> str:
+        """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
+        failed = np.flatnonzero(~self.ok)
+        text = [f"{self.ok.sum()}/{len(self.ok)} ok"]
+        for s in failed[:limit]:
+            cycle, section = divmod(int(self.failed_at[s]), self.sections)
+            where = f"section {section}, cycle {cycle}: " if self.failed_at[s] >= 0 else ""
+            text.append(f"#{s}: {where}{Result(int(self.result[s])).message}")
+        if len(failed) > limit:
+            text.append(f"and {len(failed) - limit} more")
+        return "; ".join(text)
+
+    def __repr__(self) -> str:
+        S, n, _ = self.u.shape
+        family = f"{self.family}, " if self.family else ""
+        return (
+            f"ExperimentData({family}{self.summary()}; {n // self.sections} cycles of "
+            f"{self.sections} sections each, window P = {self.periods} periods; "
+            f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+        )
+
+
+def simulate_experiments(
+    ldtp: LDTP,
+    design: Design,
+    *,
+    discard: int | None = None,
+    start: Literal["rest", "periodic"] = "rest",
+) -> ExperimentData:
+    """Run a design on a linear periodic model, from section 0.
+
+    **Arguments:**
+
+    - `ldtp`: the model. `design`: for the same N and number of inputs.
+    - `start`: `"rest"` starts at zero, so a transient decays during the first cycles;
+      `"periodic"` starts on the periodic response, without a transient.
+    - `discard`: cycles run before the window of P periods; by default 20 from rest (as in the
+      paper), 0 from the periodic start.
+
+    **Returns:** `ExperimentData` with `discard + P` cycles.
+
+    **Raises:** `DefinitionError` if N or the number of inputs differ, or if a periodic response
+    does not exist (a multiplier that is a P-th root of one).
+    """
+    if start not in ("rest", "periodic"):
+        raise DefinitionError(f"start must be 'rest' or 'periodic', not {start!r}.")
+    if ldtp.sections != design.sections or len(ldtp.inputs) != len(design.input_names):
+        raise DefinitionError(
+            f"the design is for N = {design.sections} and {len(design.input_names)} inputs, the "
+            f"model has N = {ldtp.sections} and {len(ldtp.inputs)}."
+        )
+    if discard is None:
+        discard = 20 if start == "rest" else 0
+    if discard < 0:
+        raise DefinitionError(f"discard must not be negative, but is {discard}.")
+    u = design.inputs(design.periods + discard)
+    x0 = None
+    if start == "periodic":
+        # Outside of jit, where the model can tell that no periodic response exists.
+        x0 = jax.vmap(lambda u: ldtp.periodic_state(u, design.periods))(design.inputs())
+    y = _respond(ldtp, jnp.asarray(u), x0)
+    return ExperimentData(
+        u,
+        y,
+        sections=design.sections,
+        periods=design.periods,
+        inputs=ldtp.inputs,
+        outputs=ldtp.outputs,
+        family="linear model",
+    )
+
+
+@eqx.filter_jit
+def _respond(
+    ldtp: LDTP, u: Float[Array, "S n nu"], x0: Float[Array, "S d"] | None
+) -> Float[Array, "S n ny"]:
+    return jax.vmap(ldtp.simulate)(u, x0)

@@ -1,0 +1,232 @@
+"""Multisine designs: which cosines, with which phases, in which experiment."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.errors import DefinitionError
+from ..periodic._checks import names
+from .partition import check_sharing, is_real, needs_two_phases
+
+
+class Design(eqx.Module):
+    """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
+
+    Experiment s applies, at section n counted from its start,
+    `u[n] = sum_k a_k cos(2 pi j_k n / (N P) + phi_k)` over its own cosines k, so that
+    `f_k = j_k / P` is in cycles per period of the limit cycle and all signals repeat after P
+    periods. The amplitude is `a` (the paper divides it by pi). Every design that exists obeys
+    the rules of Sec. V (see `check`); the functions `multisine`, `paper_design` and
+    `single_cosine` make the usual ones, `Design.from_lines` any other.
+
+    **Fields:** one entry per cosine in the flat arrays, all on the host.
+
+    - `experiment`: the experiment it belongs to, 0..experiments-1, ascending.
+    - `line`: j, so that f = j / periods.
+    - `channel`: index of the input it is applied to.
+    - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
+    - `sections`: N. `periods`: P. `experiments`: their number S. `input_names`.
+    """
+
+    experiment: Int[np.ndarray, " K"]
+    line: Int[np.ndarray, " K"]
+    channel: Int[np.ndarray, " K"]
+    amplitude: Float[np.ndarray, " K"]
+    phase: Float[np.ndarray, " K"]
+    sections: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    experiments: int = eqx.field(static=True)
+    input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
+
+    def __check_init__(self):
+        self.check()
+
+    @classmethod
+    def from_lines(
+        cls,
+        frequencies: Sequence[Sequence[float] | np.ndarray],
+        amplitudes: float | Sequence[Sequence[float] | np.ndarray] = 0.01,
+        phases: float | Sequence[Sequence[float] | np.ndarray] = 0.0,
+        *,
+        sections: int = 32,
+        periods: int = 64,
+        channels: int | Sequence[Sequence[int] | np.ndarray] = 0,
+        inputs: int | str | Sequence[str] = 1,
+    ) -> "Design":
+        """A design from your own cosines.
+
+        **Arguments:**
+
+        - `frequencies`: for each experiment, its frequencies in cycles per period.
+        - `amplitudes`, `phases` (rad), `channels` (index of the input): one number for all
+          cosines, or for each experiment one number per frequency.
+        - `sections`: N. `periods`: P; every frequency must be a multiple of 1/P.
+        - `inputs`: the number of inputs, or their names.
+
+        **Raises:** `DefinitionError` as `check` does, or for lists that do not fit together.
+        """
+        sizes = [np.size(f) for f in frequencies]
+        if len(sizes) == 0 or min(sizes) == 0:
+            raise DefinitionError("every experiment of a design needs at least one frequency.")
+
+        def flat(name, values, dtype):
+            if np.ndim(values) == 0:
+                return np.full(sum(sizes), values, dtype)
+            if [np.size(v) for v in values] != sizes:
+                raise DefinitionError(
+                    f"`{name}` must be one number or have as many entries as `frequencies` in "
+                    f"each of the {len(sizes)} experiments."
+                )
+            return np.concatenate([np.ravel(v) for v in values]).astype(dtype)
+
+        lines = to_lines(flat("frequencies", frequencies, float), periods)
+        experiment = np.repeat(np.arange(len(sizes)), sizes)
+        order = np.lexsort((lines, experiment))
+        return cls(
+            experiment=experiment[order],
+            line=lines[order],
+            channel=flat("channels", channels, int)[order],
+            amplitude=flat("amplitudes", amplitudes, float)[order],
+            phase=flat("phases", phases, float)[order],
+            sections=sections,
+            periods=periods,
+            experiments=len(sizes),
+            input_names=input_names(inputs),
+        )
+
+    def check(self) -> None:
+        """Check the rules under which the HTFs follow from the experiments uniquely (Sec. V).
+
+        - every f lies in [0, N/2], amplitudes are positive, phases finite;
+        - in one experiment no two frequencies differ by, or add up to, an integer;
+        - a frequency on a multiple of 1/2 (eq. 16) is excited in two experiments at least, with
+          different phases; 0 and N/2 need only one phase, but not one with cos(phase) = 0.
+
+        **Raises:** `DefinitionError` that names the experiment and the frequencies.
+        """
+        P, N = self.periods, self.sections
+        if N < 1 or P < 1:
+            raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
+        empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
+        if len(empty) or len(self.experiment) == 0:
+            raise DefinitionError("every experiment of a design needs at least one frequency.")
+        self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
+        good = np.isfinite(self.amplitude) & (self.amplitude > 0)
+        self._refuse(~good, "has an amplitude that is not a positive number")
+        self._refuse(~np.isfinite(self.phase), "has a phase that is not finite")
+        nu = len(self.input_names)
+        outside = (self.channel < 0) | (self.channel >= nu)
+        self._refuse(outside, f"is applied to an input that is not one of the {nu}")
+        check_sharing(self.experiment, self.line, P)
+
+        u = np.exp(1j * self.phase)
+        _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
+        count = np.bincount(group)
+        same = np.hypot(np.bincount(group, (u**2).real), np.bincount(group, (u**2).imag)) / count
+        self._refuse(
+            (needs_two_phases(self.line, P, N) & (same > 1 - 1e-6)[group]),
+            "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
+            "experiments with phases 90 degrees apart (half_integers='two-phase' does so), or "
+            "leave it out (half_integers='skip')",
+        )
+        self._refuse(
+            is_real(self.line, P, N) & (np.abs(u.real) < 1e-3),
+            "is zero at every section with this phase: give it the phase 0",
+        )
+
+    def _refuse(self, wrong: np.ndarray, reason: str) -> None:
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            f = self.line[first] / self.periods
+            raise DefinitionError(f"experiment {self.experiment[first]}: f = {f:.10g} {reason}.")
+
+    @property
+    def f(self) -> Float[np.ndarray, " K"]:
+        """Frequency of each cosine, cycles per period."""
+        return self.line / self.periods
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, " F"]:
+        """All frequencies that the design measures, ascending, each once."""
+        return np.unique(self.line) / self.periods
+
+    def inputs(self, cycles: int | None = None) -> Float[np.ndarray, "S n nu"]:
+        """The signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
+
+        They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
+        have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
+        (which is why estimates divide by the spectrum of the window itself).
+        """
+        cycles = self.periods if cycles is None else cycles
+        if cycles < 1:
+            raise DefinitionError(f"cycles must be at least 1, not {cycles}.")
+        length = self.sections * self.periods
+        spectrum = np.zeros((self.experiments, length // 2 + 1, len(self.input_names)), complex)
+        value = 0.5 * length * self.amplitude * np.exp(1j * self.phase)
+        value = np.where(is_real(self.line, self.periods, self.sections), 2 * value.real, value)
+        spectrum[self.experiment, self.line, self.channel] = value
+        one = np.fft.irfft(spectrum, n=length, axis=1)
+        index = np.arange(cycles * self.sections) % length
+        return one[:, index]
+
+    def cycles(self, discard: int = 20) -> int:
+        """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
+        return self.experiments * (self.periods + discard)
+
+    def crest_factors(self) -> Float[np.ndarray, " S"]:
+        """max |u| / rms(u) in each experiment (over its inputs, the largest)."""
+        u = self.inputs()
+        rms = np.sqrt(np.mean(u**2, axis=1))
+        peak = np.abs(u).max(axis=1)
+        return np.max(np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1)
+
+    def __repr__(self) -> str:
+        f, sizes = self.frequencies, np.bincount(self.experiment)
+        crest = self.crest_factors()
+        return (
+            f"Design({_count(self.experiments, 'experiment')}, {len(f)} frequencies "
+            f"{_span(f)} cycles per period in steps of 1/{self.periods}, "
+            f"{_count(_span(sizes), 'cosine')} each of amplitude {_span(self.amplitude)}, "
+            f"crest factor {_span(crest)}, N = {self.sections}, P = {self.periods} periods, "
+            f"inputs = {', '.join(self.input_names)})"
+        )
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+
+
+def _count(number: int | str, noun: str) -> str:
+    return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
+
+
+def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """Frequencies as integers j with f = j / periods.
+
+    **Raises:** `DefinitionError` for a frequency that is not a multiple of 1/periods.
+    """
+    if periods < 1:
+        raise DefinitionError(f"periods must be at least 1, not {periods}.")
+    exact = np.asarray(frequencies, float) * periods
+    lines = np.rint(exact)
+    wrong = ~(np.abs(exact - lines) < 1e-6)
+    if wrong.any():
+        f = float(np.asarray(frequencies)[np.argmax(wrong)])
+        raise DefinitionError(
+            f"f = {f:.10g} is not a multiple of 1/{periods}, so its cosine does not fit into "
+            f"periods = {periods}; move it or choose another number of periods."
+        )
+    return lines.astype(int)
+
+
+def input_names(inputs: int | str | Sequence[str]) -> tuple[str, ...]:
+    """Names from names, or from a number: `u`, or `u0`, `u1`, ..."""
+    if isinstance(inputs, int):
+        if inputs < 1:
+            raise DefinitionError(f"a design needs at least one input, not {inputs}.")
+        return names("inputs", None, inputs)
+    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    return names("inputs", inputs, len(inputs))

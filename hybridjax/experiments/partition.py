@@ -1,0 +1,99 @@
+"""Which cosines may share an experiment, and how few experiments suffice.
+
+A cosine at the frequency `f` (cycles per period) makes a periodic system of N sections answer at
+`f + l` and, through its negative half, at `-f + l` for all integers l. So (Ankarali & Cowan,
+Sec. V-B) two cosines may share an experiment unless their difference or their sum is an integer.
+On the grid `f = j / P` that is one comparison: with `r = j mod P`, the *class* of a line is
+`min(r, P - r)`, and two lines disturb each other exactly if their classes are equal.
+Lines of one class need one experiment each, lines of different classes never meet; so the size
+of the largest class is the exact minimum of experiments, and every greater number works too.
+
+Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from .._core.errors import DefinitionError
+
+
+def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """`min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between two."""
+    rest = line % periods
+    return np.minimum(rest, periods - rest)
+
+
+def is_half_integer(line: Int[np.ndarray, " K"], periods: int) -> Bool[np.ndarray, " K"]:
+    """Whether f is a multiple of 1/2: the cosine then meets its own mirror image (eq. 16)."""
+    return (2 * line) % periods == 0
+
+
+def is_real(line: Int[np.ndarray, " K"], periods: int, sections: int) -> Bool[np.ndarray, " K"]:
+    """Whether f is 0 or N/2, where `cos(w n + phi)` is a real factor times a fixed sequence."""
+    return (line == 0) | (2 * line == sections * periods)
+
+
+def needs_two_phases(
+    line: Int[np.ndarray, " K"], periods: int, sections: int
+) -> Bool[np.ndarray, " K"]:
+    """Multiples of 1/2 other than 0 and N/2: identified from two phases only."""
+    return is_half_integer(line, periods) & ~is_real(line, periods, sections)
+
+
+def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
+    """The exact minimum of experiments for these lines (repeated ones count as often)."""
+    return int(np.bincount(line_class(line, periods)).max())
+
+
+def assign(
+    line: Int[np.ndarray, " K"], periods: int, experiments: int, rng: np.random.Generator
+) -> Int[np.ndarray, " K"]:
+    """Random partition that obeys the rules: the experiment, 0..experiments-1, of each line.
+
+    Class after class, in random order, is spread over the experiments that are the least full
+    at that moment (ties at random), so sizes differ by at most one. Needs
+    `experiments >= fewest_experiments(line, periods)`, and then never fails.
+    """
+    classes = line_class(line, periods)
+    load = np.zeros(experiments, int)
+    experiment = np.empty(len(line), int)
+    for c in rng.permutation(np.unique(classes)):
+        members = rng.permutation(np.flatnonzero(classes == c))
+        least_full = np.lexsort((rng.random(experiments), load))[: len(members)]
+        experiment[members] = least_full
+        load[least_full] += 1
+    return experiment
+
+
+def check_sharing(
+    experiment: Int[np.ndarray, " K"],
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    hint: Callable[[int], str] = lambda experiment: "",
+) -> None:
+    """Check that no two lines of one experiment have the same class.
+
+    **Raises:** `DefinitionError` that names the experiment and the first pair; the text of
+    `hint(experiment)` is added to it.
+    """
+    classes = line_class(line, periods)
+    order = np.lexsort((line, classes, experiment))
+    e, c, j = experiment[order], classes[order], line[order]
+    clash = np.flatnonzero((e[1:] == e[:-1]) & (c[1:] == c[:-1]))
+    if len(clash) == 0:
+        return
+    first = clash[0]
+    low, high, number = int(j[first]), int(j[first + 1]), int(e[first])
+    a, b = low / periods, high / periods
+    if low == high:
+        reason = f"f = {a:.10g} is excited twice"
+    elif (high - low) % periods == 0:
+        reason = f"f = {a:.10g} and {b:.10g} differ by an integer"
+    else:
+        reason = f"f = {a:.10g} and {b:.10g} add up to an integer"
+    raise DefinitionError(
+        f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
+        f"move one of them to another experiment{hint(number)}."
+    )
