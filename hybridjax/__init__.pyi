@@ -18,9 +18,15 @@ from .experiments.multisine import (
     paper_design as paper_design,
     single_cosine as single_cosine,
 )
+from .identify.compare import MultiplierComparison as MultiplierComparison
 from .identify.nonparametric import (
     estimate_htf as estimate_htf,
     missing_frequencies as missing_frequencies,
+)
+from .identify.rational import RationalFit as RationalFit, fit_rational as fit_rational
+from .identify.structured import (
+    StructuredFit as StructuredFit,
+    fit_multipliers as fit_multipliers,
 )
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
