@@ -1,6 +1,6 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -53,7 +53,7 @@ class HTF(eqx.Module):
         self,
         f: Any,
         H: Any,
-        harmonics: int | Sequence[int],
+        harmonics: int | Iterable,
         sections: int,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
@@ -105,7 +105,7 @@ class HTF(eqx.Module):
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         return self.harmonic(m)
 
-    def select(self, harmonics: int | Sequence[int]) -> "HTF":
+    def select(self, harmonics: int | Iterable) -> "HTF":
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.sections)
         return self._with(self.f, self.H[np.array([self._index(m) for m in harmonics])], harmonics)
@@ -189,10 +189,10 @@ class HTF(eqx.Module):
                 )
         lines, here = np.array(lines, int), np.array(here, int)
         conjugate = np.array(conjugate, bool)[:, None, None]
-        Y = jnp.zeros((n, len(self.outputs)), complex)
-        for row, m in enumerate(self.harmonics):
-            H = jnp.where(conjugate, jnp.conj(self.H[mirror[row], here]), self.H[row, here])
-            Y = Y.at[(lines + m * periods) % n].add(jnp.einsum("kij,kj->ki", H, U[lines]))
+        H = jnp.where(conjugate, jnp.conj(self.H[np.array(mirror)][:, here]), self.H[:, here])
+        parts = jnp.einsum("mkij,kj->mki", H, U[lines])
+        places = (lines + periods * np.array(self.harmonics)[:, None]) % n
+        Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
         return jnp.fft.ifft(Y, axis=0).real
 
     def harmonic_errors(self, other: "HTF") -> Float[Array, "M ny"]:

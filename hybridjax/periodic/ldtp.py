@@ -1,6 +1,6 @@
 """Linear discrete-time periodic systems whose state dimension may vary over the period."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,10 +12,11 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
+from . import response
 from ._checks import is_traced, names, real_array, require_finite
 from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
-from .transfer import check_harmonics, harmonic_transfer, monodromy
+from .transfer import check_harmonics, harmonic_transfer
 
 
 _RTOL = 1e-12  # singular values of a factor below this part of its largest one are zero
@@ -166,17 +167,8 @@ class LDTP(eqx.Module):
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
-        u = self._input(u)
-        x0 = self._state(x0, start)
-        section = (start + jnp.arange(u.shape[0])) % self.sections
-
-        def advance(x, step):
-            n, u = step
-            x = self.A[n] @ x + self.B[n] @ u
-            return x, x
-
-        _, states = jax.lax.scan(advance, x0, (section, u))
-        return jnp.concatenate([x0[None], states])
+        u, x0 = self._input(u), self._state(x0, start)
+        return response.states(self.A, self.B, u, x0, self._sections_from(start, u))
 
     def simulate(
         self, u: ArrayLike, x0: ArrayLike | None = None, start: int = 0
@@ -184,10 +176,7 @@ class LDTP(eqx.Module):
         """The outputs (n, ny) that an input leads to; arguments as in `states`."""
         u = self._input(u)
         x = self.states(u, x0, start)[:-1]
-        section = (start + jnp.arange(u.shape[0])) % self.sections
-        return jnp.einsum("nij,nj->ni", self.C[section], x) + jnp.einsum(
-            "nij,nj->ni", self.D[section], u
-        )
+        return response.outputs(self.C, self.D, u, x, self._sections_from(start, u))
 
     def impulse_response(self, n_lags: int) -> Float[Array, "N lags ny nu"]:
         """The time-periodic impulse response (Markov parameters).
@@ -199,14 +188,9 @@ class LDTP(eqx.Module):
         """
         if n_lags < 1:
             raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
+        return response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
-        def advance(x, _):
-            return jnp.roll(self.A @ x, 1, axis=0), self.C @ x
-
-        _, later = jax.lax.scan(advance, jnp.roll(self.B, 1, axis=0), length=n_lags - 1)
-        return jnp.concatenate([self.D[None], later]).swapaxes(0, 1)
-
-    def htf(self, f: Any, harmonics: int | Sequence[int] | None = None) -> HTF:
+    def htf(self, f: Any, harmonics: int | Iterable | None = None) -> HTF:
         """The exact harmonic transfer functions.
 
         **Arguments:**
@@ -223,31 +207,23 @@ class LDTP(eqx.Module):
         f = real_array("f", f, ndim=1)
         require_finite("f", f)
         require_x64(self)
-        self._refuse_resonance(f, jnp.exp(2j * jnp.pi * f))
+        self._refuse_resonance(f)
         H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
         chosen = np.asarray(harmonics) % self.sections
         return HTF(f, H[chosen], harmonics, self.sections, self.inputs, self.outputs, "exact")
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""
-        return monodromy(jnp.roll(self.A, -section, axis=0))
+        return response.monodromy(jnp.roll(self.A, -section, axis=0))
 
-    def characteristic_polynomial(self) -> Float[Array, " d+1"]:
+    def characteristic_polynomial(self) -> Float[Array, " coefficients"]:
         r"""Coefficients $1, c_1, \ldots, c_d$ of $\det(\lambda I - \Phi)$, highest power first.
 
         The same at every section, smooth also where multipliers meet, and differentiable, unlike
         `multipliers`. It forms the product of the factors, and coefficients beyond the number of
-        non-zero multipliers are zero up to rounding. (Faddeev-LeVerrier recursion.)
+        non-zero multipliers are zero up to rounding.
         """
-        product = self.monodromy()
-        d = product.shape[0]
-        identity = jnp.eye(d)
-        coefficients, adjugate = [jnp.ones(())], identity
-        for k in range(1, d + 1):
-            step = product @ adjugate
-            coefficients.append(-jnp.trace(step) / k)
-            adjugate = step + coefficients[-1] * identity
-        return jnp.stack(coefficients)
+        return response.characteristic_polynomial(self.monodromy())
 
     def multipliers(self, rtol: float = _RTOL) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
@@ -283,16 +259,17 @@ class LDTP(eqx.Module):
         of one within `1e-8`: then no such state exists.
         """
         u = self._input(u)
-        if u.shape[0] != periods * self.sections:
+        if periods < 1 or u.shape[0] != periods * self.sections:
             raise DefinitionError(
                 f"`u` has {u.shape[0]} samples, but {periods} periods of {self.sections} sections "
                 f"are {periods * self.sections}."
             )
-        lines = jnp.arange(periods) / periods
-        self._refuse_resonance(lines, jnp.exp(2j * jnp.pi * lines))
-        forced = self.states(u)[-1]
-        power = jnp.linalg.matrix_power(self.monodromy(), periods)
-        return jnp.linalg.solve(jnp.eye(power.shape[0]) - power, forced)
+        self._refuse_resonance(np.arange(periods) / periods)
+        by_period = u.reshape(periods, self.sections, -1)
+        return response.periodic_state(self.A, self.B, by_period)
+
+    def _sections_from(self, start, u):
+        return (start + jnp.arange(u.shape[0])) % self.sections
 
     def _input(self, u):
         u = real_array("u", u, ndim=2)
@@ -329,11 +306,11 @@ class LDTP(eqx.Module):
             A, np.roll(dims, -1), dims, strict=True
         )]  # fmt: skip
 
-    def _refuse_resonance(self, f, z_N):
+    def _refuse_resonance(self, f):
         if is_traced(self.A, self.dims, f):
             return
         multipliers, f = self.multipliers(), np.asarray(f)
-        distance = np.abs(np.asarray(z_N)[:, None] - multipliers)
+        distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)
             raise DefinitionError(

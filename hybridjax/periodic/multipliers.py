@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 from .._core.errors import ComputationError
 
 
-Matrix = Float[np.ndarray, "rows columns"]
+Matrix = Float[np.ndarray, "_ _"]
 
 
 def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
@@ -113,10 +113,10 @@ def _hessenberg_triangular(factors):
     return reduced
 
 
-def _shift(factors, low, high):
-    """An eigenvalue of the trailing 2 x 2 block of the product over `[low, low]` of the triangles.
+def _shift(factors, low, high, exceptional):
+    """A shift for the product divided by the triangles' `[low, low]`: it may be rough.
 
-    Only guides convergence, so it may be rough.
+    An eigenvalue of the trailing 2 x 2 block; an exceptional one breaks a stall (LAPACK's way).
     """
     pair = slice(high - 1, high + 1)
     *triangles, hessenberg = factors
@@ -126,6 +126,8 @@ def _shift(factors, low, high):
             block = block @ (triangle[pair, pair] / triangle[low, low])
     if not np.all(np.isfinite(block)):
         return 0.0
+    if exceptional:
+        return block[1, 1] + 0.75 * np.abs(block[1, 0])
     eigenvalues = np.linalg.eigvals(block)
     return eigenvalues[np.argmin(np.abs(eigenvalues - block[1, 1]))]
 
@@ -149,9 +151,7 @@ def _periodic_schur(factors):
         stalled += 1
         if stalled > 60:
             raise ComputationError("The periodic QR algorithm did not converge.")
-        shift = _shift(factors, low, high)
-        if stalled % 10 == 0:
-            shift = shift * (0.7 + 0.4j)
+        shift = _shift(factors, low, high, exceptional=stalled % 10 == 0)
         start = (hessenberg[low, low] - shift, hessenberg[low + 1, low])
         _rotate(factors, low, _rotation(*start))
         for k in range(low + 1, high):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from .._core.errors import DefinitionError
+from .response import monodromy
 
 
 def all_harmonics(sections: int) -> tuple[int, ...]:
@@ -17,7 +18,7 @@ def all_harmonics(sections: int) -> tuple[int, ...]:
     return tuple(range(-(sections // 2), (sections + 1) // 2))
 
 
-def check_harmonics(harmonics: int | Iterable[int] | None, sections: int) -> tuple[int, ...]:
+def check_harmonics(harmonics: int | Iterable | None, sections: int) -> tuple[int, ...]:
     """`harmonics` as an ascending tuple; `None` means all of them.
 
     **Raises:** `DefinitionError` for harmonics that are out of range, repeated or no integers.
@@ -42,12 +43,6 @@ def check_harmonics(harmonics: int | Iterable[int] | None, sections: int) -> tup
     if len(set(integers)) < len(integers) or not integers:
         raise DefinitionError(f"`harmonics` must be distinct and at least one: {integers}.")
     return integers
-
-
-def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
-    """The product `A[N-1] ... A[0]`."""
-    identity = jnp.eye(A.shape[-1], dtype=A.dtype)
-    return jax.lax.scan(lambda product, factor: (factor @ product, None), identity, A)[0]
 
 
 @jax.jit

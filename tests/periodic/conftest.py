@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+# Dimensions 3, 2, 3, 2, 3, 2, two inputs, two outputs; rows separated by ";".
+SYNTHETIC = [
+    (".5 -.3 .2; .4 .6 -.1", "1 0; .5 -.2", "1 0 0; 0 1 -1", "0 0; 0 0"),
+    (".7 .2; -.5 .8; .3 .1", ".3 .1; 0 1; -.4 .2", "1 .5; 0 1", ".1 0; 0 0"),
+    (".6 .1 -.4; -.2 .9 .3", ".2 .6; -1 .1", "0 1 .2; 1 0 0", "0 0; 0 -.2"),
+    (".8 -.6; .5 .7; -.1 .4", ".5 0; .1 -.3; 0 .7", ".5 1; -1 0", "0 0; .3 0"),
+    (".9 .2 .1; -.3 .7 .5", "-.6 .4; .2 .8", "1 0 .3; .2 -1 0", "0 0; 0 0"),
+    ("1.1 -.4; .3 .9; .2 -.7", "0 .5; 1 -.1; .3 .2", "0 1; 1 1", "0 .1; 0 0"),
+]
+
+
+def parse(text):
+    return np.array([row.split() for row in text.split(";")], float)
+
+
+def blocks_at_random(seed, dims, ny, nu, gain=0.7):
+    """Random matrices A, B, C, D; every `A[n]` has the norm `gain`."""
+    rng = np.random.default_rng(seed)
+    after = np.roll(dims, -1)
+    A = [rng.normal(size=(i, j)) for i, j in zip(after, dims, strict=True)]
+    A = [gain * a / np.linalg.norm(a, 2) for a in A]
+    B = [rng.normal(size=(d, nu)) for d in after]
+    C = [rng.normal(size=(ny, d)) for d in dims]
+    D = [rng.normal(size=(ny, nu)) for _ in dims]
+    return A, B, C, D
+
+
+def simulate_blocks(blocks, u, x0, start=0):
+    """The definition of an LDTP, in a loop over unpadded matrices."""
+    A, B, C, D = blocks
+    x, xs, ys = x0, [x0], []
+    for i, value in enumerate(u):
+        n = (start + i) % len(A)
+        ys.append(C[n] @ x + D[n] @ value)
+        x = A[n] @ x + B[n] @ value
+        xs.append(x)
+    return xs, np.array(ys)
+
+
+@pytest.fixture(scope="session")
+def synthetic():
+    columns = zip(*[[parse(text) for text in row] for row in SYNTHETIC], strict=True)
+    return hj.LDTP.from_blocks(*columns)
+
+
+@pytest.fixture(scope="session")
+def hopper(reference):
+    data = reference("ldtp_isochron")
+    return hj.LDTP(
+        data["A"],
+        data["B"][..., None],
+        data["C"],
+        data["D"][..., None],
+        data["dim"],
+        inputs="u",
+        outputs=("yM", "vM"),
+    )
