@@ -21,6 +21,8 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
 
     **Arguments:** `factors`, in the order in which they act; `rtol`, the singular values of a
     factor below `rtol` times its largest one count as zero.
+
+    **Raises:** `ComputationError` for NaN and infinity.
     """
     basis, _ = _carry_range(factors, np.eye(factors[0].shape[1]), rtol)
     return basis.shape[1]
@@ -35,7 +37,7 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
 
     **Arguments:** as in `product_rank`.
 
-    **Raises:** `ComputationError` if the QR algorithm does not converge.
+    **Raises:** `ComputationError` if the QR algorithm does not converge, or for NaN and infinity.
     """
     regular = _regular_part(factors, rtol)
     if not regular:
@@ -49,7 +51,9 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
 def _carry_range(factors, basis, rtol):
     """Orthonormal basis of `A[N-1] ... A[0] basis`, and each factor in the bases on its way."""
     reduced = []
-    for factor in factors:
+    for n, factor in enumerate(factors):
+        if not np.all(np.isfinite(factor)):
+            raise ComputationError(f"Factor {n} of the monodromy holds NaN or infinity.")
         image = factor @ basis
         left, singular, _ = np.linalg.svd(image, full_matrices=False)
         left = left[:, singular > rtol * np.linalg.norm(factor, 2)]

@@ -205,6 +205,12 @@ def test_characteristic_polynomial_is_smooth_where_multipliers_meet():
     np.testing.assert_allclose(jax.jacrev(coefficients)(0.0), [0, 0, -1], atol=1e-15)
 
 
+def test_factors_that_are_not_finite():
+    for function in (product_eigenvalues, product_rank):
+        with pytest.raises(hj.ComputationError, match="Factor 1 .* NaN or infinity"):
+            function([np.eye(2), np.full((2, 2), np.nan)], RTOL)
+
+
 def test_multipliers_refuse_to_be_traced(synthetic):
     with pytest.raises(hj.DefinitionError, match="works on the host"):
         jax.jit(lambda ldtp: ldtp.multipliers())(synthetic)
