@@ -149,6 +149,7 @@ def test_prediction_is_the_periodic_response(seed, shape):
 def test_derivatives(synthetic):
     f = jnp.array([0.4, 1.7])
 
+    @jax.jit
     def values(A, B, C, D, f):
         htf = hj.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
