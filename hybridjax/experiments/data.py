@@ -1,7 +1,7 @@
 """What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -45,16 +45,16 @@ class ExperimentData(eqx.Module):
 
     def __init__(
         self,
-        u: Float[np.ndarray | Array, "S n nu"],
-        y: Float[np.ndarray | Array, "S n ny"],
+        u: Any,
+        y: Any,
         *,
         sections: int,
         periods: int,
-        inputs: Sequence[str] | None = None,
-        outputs: Sequence[str] | None = None,
-        result: Int[np.ndarray | Array, " S"] | None = None,
-        failed_at: Int[np.ndarray | Array, " S"] | None = None,
-        cycle_outputs: Float[np.ndarray | Array, "N ny"] | None = None,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        result: Any = None,
+        failed_at: Any = None,
+        cycle_outputs: Any = None,
         family: str = "",
     ):
         """**Arguments:** the fields. Without `result` every experiment counts as good; names
@@ -63,22 +63,26 @@ class ExperimentData(eqx.Module):
         **Raises:** `DefinitionError` for shapes that do not fit together, a record that is not a
         whole number of periods or shorter than the window, and for NaN in a good experiment.
         """
-        self.u = np.asarray(u, float)
-        self.y = np.asarray(y, float)
-        if self.u.ndim != 3 or self.y.ndim != 3 or self.u.shape[:2] != self.y.shape[:2]:
+        self.u, self.y = _real("u", u), _real("y", y)
+        shapes = self.u.shape, self.y.shape
+        if any(len(s) != 3 or 0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
             raise DefinitionError(
                 "u must have the shape (experiments, samples, inputs) and y (experiments, "
-                f"samples, outputs), not {self.u.shape} and {self.y.shape}."
+                f"samples, outputs), not {shapes[0]} and {shapes[1]}."
             )
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
         self.failed_at = np.full(S, -1) if failed_at is None else np.asarray(failed_at, int)
-        self.cycle_outputs = None if cycle_outputs is None else np.asarray(cycle_outputs, float)
+        self.cycle_outputs = (
+            None if cycle_outputs is None else _real("cycle_outputs", cycle_outputs)
+        )
         self.sections, self.periods, self.family = sections, periods, family
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
 
-    def __check_init__(self):
+        self._check()
+
+    def _check(self) -> None:
         S, n, _ = self.u.shape
         N, P, ny = self.sections, self.periods, self.y.shape[2]
         if N < 1 or P < 1:
@@ -139,6 +143,16 @@ class ExperimentData(eqx.Module):
             f"{self.sections} sections each, window P = {self.periods} periods; "
             f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
         )
+
+
+def _real(name: str, values: Any) -> np.ndarray:
+    try:
+        values = np.asarray(values)
+    except ValueError as error:
+        raise DefinitionError(f"{name} is not a rectangular array: {error}.") from error
+    if values.dtype.kind not in "fiu":
+        raise DefinitionError(f"{name} must hold real numbers, not {values.dtype}.")
+    return values.astype(float)
 
 
 def simulate_experiments(

@@ -11,6 +11,10 @@ from ..periodic._checks import names
 from .partition import check_sharing, is_real, needs_two_phases
 
 
+Number = int | float
+Numbers = Sequence[Number] | np.ndarray
+
+
 class Design(eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
 
@@ -46,9 +50,9 @@ class Design(eqx.Module):
     @classmethod
     def from_lines(
         cls,
-        frequencies: Sequence[Sequence[float] | np.ndarray],
-        amplitudes: float | Sequence[Sequence[float] | np.ndarray] = 0.01,
-        phases: float | Sequence[Sequence[float] | np.ndarray] = 0.0,
+        frequencies: Sequence[Numbers],
+        amplitudes: Number | Sequence[Numbers] = 0.01,
+        phases: Number | Sequence[Numbers] = 0.0,
         *,
         sections: int = 32,
         periods: int = 64,
@@ -72,7 +76,7 @@ class Design(eqx.Module):
             raise DefinitionError("every experiment of a design needs at least one frequency.")
 
         def flat(name, values, dtype):
-            if np.ndim(values) == 0:
+            if np.isscalar(values):
                 return np.full(sum(sizes), values, dtype)
             if [np.size(v) for v in values] != sizes:
                 raise DefinitionError(

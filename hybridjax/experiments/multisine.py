@@ -6,18 +6,18 @@ from typing import Literal
 import numpy as np
 
 from .._core.errors import DefinitionError
-from .design import Design, input_names, to_lines
+from .design import Design, Number, Numbers, input_names, to_lines
 from .partition import assign, fewest_experiments, is_half_integer, is_real, needs_two_phases
 
 
 def multisine(
     sections: int = 32,
     periods: int = 64,
-    f_max: float = 10.0,
-    amplitude: float = 0.01,
+    f_max: Number = 10.0,
+    amplitude: Number = 0.01,
     seed: int = 0,
     *,
-    f_min: float = 0.0,
+    f_min: Number = 0.0,
     experiments: int | None = None,
     half_integers: Literal["skip", "two-phase"] = "skip",
     inputs: int | str | Sequence[str] = 1,
@@ -109,8 +109,8 @@ def multisine(
 def paper_design(
     sections: int = 32,
     periods: int = 64,
-    f_max: float = 10.0,
-    amplitude: float = 0.01,
+    f_max: Number = 10.0,
+    amplitude: Number = 0.01,
     seed: int = 0,
     *,
     experiments: int = 80,
@@ -124,11 +124,11 @@ def paper_design(
 
 
 def single_cosine(
-    f: float | Sequence[float] | np.ndarray,
+    f: Number | Numbers,
     sections: int = 32,
     periods: int = 64,
-    amplitude: float = 0.01,
-    phase: float = 0.0,
+    amplitude: Number = 0.01,
+    phase: Number = 0.0,
     *,
     half_integers: Literal["error", "two-phase"] = "error",
     inputs: int | str | Sequence[str] = 1,

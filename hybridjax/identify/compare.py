@@ -1,11 +1,16 @@
 """Estimated multipliers beside the true ones."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from .._core.errors import DefinitionError
+
+
+Multipliers = np.ndarray | Array | Sequence[complex | float]
 
 
 class MultiplierComparison(eqx.Module):
@@ -40,14 +45,12 @@ def _show(value: complex) -> str:
     return f"{value.real:+.9f} {value.imag:+.9f}i"
 
 
-def compare_multipliers(
-    estimated: Complex[np.ndarray, " d"], true: Complex[np.ndarray, " t"]
-) -> MultiplierComparison:
+def compare_multipliers(estimated: Multipliers, true: Multipliers) -> MultiplierComparison:
     """Pair estimated with true multipliers so that the sum of distances is smallest.
 
     **Raises:** `DefinitionError` if either is empty.
     """
-    estimated, true = np.atleast_1d(estimated), np.atleast_1d(true)
+    estimated, true = np.asarray(estimated).ravel(), np.asarray(true).ravel()
     if estimated.size == 0 or true.size == 0:
         raise DefinitionError("there is no multiplier to compare.")
     here, there = linear_sum_assignment(np.abs(estimated[:, None] - true))

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.errors import DefinitionError
+from .._core.precision import require_x64
 from ..experiments.data import ExperimentData
 from ..experiments.partition import check_sharing, needs_two_phases
 from ..periodic.htf import HTF
@@ -47,6 +48,7 @@ def estimate_htf(
     """
     if half_integers not in ("error", "skip"):
         raise DefinitionError(f"half_integers must be 'error' or 'skip', not {half_integers!r}.")
+    require_x64()
     harmonics = check_harmonics(harmonics, data.sections)
     lines = _excited(data, threshold)
     unsolved = _one_phase(lines, data)

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
-from numpy.typing import ArrayLike
 
-from .._core.errors import DefinitionError
+from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..periodic.htf import HTF
-from .compare import MultiplierComparison, compare_multipliers
+from .compare import MultiplierComparison, Multipliers, compare_multipliers
 
 
 class RationalFit(eqx.Module):
@@ -40,8 +40,8 @@ class RationalFit(eqx.Module):
     - `harmonic`, `sections`, `form`, `weighting`, `outputs`, `input`: what was fitted.
     """
 
-    numerator: Float[np.ndarray, "ny q+1"]
-    denominator: Float[np.ndarray, "ny p+1"]
+    numerator: Float[np.ndarray, "ny b"]
+    denominator: Float[np.ndarray, "ny a"]
     poles: Complex[np.ndarray, "ny p"]
     zeros: Complex[np.ndarray, "ny q"]
     multipliers: Complex[np.ndarray, "ny p"]
@@ -64,7 +64,7 @@ class RationalFit(eqx.Module):
         bottom = [polynomial(w[:, 0], self.denominator[i]) for i in columns]
         return delay * np.stack(top, axis=1) / np.stack(bottom, axis=1)
 
-    def compare(self, true: Complex[np.ndarray, " d"]) -> tuple[MultiplierComparison, ...]:
+    def compare(self, true: Multipliers) -> tuple[MultiplierComparison, ...]:
         """The multipliers of each output's fit beside the true ones."""
         return tuple(compare_multipliers(own, true) for own in self.multipliers)
 
@@ -114,7 +114,8 @@ def fit_rational(
     **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
 
     **Raises:** `DefinitionError` for a harmonic, output or input that is not there, for fewer
-    lines than coefficients, for NaN or, with relative weighting, zeros in H.
+    lines than coefficients, for NaN or, with relative weighting, zeros in H;
+    `ComputationError` if no start leads anywhere.
     """
     require_x64(htf.H)
     if form not in ("delayed", "direct"):
@@ -146,6 +147,8 @@ def fit_rational(
         h = jnp.asarray(h / rms)
         a, b, cost, converged = _fit(w, delay, h, jnp.asarray(weight), poles, zeros, max_steps)
         cost = np.where(np.isfinite(cost), cost, np.inf)
+        if not np.isfinite(cost).any():
+            raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
         lowest = cost <= cost.min() * (1 + 1e-9)
         best = int(np.argmax(lowest * (1 + np.asarray(converged))))
         fits.append(
@@ -160,12 +163,14 @@ def fit_rational(
         np.array(values) for values in zip(*fits, strict=True)
     )
     roots = np.stack([_roots(a) for a in denominator])
+    with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
+        multipliers = roots**htf.sections
     return RationalFit(
         numerator=numerator,
         denominator=denominator,
         poles=roots,
         zeros=np.stack([_roots(b) for b in numerator]),
-        multipliers=roots**htf.sections,
+        multipliers=multipliers,
         residual=residual,
         result=result.astype(int),
         harmonic=harmonic,
@@ -185,7 +190,7 @@ def _index(kind: str, wanted: str | int, names: tuple[str, ...]) -> int:
     raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
 
 
-def _roots(coefficients: Float[np.ndarray, " n+1"]) -> Complex[np.ndarray, " n"]:
+def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
     finite = finite[np.lexsort((-finite.imag, -np.abs(finite)))]
@@ -231,7 +236,8 @@ def _fit(
         # Coordinates in which the Jacobian at the start is orthonormal: those of `a` are so
         # nearly dependent for poles close to z = 1 that damping would stall.
         jacobian = jax.jacfwd(lambda a: numerator(a)[1])(start)
-        scale = jnp.linalg.qr(jacobian, mode="r")
+        floor = 1e-8 * (jnp.linalg.norm(jacobian) + 1e-8) * jnp.eye(poles)
+        scale = jnp.linalg.qr(jnp.concatenate([jacobian, floor]), mode="r")
 
         def place(s):
             return start + jax.scipy.linalg.solve_triangular(scale, s)
@@ -251,5 +257,5 @@ def _fit(
     return jax.lax.map(refine, starts)
 
 
-def _real(z: Complex[Array, "F n"]) -> Float[Array, "2F n"]:
+def _real(z: Complex[Array, "F n"]) -> Float[Array, "rows n"]:
     return jnp.concatenate([z.real, z.imag])

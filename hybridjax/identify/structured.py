@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
-from numpy.typing import ArrayLike
+from jax.typing import ArrayLike
+from jaxtyping import Complex, Float, Inexact
 
 from .._core.errors import DefinitionError
 from ..periodic.htf import HTF
 from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
-from .compare import MultiplierComparison, compare_multipliers
+from .compare import MultiplierComparison, Multipliers, compare_multipliers
 
 
 _RANK = 1e-13  # singular values below this part of the largest are rounding errors
@@ -41,7 +41,7 @@ class StructuredFit(eqx.Module):
     multipliers: Complex[np.ndarray, " d"]
     coefficients: Float[np.ndarray, " d"]
     residual: Float[np.ndarray, " ny"]
-    numerators: Complex[np.ndarray, "M degree+1 ny nu"]
+    numerators: Complex[np.ndarray, "M coefficients ny nu"]
     harmonics: tuple[int, ...] = eqx.field(static=True)
     sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -65,7 +65,7 @@ class StructuredFit(eqx.Module):
         H = H / _chi(np.exp(-2j * np.pi * f), self.coefficients)[:, None, None]
         return HTF(f, H, wanted, self.sections, self.inputs, self.outputs, "structured fit")
 
-    def compare(self, true: Complex[np.ndarray, " t"]) -> MultiplierComparison:
+    def compare(self, true: Multipliers) -> MultiplierComparison:
         """The multipliers beside the true ones, paired; printing it shows a table."""
         return compare_multipliers(self.multipliers, true)
 
@@ -186,7 +186,7 @@ class _Block(NamedTuple):
         kept = s > _RANK * s[0]
         return weight, u[:, kept], s[kept], vh[kept]
 
-    def projected(self, c: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows d+1"]:
+    def projected(self, c: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows columns"]:
         """What is left of z^{-jN} H, j = 0..d, when all numerators are projected out."""
         weight, u, _, _ = self._weighted_powers(c)
         columns = []
@@ -196,7 +196,7 @@ class _Block(NamedTuple):
             columns.append(np.concatenate([column.real.ravel(), column.imag.ravel()]))
         return np.stack(columns, axis=1)
 
-    def numerators(self, c: Float[np.ndarray, " d"]) -> Complex[np.ndarray, "R series"]:
+    def numerators(self, c: Float[np.ndarray, " d"]) -> Inexact[np.ndarray, "R series"]:
         weight, u, s, vh = self._weighted_powers(c)
         target = self._split(weight * _chi(self.lag, c)[:, None] * self.data)
         return vh.conj().T @ ((u.conj().T @ target) / s[:, None])

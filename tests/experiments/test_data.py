@@ -1,0 +1,93 @@
+"""Experiment data: simulation of linear models, summaries, bad records."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..periodic.conftest import blocks_at_random, simulate_blocks
+
+
+BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
+DESIGN = hj.multisine(sections=4, periods=5, f_max=2.0, inputs=("a", "b"))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hj.LDTP.from_blocks(*BLOCKS, inputs=("a", "b"))
+
+
+def test_simulation_from_rest_is_the_definition(model):
+    data = hj.simulate_experiments(model, DESIGN, discard=3)
+    assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
+    for u, y in zip(data.u, data.y, strict=True):
+        np.testing.assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
+    assert (data.inputs, data.outputs) == (("a", "b"), ("y0", "y1"))
+    assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"
+    assert hj.simulate_experiments(model, DESIGN).u.shape[1] == 25 * 4
+
+
+def test_periodic_start_has_no_transient(model):
+    data = hj.simulate_experiments(model, DESIGN, start="periodic", discard=5)
+    np.testing.assert_allclose(data.y[:, :20], data.y[:, 20:], atol=1e-15)
+    assert hj.simulate_experiments(model, DESIGN, start="periodic").u.shape[1] == 5 * 4
+
+
+@pytest.mark.parametrize(
+    "message, arguments",
+    {
+        "start must be": dict(start="cycle"),
+        "discard must not be negative": dict(discard=-1),
+        "the design is for N = 5": dict(design=hj.multisine(5, 4, 2.0, inputs=2)),
+        "and 1 inputs": dict(design=hj.multisine(4, 4, 2.0)),
+    }.items(),
+)
+def test_bad_simulations(model, message, arguments):
+    # The hook that checks types in these tests would be the first to refuse a wrong `start`.
+    simulate = getattr(hj.simulate_experiments, "__wrapped__", hj.simulate_experiments)
+    with pytest.raises(hj.DefinitionError, match=message):
+        simulate(model, **(dict(design=DESIGN) | arguments))
+
+
+def test_failed_experiments_are_named():
+    y = np.ones((80, 84 * 32, 1))
+    y[17, 41 * 32 + 21 :] = np.nan
+    result, failed_at = np.zeros(80, int), np.full(80, -1)
+    result[17], failed_at[17] = hj.Result.SECTION_MISSED, 41 * 32 + 21
+    data = hj.ExperimentData(
+        np.ones_like(y), y, sections=32, periods=64, result=result, failed_at=failed_at
+    )
+    assert data.summary() == (
+        "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"
+    )
+    assert data.ok.sum() == 79 and not data.ok[17]
+    assert "79/80 ok" in repr(data)
+    result[:8] = hj.Result.BLOW_UP
+    data = hj.ExperimentData(np.ones_like(y), y, sections=32, periods=64, result=result)
+    assert data.summary().endswith("and 4 more")
+
+
+GOOD = dict(u=np.ones((3, 12, 1)), y=np.ones((3, 12, 2)), sections=4, periods=3)
+HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
+
+
+@pytest.mark.parametrize(
+    "message, change",
+    {
+        "13 samples, not a multiple of N = 4": dict(u=np.ones((3, 13, 1)), y=np.ones((3, 13, 2))),
+        "longer than the record, 3 periods": dict(periods=4),
+        "u must have the shape": dict(u=np.ones((3, 12))),
+        r"not \(3, 12, 1\) and \(2, 12, 2\)": dict(y=np.ones((2, 12, 2))),
+        "y must hold real numbers, not complex128": dict(y=1j * np.ones((3, 12, 2))),
+        "u is not a rectangular array": dict(u=[[[1.0]], [[1.0, 2.0]]]),
+        "experiment 0: u is NaN or infinite at sample 7": dict(u=HOLE),
+        "result and failed_at": dict(result=[0, 0]),
+        "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
+        "`outputs` is": dict(outputs=("yM",)),
+        "must be at least 1": dict(sections=0),
+    }.items(),
+)
+def test_bad_records(message, change):
+    hj.ExperimentData(**GOOD)
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.ExperimentData(**(GOOD | change))

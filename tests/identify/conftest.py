@@ -1,0 +1,32 @@
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..periodic.conftest import hopper as hopper
+
+
+@pytest.fixture(scope="session")
+def exact(reference):
+    """The hopper's HTFs from the independent computation: 620 frequencies, all harmonics."""
+    data = reference("htf_exact_isochron")
+    H = data["H"].transpose(1, 0, 2)[..., None]
+    return hj.HTF(data["f"], H, tuple(range(-16, 16)), 32, "u", ("yM", "vM"), "exact")
+
+
+@pytest.fixture(scope="session")
+def multipliers():
+    return np.array(
+        [-0.248983334735609 + 0.699333251798004j, -0.248983334735609 - 0.699333251798004j]
+    )
+
+
+@pytest.fixture(scope="session")
+def paper_data(hopper):
+    """The paper's protocol on the linear model: 84 cycles from rest, the last 64 kept."""
+    return hj.simulate_experiments(hopper, hj.paper_design())
+
+
+@pytest.fixture(scope="session")
+def paper_estimate(paper_data):
+    return hj.estimate_htf(paper_data)

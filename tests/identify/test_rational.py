@@ -1,0 +1,106 @@
+"""The paper's parametric fit: its known bias, global optimum, bad input."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+import hybridjax as hj
+
+
+# |lambda error| of the fit to the exact H_0, (yM, vM), and how far the last digit may be off.
+BIAS = {
+    ("delayed", "uniform"): ((2.6e-3, 1.07e-2), 0.05e-3),
+    ("direct", "uniform"): ((3.6e-3, 2.2e-2), 0.3e-3),
+    ("delayed", "relative"): ((4.4e-2, 4.5e-2), 1e-3),
+}
+
+
+@pytest.mark.parametrize("form, weighting", BIAS)
+def test_the_bias_on_exact_data(form, weighting, exact, multipliers):
+    fit = hj.fit_rational(exact, form=form, weighting=weighting)
+    errors = [comparison.max_error for comparison in fit.compare(multipliers)]
+    np.testing.assert_allclose(errors, *BIAS[form, weighting][:1], atol=BIAS[form, weighting][1])
+    assert np.all(fit.result == hj.Result.OK)
+    np.testing.assert_array_equal(fit.multipliers, fit.poles**32)
+    assert (fit.form, fit.weighting, fit.outputs) == (form, weighting, ("yM", "vM"))
+
+
+def rational(f, numerator, denominator, sections, delay):
+    w = np.exp(-2j * np.pi * np.asarray(f) / sections)
+    top = sum(b * w ** (delay + r) for r, b in enumerate(numerator))
+    return top / sum(a * w**r for r, a in enumerate(denominator))
+
+
+@pytest.mark.parametrize("form", ["delayed", "direct"])
+@pytest.mark.parametrize("weighting", ["uniform", "relative"])
+def test_no_start_finds_a_better_fit(form, weighting, exact):
+    """Against scipy's solver over all coefficients, from 20 random pairs of poles."""
+    fit = hj.fit_rational(exact, output="vM", form=form, weighting=weighting)
+    delay, f, h = int(form == "delayed"), np.asarray(exact.f), np.asarray(exact[0])[:, 1, 0]
+    weight = 1 / np.abs(h) if weighting == "relative" else 1 / np.sqrt(np.mean(np.abs(h) ** 2))
+
+    def residual(x):
+        e = weight * (h - rational(f, x[2:], [1, *x[:2]], 32, delay)) / np.sqrt(len(h))
+        return np.concatenate([e.real, e.imag])
+
+    own = [*fit.denominator[0, 1:], *fit.numerator[0]]
+    np.testing.assert_allclose(np.linalg.norm(residual(own)), fit.residual[0], rtol=1e-9)
+    rng = np.random.default_rng(0)
+    for radius, angle in zip(rng.uniform(0.5, 1.0, 20), rng.uniform(0, 2, 20), strict=True):
+        a = [-2 * radius * np.cos(angle), radius**2]
+        columns = [rational(f, b, [1, *a], 32, delay) for b in ([1], [0, 1])]
+        columns = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
+        b = np.linalg.lstsq(columns, np.concatenate([h.real, h.imag]))[0]
+        found = scipy.optimize.least_squares(residual, [*a, *b], x_scale="jac", max_nfev=50)
+        assert np.linalg.norm(found.fun) > fit.residual[0] * (1 - 1e-6)
+
+
+@pytest.mark.parametrize("form", ["delayed", "direct"])
+def test_a_rational_function_is_found_exactly(form):
+    """Three poles, two zeros; evaluate, poles, zeros and gain of what was put in."""
+    f, numerator = np.linspace(0.1, 2.4, 40), np.array([2.0, -1.0, 0.3])
+    poles = np.array([0.9 + 0.3j, 0.9 - 0.3j, -0.5])
+    h = rational(f, numerator, np.poly(poles).real, 5, int(form == "delayed"))
+    fit = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2, form=form)
+    np.testing.assert_allclose(fit.poles[0], poles, atol=1e-7)
+    np.testing.assert_allclose(fit.numerator[0], numerator, atol=1e-6)
+    np.testing.assert_allclose(np.sort_complex(fit.zeros[0]), np.roots(numerator)[::-1], atol=1e-6)
+    np.testing.assert_allclose(fit.evaluate(f)[:, 0], h, atol=1e-6)
+    assert fit.residual[0] < 1e-7
+    # More poles than there are: the fit stays good and the true ones are among them.
+    more = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3, form=form)
+    assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)
+
+
+def test_one_output_of_several(exact):
+    both, one = hj.fit_rational(exact), hj.fit_rational(exact, output="vM")
+    assert one.outputs == ("vM",) and one.multipliers.shape == (1, 2)
+    np.testing.assert_allclose(one.multipliers[0], both.multipliers[1], atol=1e-12)
+    assert "yM: multipliers" in repr(both) and "delayed, uniform weighting" in repr(both)
+
+
+@pytest.mark.parametrize(
+    "message, arguments",
+    {
+        "there is no output 'xM'; the outputs are yM, vM": dict(output="xM"),
+        "there is no output 2": dict(output=2),
+        "there is no input 'v'": dict(input="v"),
+        "Harmonic 40|not stored": dict(harmonic=2),
+        "poles >= 1": dict(poles=0),
+        "too many for 3 frequencies": dict(poles=4, zeros=3),
+    }.items(),
+)
+def test_bad_arguments(message, arguments, exact):
+    few = hj.HTF(exact.f[:3], exact.H[16:17, :3], 0, 32, "u", ("yM", "vM"))
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.fit_rational(few, **arguments)
+
+
+def test_bad_values():
+    f, H = np.linspace(0.1, 0.9, 9), np.ones((1, 9, 1, 1), complex)
+    H[0, 3] = 0
+    with pytest.raises(hj.DefinitionError, match="zero at a frequency"):
+        hj.fit_rational(hj.HTF(f, H, 0, 4), weighting="relative")
+    H[0, 3] = np.nan
+    with pytest.raises(hj.DefinitionError, match="H_0 of y holds NaN"):
+        hj.fit_rational(hj.HTF(f, H, 0, 4))

@@ -1,0 +1,111 @@
+"""The structured fit: exact on exact data, robust on measured data, bad input."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+from hybridjax.identify.compare import compare_multipliers
+
+from ..periodic.conftest import blocks_at_random
+
+
+@pytest.mark.parametrize("harmonics", [None, 0, (-1, 0, 1), 1, (1, 2), (-16, -2, 2)])
+def test_the_hopper_is_found_exactly(harmonics, exact, multipliers):
+    fit = hj.fit_multipliers(exact, 2, harmonics)
+    assert fit.compare(multipliers).max_error < 2e-9
+    assert fit.residual.max() < 1e-9
+
+
+def test_the_paper_protocol(paper_estimate, hopper, multipliers):
+    fit = hj.fit_multipliers(paper_estimate, hopper)
+    assert fit.compare(multipliers).max_error < 1e-5
+    narrow = hj.fit_multipliers(paper_estimate, 2, (-2, -1, 0, 1, 2))
+    assert narrow.compare(multipliers).max_error < 1e-5
+
+
+def test_noise_of_a_tenth_of_the_output(paper_data, multipliers):
+    noise = np.random.default_rng(0).normal(size=paper_data.y.shape)
+    y = paper_data.y + 0.1 * np.std(paper_data.y, axis=(0, 1)) * noise
+    data = hj.ExperimentData(paper_data.u, y, sections=32, periods=64)
+    fit = hj.fit_multipliers(hj.estimate_htf(data), 2)
+    assert fit.compare(multipliers).max_error < 1e-3
+
+
+def test_evaluation_between_the_lines(exact, hopper):
+    fit = hj.fit_multipliers(exact, 2)
+    f = np.linspace(0.02, 9.9, 57)
+    assert fit.evaluate(f).error(hopper.htf(f)).max() < 1e-10
+    one = fit.evaluate(f, 1)
+    assert one.harmonics == (1,) and one.source == "structured fit"
+    with pytest.raises(hj.DefinitionError, match="harmonic 2 was not fitted"):
+        hj.fit_multipliers(exact, 2, (0, 1)).evaluate(f, (0, 2))
+
+
+SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.sampled_from(SHAPES), st.integers(0, 99))
+def test_random_systems(shape, seed):
+    """The state beyond the rank dies within one period, as dimensions fall to 2 or less."""
+    dims, ny, nu = shape
+    model = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu, gain=0.95))
+    N = len(dims)
+    htf = model.htf(np.linspace(0.01, N / 2 - 0.01, 12 * N))
+    fit = hj.fit_multipliers(htf, model)
+    true = model.multipliers()
+    polynomial = np.poly(true).real
+    np.testing.assert_allclose(fit.coefficients, polynomial[1:], atol=1e-8)
+    assert fit.evaluate(htf.f).error(htf).max() < 1e-8
+    assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
+
+
+def test_units_of_an_output_do_not_matter(paper_estimate):
+    scale = np.array([1e3, 1e-3])[:, None]
+    H = np.asarray(paper_estimate.H) * scale
+    other = hj.HTF(paper_estimate.f, H, paper_estimate.harmonics, 32)
+    np.testing.assert_allclose(
+        hj.fit_multipliers(other, 2).coefficients,
+        hj.fit_multipliers(paper_estimate, 2).coefficients,
+        rtol=1e-8,
+    )
+
+
+@pytest.mark.parametrize(
+    "message, arguments",
+    {
+        "order >= 1": dict(order=0),
+        "overhang >= 0": dict(order=2, overhang=-1),
+        "50 frequencies are too few .* 97 coefficients and 2 multipliers: 98": dict(
+            order=2, harmonics=1
+        ),
+        "50 frequencies are too few .* 129 coefficients": dict(order=3),
+    }.items(),
+)
+def test_bad_arguments(message, arguments, exact):
+    few = hj.HTF(exact.f[:50], exact.H[:, :50], exact.harmonics, 32)
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.fit_multipliers(few, **arguments)
+
+
+def test_the_number_of_frequencies_that_is_asked_for_suffices(exact, multipliers):
+    few = hj.HTF(exact.f[::6][:98], exact.H[:, ::6][:, :98], exact.harmonics, 32)
+    assert hj.fit_multipliers(few, 2, 1).compare(multipliers).max_error < 1e-6
+
+
+def test_bad_values(exact):
+    with pytest.raises(hj.DefinitionError, match="NaN or infinity"):
+        hj.fit_multipliers(hj.HTF(exact.f, exact.H * np.nan, exact.harmonics, 32), 2)
+    H = np.asarray(exact.H) * np.array([1.0, 0.0])[:, None]
+    with pytest.raises(hj.DefinitionError, match="the HTFs of y1 are zero"):
+        hj.fit_multipliers(hj.HTF(exact.f, H, exact.harmonics, 32), 2)
+
+
+def test_pairs_are_matched_by_distance():
+    comparison = compare_multipliers(np.array([0.1, -0.5 - 0.2j, -0.5 + 0.21j]), [-0.5 + 0.2j, 0.1])
+    np.testing.assert_array_equal(comparison.true, [-0.5 + 0.2j, 0.1])
+    np.testing.assert_allclose(comparison.error, [0.01, 0.0], atol=1e-15)
+    assert "-0.500000000 +0.210000000i" in repr(comparison)
+    with pytest.raises(hj.DefinitionError, match="no multiplier to compare"):
+        compare_multipliers(np.zeros(0), [1.0])
