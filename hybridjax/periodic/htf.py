@@ -85,7 +85,8 @@ class HTF(eqx.Module):
         count = self.f.shape[-1]
         span = ""
         if count and not is_traced(self.f):
-            span = f" {float(jnp.min(self.f)):.4g} to {float(jnp.max(self.f)):.4g}"
+            f = np.asarray(self.f)
+            span = f" {f.min():.4g} to {f.max():.4g}"
         low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
         dense = number == high - low + 1
         shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))

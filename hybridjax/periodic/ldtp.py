@@ -284,7 +284,7 @@ class LDTP(eqx.Module):
         if x0 is None:
             return jnp.zeros(d)
         x0 = real_array("x0", x0, ndim=1)
-        true = d if is_traced(self.dims) else int(self.dims[start % self.sections])
+        true = d if is_traced(self.dims) else int(np.asarray(self.dims)[start % self.sections])
         if x0.shape[0] not in (d, true):
             raise DefinitionError(
                 f"`x0` has {x0.shape[0]} entries, but section {start % self.sections} has {true} "
@@ -326,8 +326,10 @@ def _dimensions(dims, sections, d):
     dims = dims if isinstance(dims, jax.Array) else np.asarray(dims)
     if dims.shape != (sections,) or not np.issubdtype(dims.dtype, np.integer):
         raise DefinitionError(f"`dims` must hold {sections} integers, one per section.")
-    if not is_traced(dims) and not np.all((dims >= 1) & (dims <= d)):
-        raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
+    if not is_traced(dims):
+        dims = np.asarray(dims)
+        if np.any((dims < 1) | (dims > d)):
+            raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
     return jnp.asarray(dims)
 
 

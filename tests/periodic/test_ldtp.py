@@ -105,6 +105,21 @@ def test_blocks_may_be_traced(synthetic):
         last(jnp.eye(2))  # A[0] must be (1, 2)
 
 
+def test_systems_known_outside_of_jit_work_inside(synthetic):
+    @jax.jit
+    def inside(u):
+        ldtp = hj.LDTP(synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        htf = ldtp.htf([0.3, 0.4], (0, 1))
+        repr(ldtp), repr(htf), repr(synthetic.htf([0.3]))
+        x0 = synthetic.periodic_state(u, 2)
+        return ldtp.simulate(u, x0[:3]), htf.error(synthetic.htf([0.3, 0.4], (0, 1)))
+
+    u = np.random.default_rng(2).normal(size=(12, 2))
+    y, error = inside(u)
+    np.testing.assert_allclose(y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13)
+    np.testing.assert_allclose(error, 0, atol=1e-14)
+
+
 def test_names_and_repr(synthetic, hopper):
     assert (synthetic.inputs, synthetic.outputs) == (("u0", "u1"), ("y0", "y1"))
     assert repr(hopper) == "LDTP(32 sections, dimension 2 to 4, inputs (u), outputs (yM, vM))"
