@@ -6,6 +6,7 @@ crossing is found also where the guard dips below zero and returns within the st
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -64,19 +65,22 @@ def first_crossing(
     hi = jnp.where(first, sa, jnp.where(second, sb, 1.0))
     found = first | second | third
 
-    s = 0.5 * (lo + hi)
-    for _ in range(10):  # Newton, kept inside the shrinking bracket
+    def newton(_, carry):
+        """A Newton step, kept inside the shrinking bracket."""
+        s, lo, hi = carry
         value = cubic(s)
         lo, hi = jnp.where(value > 0, s, lo), jnp.where(value > 0, hi, s)
-        newton = s - _divide(value, slope(s))
-        s = jnp.where((newton >= lo) & (newton <= hi), newton, 0.5 * (lo + hi))
+        guess = s - _divide(value, slope(s))
+        return jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi)), lo, hi
+
+    s, *_ = jax.lax.fori_loop(0, 10, newton, (0.5 * (lo + hi), lo, hi))
 
     scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
     touch = near = jnp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
         touch = touch | (dips & (jnp.abs(value) <= TOUCH * scale))
-        near = near | (dips & (value > 0) & (value < NEAR * scale))
+        near = near | (dips & (value > TOUCH * scale) & (value < NEAR * scale))
     return Crossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
 
 

@@ -46,32 +46,60 @@ def move(
 ) -> Moved:
     """Flow every lane to its target under a constant input.
 
-    Lanes fail one by one, with a code each; nothing is raised. Exact first derivatives (and
-    second, through crossings too) of times and states with respect to everything that is a
+    Lanes fail one by one, with a code each; nothing is raised. Times and states have exact
+    derivatives (first and second, through crossings too) with respect to everything that is a
     floating-point array: states, times, inputs, parameters, the target.
     """
+    h, result = _defaults(system, lanes, u, target, settings, h, result)
+    return _move(system, lanes, u, target, h, result, settings)
+
+
+def record(
+    system: HybridSystem,
+    lanes: Lanes,
+    u: Float[Array, "nu L"],
+    target: Target,
+    settings: Settings,
+    h: Float[Array, " L"] | None = None,
+    result: Int[Array, " L"] | None = None,
+) -> tuple[Moved, Tape]:
+    """As `move`, with a record of every step, and without derivatives."""
+    arguments = (
+        system,
+        lanes,
+        u,
+        target,
+        *_defaults(system, lanes, u, target, settings, h, result),
+    )
+    found = _search(*(_constant(x) for x in arguments), settings, True)
+    return Moved(found.lanes, found.h, found.result), found.tape
+
+
+def follow(
+    system: HybridSystem, lanes: Lanes, u: Float[Array, "nu L"], target: Target, tape: Tape
+) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
+    """Times and states at the end of a recorded piece of flow, differentiable."""
+    return replay(Structure(system), lanes, u, target, tape.h, tape.code)
+
+
+def _defaults(system, lanes, u, target, settings, h, result):
     if h is None:
         h = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings.rtol)
     if result is None:
         result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
-    h = jax.lax.stop_gradient(h)
-    return _move(system, lanes, u, target, h, result, settings)
+    return jax.lax.stop_gradient(h), result
 
 
-def trace(
-    system: HybridSystem, lanes: Lanes, u: Float[Array, "nu L"], target: Target, settings: Settings
-) -> tuple[Moved, Tape]:
-    """As `move`, with a record of every step. Not differentiable."""
-    s = Structure(system)
-    h = initial_step(s, lanes, u, target.limit - lanes.t, settings.rtol)
-    result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
-    found = _search(s, lanes, u, target, h, result, settings, tape=True)
-    return Moved(found.lanes, found.h, found.result), found.tape
+def _constant(tree):
+    return jax.tree_util.tree_map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree
+    )
 
 
-def _search(s, lanes, u, target, h, result, settings, tape):
+@eqx.filter_jit
+def _search(system, lanes, u, target, h, result, settings, tape):
     return search(
-        s,
+        Structure(system),
         lanes,
         u,
         target,
@@ -86,28 +114,26 @@ def _search(s, lanes, u, target, h, result, settings, tape):
 
 @eqx.filter_custom_jvp
 def _move(system, lanes, u, target, h, result, settings):
-    found = _search(Structure(system), lanes, u, target, h, result, settings, tape=False)
+    found = _search(system, lanes, u, target, h, result, settings, False)
     return Moved(found.lanes, found.h, found.result)
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     system, lanes, u, target, h, result, settings = primals
-    found = _search(Structure(system), lanes, u, target, h, result, settings, tape=True)
-    h_tape, code = found.tape.h, found.tape.code
+    moved, tape = record(system, lanes, u, target, settings, h, result)
 
-    def follow(system, t, q, u, target):
+    def ends(system, t, q, u, target):
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
-        return replay(Structure(system), start, u, target, h_tape, code)
+        return follow(system, start, u, target, tape)
 
     t_system, t_lanes, t_u, t_target, *_ = tangents
     (t, q), (t_t, t_q) = eqx.filter_jvp(
-        follow,
+        ends,
         (system, lanes.t, lanes.q, u, target),
         (t_system, t_lanes.t, t_lanes.q, t_u, t_target),
     )
-    end = eqx.tree_at(lambda x: (x.t, x.q), found.lanes, (t, q))
-    out = Moved(end, found.h, found.result)
+    out = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (t, q))
     nothing = jax.tree_util.tree_map(lambda _: None, out)
     d_out = eqx.tree_at(
         lambda x: (x.lanes.t, x.lanes.q), nothing, (t_t, t_q), is_leaf=lambda x: x is None

@@ -11,10 +11,12 @@ from jaxtyping import Array, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
+from .events import apply_resets, scheduled_time
 from .lanes import for_each_chart, Lanes, only
-from .search import apply_resets, ARRIVE_LEVEL, ARRIVE_TIME, chart_field, IDLE, settle
+from .search import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .step import rk_step
 from .target import Target
+from .watch import chart_field, settle, watched
 
 
 def replay(
@@ -34,18 +36,12 @@ def replay(
         def move(carry):
             t, q, chart = carry
             by_clock = (code >= 0) & scheduled[code]
-            due = _scheduled_time(s, code, t + h)
+            due = scheduled_time(s, code, t + h)
             h1 = jnp.where(code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h))
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock, -1, which)
             t, q = _advance(s, t, q, chart, code != IDLE, u, target, h1, which)
-            fired = jnp.maximum(code, -1)
-            moved = Lanes(t, chart, q, lanes.armed, lanes.events, lanes.pace)
-            q, chart = jax.lax.cond(
-                (fired >= 0).any(),
-                lambda: apply_resets(s, moved, fired, u),
-                lambda: (q, chart),
-            )
+            q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
         return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
@@ -66,21 +62,11 @@ def _advance(s, t, q, chart, moves, u, target, h, which):
         q1, t1 = rk_step(chart_field(s, a, u0), t0, q0, h0).q, t0 + h0
 
         def land():
-            past, q2, *_ = settle(s, a, t1, q1, u0, index, crossing, target)
-            return t1 + past, q2
+            settled = settle(s, a, target, t1, q1, u0, index, crossing)
+            return t1 + settled.past, settled.q
 
-        t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
+        if watched(s, a, target):
+            t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
         return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
 
     return for_each_chart(s, chart, moves, work, (t, q))
-
-
-def _scheduled_time(s: Structure, code, t):
-    """Time of the scheduled event `code` that lies at t up to rounding, as a smooth function."""
-    time = t
-    for g, transition in enumerate(s.transitions):
-        schedule = transition.guard
-        if isinstance(schedule, Scheduled):
-            k = jax.lax.stop_gradient(jnp.round((t - schedule.offset) / schedule.period))
-            time = jnp.where(code == g, schedule.offset + k * schedule.period, time)
-    return time

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import numpy as np
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .tableau import VERNER65
+from .tableau import VERNER76
 
 
 LaneField = Callable[[jax.Array, jax.Array], jax.Array]
@@ -22,8 +23,6 @@ class Step(NamedTuple):
 
     q: Float[Array, "n L"]
     """State at t + h."""
-    f0: Float[Array, "n L"]
-    """Field at the start."""
     f1: Float[Array, "n L"]
     """Field at the end."""
     error: Float[Array, "n L"]
@@ -33,13 +32,22 @@ class Step(NamedTuple):
 def rk_step(
     field: LaneField, t: Float[Array, " L"], q: Float[Array, "n L"], h: Float[Array, " L"]
 ) -> Step:
-    """One step of Verner's 6(5) pair from (t, q) over h."""
-    stages = [field(t, q)]
-    for row, c in zip(VERNER65.a_lower, VERNER65.c, strict=True):
-        point = q + h * _combine(row, stages)
-        stages.append(field(t + c * h, point))
-    # First same as last: the last stage is evaluated at the solution itself.
-    return Step(point, stages[0], stages[-1], h * _combine(VERNER65.b_error, stages))
+    """One step of Verner's 7(6) pair from (t, q) over h."""
+    n = VERNER76.num_stages
+    A = np.zeros((n, n))
+    for k, row in enumerate(VERNER76.a_lower):
+        A[k + 1, : k + 1] = row
+    C = np.concatenate([[0.0], VERNER76.c])
+
+    def stage(K, xs):
+        row, c, k = xs
+        point = q + h * jnp.tensordot(row, K, 1)
+        return K.at[k].set(field(t + c * h, point)), None
+
+    K, _ = jax.lax.scan(stage, jnp.zeros((n, *q.shape)), (A, C, np.arange(n)))
+    end = q + h * jnp.tensordot(VERNER76.b_sol, K, 1)
+    error = h * jnp.tensordot(VERNER76.b_error, K, 1)
+    return Step(end, field(t + h, end), error)
 
 
 def midpoint_step(

@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result
@@ -43,3 +44,11 @@ class Target(eqx.Module):
     levels: AbstractLevels | None
     missed: Result = eqx.field(static=True)
     """The code of a lane that does not arrive."""
+
+
+def until(time: Float[Array, " L"]) -> Target:
+    """The target of lanes that flow to a given time."""
+    L = time.shape[0]
+    none = jnp.full(L, -1, jnp.int32)
+    far = jnp.full(L, jnp.inf)
+    return Target(time, none, none, jnp.nextafter(time, far), far, None, None, Result.EVENT_MISSED)

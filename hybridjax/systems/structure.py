@@ -15,8 +15,13 @@ import numpy as np
 from .._core.errors import DefinitionError
 from .chart import Chart
 from .output import Output
-from .system import HybridSystem
+from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether a JAX transformation is at work on some leaf of `tree`."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree_util.tree_leaves(tree))
 
 
 def as_vector(value: Any) -> jax.Array:
@@ -31,6 +36,7 @@ class Structure:
 
     def __init__(self, system: HybridSystem):
         self.system = system
+        self.drive = system.drive if isinstance(system, Driven) else None
         self.charts: list[Chart] = list(system.charts().values())
         self.names: tuple[str, ...] = tuple(system.charts())
         self.transitions: list[Transition] = list(system.transitions())
@@ -49,15 +55,17 @@ class Structure:
             raise DefinitionError(f"there is no event '{name}'; events are {_list(names)}.")
         return names.index(name)
 
-    def chart_input(self, a: int, u: jax.Array) -> jax.Array:
+    def chart_input(self, a: int, t, u: jax.Array) -> jax.Array:
         """g_a(û): the inputs that chart a uses."""
+        if self.drive is not None:
+            u = u + jnp.broadcast_to(jnp.asarray(self.drive(t), float), u.shape)
         names = self.charts[a].inputs
         if names is None:
             return u
         return u[np.array([self.system.inputs.index(n) for n in names], int)]
 
     def field(self, a: int, t, q, u) -> jax.Array:
-        return as_vector(self.charts[a].field(t, q, self.chart_input(a, u)))
+        return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a."""
@@ -74,17 +82,19 @@ class Structure:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transitions[g]
         a = self.chart_index(tr.source)
-        return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, u)), float)
+        return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, t, u)), float)
 
     def reset(self, g: int, t, q, u) -> jax.Array:
         tr = self.transitions[g]
-        return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), u)))
+        return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), t, u)))
 
     def enabled(self, g: int, t, q, u) -> jax.Array:
         tr = self.transitions[g]
         if tr.enabled is None:
             return jnp.asarray(True)
-        return jnp.asarray(tr.enabled(t, q, self.chart_input(self.chart_index(tr.source), u)), bool)
+        return jnp.asarray(
+            tr.enabled(t, q, self.chart_input(self.chart_index(tr.source), t, u)), bool
+        )
 
     def state_function(self, name: str, a: int) -> Callable[[Any, Any, Any], Any] | None:
         """The state called `name` in chart a as a function (t, q, u), `None` if it is not there."""
@@ -132,6 +142,10 @@ class Outputs:
             values.append(jnp.asarray(value, float).reshape(()))
         return jnp.stack(values) if values else jnp.zeros(0)
 
+    def defined(self, a: int) -> bool:
+        """Whether all outputs are defined in chart a."""
+        return all(self._function(item, a) is not None for item in self.items)
+
     def require(self, a: int) -> None:
         """Raise if some output is not defined in chart a."""
         for item, name in zip(self.items, self.names, strict=True):
@@ -150,7 +164,7 @@ class Outputs:
             function = function.get(self.structure.names[a])
         if function is None:
             return None
-        return lambda t, q, u: function(t, q, self.structure.chart_input(a, u))
+        return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))
 
 
 def check_system(system: HybridSystem) -> None:
@@ -164,7 +178,11 @@ def check_system(system: HybridSystem) -> None:
             "e.g. `VerticalHopper()`."
         )
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
-        if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(leaf)):
+        if (
+            jnp.issubdtype(leaf.dtype, jnp.inexact)
+            and not is_traced(leaf)
+            and not np.all(np.isfinite(leaf))
+        ):
             raise DefinitionError(
                 f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."

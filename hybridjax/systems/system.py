@@ -1,7 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -45,7 +45,9 @@ class HybridSystem(eqx.Module):
 
         def transitions(self):
             bounce = lambda t, q, u: (q[0], -self.restitution * q[1])
-            return (hj.Transition("bounce", "flight", "flight", lambda t, q, u: q[0], reset=bounce),)
+            return (
+                hj.Transition("bounce", "flight", "flight", lambda t, q, u: q[0], reset=bounce),
+            )
     ```
 
     `charts` (and where there are events, `transitions`) are written by every system; `period`,
@@ -77,3 +79,26 @@ class HybridSystem(eqx.Module):
     def guess(self) -> Guess | None:
         """A start for the search of the limit cycle, if the model knows one."""
         return None
+
+
+class Driven(HybridSystem):
+    """`system` with an input that is a function of time, added to the piecewise constant one."""
+
+    system: HybridSystem
+    drive: Callable[[Any], Any]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return self.system.inputs
+
+    def charts(self):
+        return self.system.charts()
+
+    def transitions(self):
+        return self.system.transitions()
+
+    def period(self):
+        return self.system.period()
+
+    def outputs(self):
+        return self.system.outputs()

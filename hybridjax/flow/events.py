@@ -1,0 +1,140 @@
+"""What happens at events: resets, arming, schedules, and the signs of Zeno."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..systems.structure import Structure
+from ..systems.transition import Scheduled
+from .lanes import by_lane, Lanes, only
+from .target import until
+from .watch import Watch, watch
+
+
+# A watched function counts as zero if its rate would have made its value in this fraction of the
+# time span at hand.
+ZERO = 1e-12
+# Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
+_ZENO_STREAK, _ZENO_REST = 10, 1e-3
+
+
+def start_lanes(
+    s: Structure,
+    t: Float[Array, " L"],
+    chart: Int[Array, " L"],
+    q: Float[Array, "d L"],
+    span: Float[Array, ""],
+) -> Lanes:
+    """Lanes with fresh bookkeeping, at zero input; guards that are positive are armed.
+
+    `span` is the time scale on which a guard's value is judged to be zero.
+    """
+    L = t.shape[0]
+    all_lanes = jnp.ones(L, bool)
+    seen = watch(s, t, chart, q, jnp.zeros((s.nu, L)), until(t), all_lanes)
+    armed = (seen.value > ZERO * span * jnp.abs(seen.rate)) & mine(s, chart)
+    pace = jnp.zeros((4, L)).at[1].set(jnp.inf)
+    return Lanes(t, chart, q, armed[:-1], jnp.zeros(L, jnp.int32), pace)
+
+
+def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "G+1 L"]:
+    """Which rows of a `Watch` belong to the chart of each lane (the target's row to all)."""
+    source = jnp.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
+    return (source == chart) | (source == -1)
+
+
+def rearm(
+    s: Structure,
+    lanes: Lanes,
+    seen: Watch,
+    fired: Int[Array, " L"],
+    together: Bool[Array, " L"],
+    span: Float[Array, " L"],
+) -> Lanes:
+    """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
+
+    A guard that is zero there waits until it has left zero. The one exception are events at the
+    same instant: where another guard of the old chart was at its zero too (`together`), a guard
+    other than the one that fired, at zero and falling, is still due.
+    """
+    value, rate = seen.value[:-1], seen.rate[:-1]
+    width = ZERO * span * jnp.abs(rate)
+    other = jnp.arange(len(s.transitions))[:, None] != fired
+    due = together & other & (jnp.abs(value) <= width) & (rate < 0)
+    armed = ((value > width) | due) & mine(s, lanes.chart)[:-1]
+    return eqx.tree_at(lambda x: x.armed, lanes, jnp.where(fired >= 0, armed, lanes.armed))
+
+
+def apply_resets(
+    s: Structure, t, chart, q, u: Float[Array, "nu L"], fired: Int[Array, " L"]
+) -> tuple[Float[Array, "d L"], Int[Array, " L"]]:
+    """States and charts after the transitions `fired` (-1: none)."""
+    for g, transition in enumerate(s.transitions):
+        here = fired == g
+        n = s.dims[s.chart_index(transition.source)]
+        b = s.chart_index(transition.target)
+
+        def work(carry, g=g, n=n, b=b, here=here):
+            q, chart = carry
+            arguments = only(here, t), only(here, q[:n]), only(here, u)
+            new = by_lane(lambda t, q, u: s.reset(g, t, q, u))(*arguments)
+            new = jnp.zeros_like(q).at[: s.dims[b]].set(new)
+            return jnp.where(here, new, q), jnp.where(here, b, chart)
+
+        q, chart = jax.lax.cond(here.any(), work, lambda carry: carry, (q, chart))
+    return q, chart
+
+
+def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]:
+    """Whether the predicates of the transitions `which` hold; True where there is none."""
+    out = jnp.ones(t.shape, bool)
+    for g, transition in enumerate(s.transitions):
+        if transition.enabled is not None:
+            here = which == g
+            n = s.dims[s.chart_index(transition.source)]
+            arguments = only(here, t), only(here, q[:n]), only(here, u)
+            holds = by_lane(lambda t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
+            out = jnp.where(here, holds, out)
+    return out
+
+
+def next_schedule(s: Structure, t: Float[Array, " L"], chart: Int[Array, " L"]):
+    """Time of the next scheduled event after t (infinity if there is none), and its transition."""
+    best, which = jnp.full_like(t, jnp.inf), jnp.full_like(chart, -1)
+    for g, transition in enumerate(s.transitions):
+        schedule = transition.guard
+        if isinstance(schedule, Scheduled):
+            k = jnp.floor((t - schedule.offset) / schedule.period + 1e-9) + 1
+            time = schedule.offset + k * schedule.period
+            sooner = (chart == s.chart_index(transition.source)) & (time < best)
+            best, which = jnp.where(sooner, time, best), jnp.where(sooner, g, which)
+    return best, which
+
+
+def scheduled_time(s: Structure, fired: Int[Array, " L"], t: Float[Array, " L"]):
+    """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
+    its period and offset; t itself for other events."""
+    time = t
+    for g, transition in enumerate(s.transitions):
+        schedule = transition.guard
+        if isinstance(schedule, Scheduled):
+            k = jax.lax.stop_gradient(jnp.round((t - schedule.offset) / schedule.period))
+            time = jnp.where(fired == g, schedule.offset + k * schedule.period, time)
+    return time
+
+
+def keep_pace(
+    pace: Float[Array, "4 L"], moved: Float[Array, " L"], event: Bool[Array, " L"]
+) -> tuple[Float[Array, "4 L"], Bool[Array, " L"]]:
+    """Bookkeeping for Zeno: do the intervals between events shrink with a sum that converges?"""
+    since, gap, streak, total = pace
+    since = since + moved
+    ratio = jnp.where(gap > 0, since / jnp.where(gap > 0, gap, 1.0), 0.0)
+    shrinks = ratio < 0.999
+    streak = jnp.where(event, jnp.where(shrinks, streak + 1, 0.0), streak)
+    total = jnp.where(event, jnp.where(shrinks, total + since, 0.0), total)
+    rest = since * ratio / (1 - jnp.minimum(ratio, 0.999))
+    zeno = event & (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
+    gap, since = jnp.where(event, since, gap), jnp.where(event, 0.0, since)
+    return jnp.stack([since, gap, streak, total]), zeno

@@ -1,0 +1,218 @@
+"""Single trajectories with their events, dense enough to plot."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.errors import ComputationError, DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..systems.structure import check_system, Structure
+from ..systems.system import Driven, Guess, HybridSystem
+from .events import start_lanes
+from .move import record, Settings
+from .search import IDLE
+from .target import until
+from .watch import slopes
+
+
+# Rows of a tape that is filled in one compiled call.
+_ROWS = 512
+
+
+class Event(NamedTuple):
+    """One event of a trajectory."""
+
+    time: float
+    name: str
+    source: str
+    target: str
+    before: dict[str, float]
+    """State before the reset, by name."""
+    after: dict[str, float]
+    """State after the reset, by name."""
+
+
+class Trajectory(eqx.Module):
+    """A hybrid trajectory: steps, events, and interpolation between steps.
+
+    **Fields:** `t` (n,), the ends of the steps; `chart` (n,), the chart after each; `before` and
+    `after` (n, d), the states at each before and after an event's reset; `slope_before`,
+    `slope_after` (n, d), their time derivatives; `event` (n,), the transition that fired there or
+    -1; `result`, what became of it.
+    """
+
+    system: HybridSystem
+    t: np.ndarray
+    chart: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    slope_before: np.ndarray
+    slope_after: np.ndarray
+    event: np.ndarray
+    result: Result = eqx.field(static=True)
+
+    @property
+    def events(self) -> list[Event]:
+        """The events in order of time."""
+        s = Structure(self.system)
+        found = []
+        for k in np.flatnonzero(self.event >= 0):
+            tr = s.transitions[self.event[k]]
+            a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+            before = dict(zip(s.charts[a].states, self.before[k].tolist(), strict=False))
+            after = dict(zip(s.charts[b].states, self.after[k].tolist(), strict=False))
+            found.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
+        return found
+
+    def dense(self, per_step: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (p,), charts (p,) and states (p, d), with `per_step` points in every step.
+
+        Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
+        the same time.
+        """
+        h = np.diff(self.t)[:, None]
+        x = np.linspace(0.0, 1.0, per_step + 1)[None, :]
+        q0, q1 = self.after[:-1, None], self.before[1:, None]
+        d0, d1 = self.slope_after[:-1, None], self.slope_before[1:, None]
+        y, hh = x[..., None], h[..., None]
+        q = (
+            q0 * (1 + 2 * y) * (1 - y) ** 2
+            + q1 * y**2 * (3 - 2 * y)
+            + hh * y * (1 - y) * (d0 * (1 - y) - d1 * y)
+        )
+        t = self.t[:-1, None] + h * x
+        chart = np.broadcast_to(self.chart[:-1, None], t.shape)
+        keep = np.ones(t.shape, bool)
+        keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
+        return t[keep], chart[keep], q[keep]
+
+    def __call__(self, *names: str, per_step: int = 8) -> tuple[np.ndarray, ...]:
+        """Times and the named states or outputs (at zero input), dense enough to plot.
+
+        Values are NaN in charts where they are not defined.
+        """
+        t, chart, q = self.dense(per_step)
+        return (t, *_evaluate(self.system, names, t, chart, q))
+
+
+def simulate(
+    system: HybridSystem,
+    chart: str,
+    state,
+    duration: float,
+    *,
+    time: float = 0.0,
+    input: Callable | np.ndarray | float | None = None,
+    settings: Settings | None = None,
+    max_steps: int = 100_000,
+    throw: bool = True,
+) -> Trajectory:
+    """Follow one trajectory through any number of events.
+
+    **Arguments:**
+
+    - `chart`, `state`, `time`: where it starts. A guard that is zero there is not an event.
+    - `duration`: how long it lasts, in the system's unit of time.
+    - `input`: a constant input (nu,), or a function of time that returns one. Zero by default.
+    - `max_steps`: bound on the number of steps.
+    - `throw`: raise if the trajectory ends early; otherwise its `result` says why it did.
+
+    **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
+    and the step limit, if `throw`.
+    """
+    require_x64(system)
+    check_system(system)
+    s = Structure(system)
+    start = Guess(chart, state, time)
+    a = s.chart_index(chart)
+    if start.state.shape != (s.dims[a],):
+        raise DefinitionError(
+            f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
+            f"shape ({s.dims[a]},); it has {start.state.shape}."
+        )
+    if not np.all(np.isfinite(start.state)) or not np.isfinite(start.time):
+        raise DefinitionError(f"the start of a trajectory must be finite; got {start.state}.")
+    if not (np.isfinite(duration) and duration > 0):
+        raise DefinitionError(f"the duration must be positive and finite; got {duration}.")
+    settings = Settings() if settings is None else settings
+    if callable(input):
+        system, u = Driven(system, input), jnp.zeros((s.nu, 1))
+    else:
+        u = jnp.broadcast_to(jnp.asarray(0.0 if input is None else input, float), (s.nu,))[:, None]
+
+    end = start.time + duration
+    lanes = _start(system, start.time[None], a, start.state, jnp.asarray(duration, float))
+    rows = [(lanes.t, lanes.q, lanes.q, lanes.chart, jnp.full(1, -1))]
+    h, steps = None, 0
+    while True:
+        moved, tape = _piece(system, lanes, u, end, settings, h)
+        used = np.asarray(tape.code[:, 0] != IDLE)
+        rows.append(
+            (tape.t[used], tape.before[used, :, 0].T, tape.after[used, :, 0].T)
+            + (tape.chart[used, 0], tape.code[used, 0])
+        )
+        lanes, h, steps = moved.lanes, moved.h, steps + _ROWS
+        result = Result(int(moved.result[0]))
+        if result != Result.STEP_LIMIT or steps >= max_steps:
+            break
+    t, before, after, charts, event = (
+        np.concatenate([np.asarray(x[k]).reshape(shape) for x in rows], axis=-1)
+        for k, shape in ((0, -1), (1, (s.d, -1)), (2, (s.d, -1)), (3, -1), (4, -1))
+    )
+    source = np.concatenate([charts[:1], charts[:-1]])
+    trajectory = Trajectory(
+        system,
+        t,
+        charts,
+        before.T,
+        after.T,
+        _slopes(system, t, source, before, u).T,
+        _slopes(system, t, charts, after, u).T,
+        event,
+        result,
+    )
+    if throw and result != Result.OK:
+        raise ComputationError(
+            f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "
+            f"{result.message}. Use `throw=False` to look at it."
+        )
+    return trajectory
+
+
+@eqx.filter_jit
+def _start(system, t, a, state, span):
+    s = Structure(system)
+    q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
+    return start_lanes(s, t, jnp.full(1, a, jnp.int32), q, span)
+
+
+@eqx.filter_jit
+def _piece(system, lanes, u, end, settings, h):
+    settings = dataclasses.replace(settings, max_steps=_ROWS)
+    return record(system, lanes, u, until(end[None]), settings, h)
+
+
+@eqx.filter_jit
+def _slopes(system, t, chart, q, u):
+    """Fields at rows of states, (d, n)."""
+    s = Structure(system)
+    return slopes(s, t, chart, q, jnp.broadcast_to(u, (s.nu, t.shape[0])))
+
+
+def _evaluate(system, names, t, chart, q):
+    """Outputs (p,) each at points of trajectories, NaN where not defined."""
+    s = Structure(system)
+    outputs = s.resolve_outputs(names)
+    values = np.full((len(names), t.shape[0]), np.nan)
+    for a in range(len(s.charts)):
+        here = chart == a
+        if here.any():
+            z = jax.vmap(lambda t, q, a=a: outputs(a, t, q, jnp.zeros(s.nu)))
+            values[:, here] = z(t[here], q[here, : s.dims[a]]).T
+    return values

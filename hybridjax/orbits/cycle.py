@@ -1,0 +1,476 @@
+"""Limit cycles: fixed points of the return map, by Newton with its exact Jacobian."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Complex, Float, Int
+
+from .._core.errors import ComputationError, DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..flow.events import start_lanes
+from ..flow.lanes import Lanes
+from ..flow.move import move, Settings
+from ..flow.sections import AtEvent, Crossing, ListLevels
+from ..flow.target import Target
+from ..flow.trajectory import simulate, Trajectory
+from ..flow.watch import slopes
+from ..periodic.multipliers import product_eigenvalues
+from ..systems.structure import check_system, is_traced, Structure
+from ..systems.system import Guess, HybridSystem
+from .jacobian import flow_jacobian
+
+
+# Pieces into which one turn is cut: their Jacobians are the factors of the monodromy.
+LEGS = 16
+# An autonomous turn flows freely for this fraction of the expected period, then to the section.
+_FREE = 0.75
+# J - I counts as singular below this fraction of its largest singular value.
+_SINGULAR = 1e-7
+
+DEFAULT = Settings(rtol=1e-12, atol=1e-12)
+
+
+class _Plane(eqx.Module):
+    """The hyperplane through a point, across the flow."""
+
+    point: Array
+    normal: Array
+
+    def __call__(self, t, q):
+        return jnp.dot(q - self.point, self.normal)
+
+
+class LimitCycle(eqx.Module):
+    """A periodic orbit of a hybrid system.
+
+    **Fields:**
+
+    - `period`: in the system's unit of time.
+    - `start`: the state at which it is anchored, on the section `base` (a clock section at
+        `start.t` if `base` is `None`).
+    - `legs`: states at the beginnings of the pieces into which the turn is cut.
+    - `factors`, `dims`: Jacobians of the flow over the pieces, padded with zeros. The valid block
+        of `factors[n]` is [:dims[n+1], :dims[n]].
+    - `residual`: largest distance between `start` and where it is after one period.
+    - `iterations`: Newton steps taken.
+    - `result`: a `Result` code.
+    - `settings`: accuracy of the flow.
+    """
+
+    system: HybridSystem
+    base: Crossing | AtEvent | None
+    period: Float[Array, ""]
+    start: Lanes
+    legs: Lanes
+    factors: Float[Array, "K d d"]
+    dims: Int[Array, " K"]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
+    order: tuple[int, ...] = eqx.field(static=True)
+    """Transitions of one turn, in order, from the start."""
+    settings: Settings
+
+    @property
+    def clocked(self) -> bool:
+        """Whether a clock drives the system."""
+        return self.system.period() is not None
+
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " r"]:
+        """The non-zero Floquet multipliers, the largest first (on the host).
+
+        Computed from the factors without forming their product, so that small ones are right
+        too; zeros that stem from resets and sections are counted by rank and left out.
+        """
+        dims = np.asarray(self.dims)
+        factors = np.asarray(self.factors)
+        after = np.roll(dims, -1)
+        blocks = [f[: after[n], : dims[n]] for n, f in enumerate(factors)]
+        return product_eigenvalues(blocks, rtol=1e-9)
+
+    @property
+    def stable(self) -> bool:
+        """Whether all multipliers lie inside the unit circle."""
+        return bool(np.all(np.abs(self.multipliers) < 1))
+
+    @property
+    def state(self) -> dict[str, float]:
+        """The state at `start`, by name."""
+        chart = Structure(self.system).charts[int(self.start.chart[0])]
+        return dict(zip(chart.states, self.start.q[:, 0].tolist(), strict=False))
+
+    def trajectory(self, periods: float = 1.0) -> Trajectory:
+        """The orbit from `start` on, with its events, dense enough to plot."""
+        s = Structure(self.system)
+        a = int(self.start.chart[0])
+        return simulate(
+            self.system,
+            s.names[a],
+            self.start.q[: s.dims[a], 0],
+            float(self.period) * periods,
+            time=float(self.start.t[0]),
+            settings=self.settings,
+        )
+
+    def __repr__(self):
+        if is_traced(self):
+            return f"LimitCycle({type(self.system).__name__}, traced)"
+        names = [tr.name for tr in Structure(self.system).transitions]
+        events = ", ".join(names[g] for g in self.order) or "none"
+        state = ", ".join(f"{k} = {v:.9g}" for k, v in self.state.items())
+        multipliers = ", ".join(_format(z) for z in self.multipliers) or "none but zero"
+        return (
+            f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
+            f"  period       {float(self.period):.12g}\n"
+            f"  at t = {float(self.start.t[0]):.6g}   {state}\n"
+            f"  events       {events}\n"
+            f"  multipliers  {multipliers}\n"
+            f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"
+        )
+
+
+def _format(z: complex) -> str:
+    return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"
+
+
+def find_limit_cycle(
+    system: HybridSystem,
+    guess: Guess | LimitCycle | None = None,
+    *,
+    section: Crossing | AtEvent | None = None,
+    settle: float = 0.0,
+    max_period: float = 100.0,
+    settings: Settings = DEFAULT,
+    throw: bool = True,
+) -> LimitCycle:
+    """Find a limit cycle by Newton on the return map; stable or not makes no difference.
+
+    A clocked system has its clock's period, and the return map is taken at the guess's phase of
+    the clock. The period of an autonomous one is found; its return map lives on `section`.
+
+    **Arguments:**
+
+    - `guess`: a rough `Guess`, by default the model's own. A `LimitCycle` of a similar system is
+        the best guess.
+    - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
+        "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
+        flow.
+    - `settle`: time to simulate before Newton begins, so that transients die out (the paper
+        takes 60 s). No help where the cycle is unstable.
+    - `max_period`: for autonomous systems: give up if no return is seen in this time.
+    - `settings`: accuracy of the flow.
+    - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
+
+    **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
+    found: no convergence, an event or section that does not come, grazing, or a singular J - I
+    (there is a whole family of cycles, from a conserved quantity or a symmetry).
+
+    Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
+    followed by implicit differentiation and nothing is raised.
+    """
+    traced = is_traced(system)
+    if not traced:
+        require_x64(system)
+        check_system(system)
+    clocked = system.period() is not None
+    if isinstance(guess, LimitCycle):
+        base = guess.base if section is None else section
+        start, expected, order = guess.start, guess.period, guess.order
+    elif traced:
+        raise DefinitionError(
+            "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
+            "one outside, and pass it as `guess`."
+        )
+    else:
+        start, base, expected = _prepare(system, guess, section, settle, max_period, settings)
+        order = None
+    if clocked:
+        expected = jnp.asarray(system.period(), float)
+    start, period, factors, seen, steps, result = _solve(system, start, base, expected, settings)
+    if not traced:
+        order = tuple(int(g) for g in np.ravel(seen.codes) if g >= 0)
+    dims = jnp.array(Structure(system).dims)[seen.legs.chart]
+    cycle = LimitCycle(
+        system, base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
+        order, settings,
+    )  # fmt: skip
+    if not traced and throw and (code := Result(int(result))) != Result.OK:
+        raise ComputationError(_explain(cycle, code))
+    return cycle
+
+
+def _prepare(system, guess, section, settle, max_period, settings):
+    """Start state, base section and expected period, from a guess."""
+    s = Structure(system)
+    guess = system.guess() if guess is None else guess
+    if guess is None:
+        raise DefinitionError(
+            f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
+        )
+    a = s.chart_index(guess.chart)
+    if guess.state.shape != (s.dims[a],) or not np.all(np.isfinite(guess.state)):
+        raise DefinitionError(
+            f"the guess must give finite values for the {s.dims[a]} states "
+            f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
+        )
+    period = system.period()
+    if period is not None and not (np.isfinite(period) and period > 0):
+        raise DefinitionError(f"the clock's period must be positive; it is {period}.")
+    if period is not None and section is not None:
+        raise DefinitionError(
+            "a clocked system returns to itself after its clock's period: leave out `section` "
+            "(sections of any kind are for linearize and run_experiments)."
+        )
+    if section is not None:
+        section.check(s)
+    span = jnp.asarray(max_period if period is None else period, float)
+    lanes = start_at(
+        system, guess.time[None], jnp.array([a], jnp.int32), _pad(s, guess.state), span
+    )
+    if settle:
+        turns = float(settle) if period is None else np.ceil(settle / period) * float(period)
+        moved = _go(system, lanes, None, _to(lanes.t + turns, -1, lanes.t + turns), settings)
+        _require(moved, "settling", s)
+        lanes = moved.lanes
+        if period is not None:
+            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - turns)
+    if period is not None:
+        return lanes, None, jnp.asarray(period, float)
+    if section is None:
+        a = int(lanes.chart[0])
+        q = lanes.q[: s.dims[a], 0]
+        f = s.field(a, lanes.t[0], q, jnp.zeros(s.nu))
+        section = Crossing(_Plane(q, f / jnp.linalg.norm(f)), "rising", charts=(s.names[a],))
+    event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
+    target = _to(jnp.full(1, jnp.inf), event, lanes.t + max_period)
+    first = _go(system, lanes, section, target, settings)
+    _require(first, f"looking for the section ({section})", s)
+    target = _to(jnp.full(1, jnp.inf), event, first.lanes.t + max_period)
+    second = _go(system, first.lanes, section, target, settings)
+    _require(second, f"looking for the return to the section ({section})", s)
+    return second.lanes, section, second.lanes.t[0] - first.lanes.t[0]
+
+
+def _require(moved, doing: str, s: Structure) -> None:
+    result = Result(int(moved.result[0]))
+    if result != Result.OK:
+        lanes = moved.lanes
+        raise ComputationError(
+            f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
+            f"'{s.names[int(lanes.chart[0])]}': {result.message}. Check the guess and the guards "
+            "with `simulate(..., throw=False)`."
+        )
+
+
+def _pad(s: Structure, q):
+    return jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
+
+
+@eqx.filter_jit
+def start_at(system, t, chart, q, span) -> Lanes:
+    """Lanes at the given times, charts and padded states."""
+    return start_lanes(Structure(system), t, chart, q, span)
+
+
+@eqx.filter_jit
+def _go(system, lanes, section, target, settings):
+    """One lane to a time, or to one section, however many steps it takes."""
+    s = Structure(system)
+    settings = dataclasses.replace(settings, max_steps=1_000_000)
+    if isinstance(section, Crossing):
+        target = dataclasses.replace(target, levels=ListLevels((section,)))
+    return move(system, lanes, jnp.zeros((s.nu, 1)), target, settings)
+
+
+def _to(time, event, limit, index: int = 0) -> Target:
+    L = time.shape[0]
+    return Target(
+        time,
+        jnp.full(L, index, jnp.int32),
+        jnp.full(L, event, jnp.int32),
+        jnp.where(jnp.isfinite(time), jnp.nextafter(time, jnp.inf), limit),
+        jnp.full(L, jnp.inf),
+        None,
+        None,
+        Result.SECTION_MISSED,
+    )
+
+
+@eqx.filter_jit
+def _solve(system, start, base, expected, settings):
+    """Newton on the return map, and what it saw in its last turn."""
+    s = Structure(system)
+    n = s.d
+    valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
+    solver = optx.Newton(
+        rtol=1e-11, atol=1e-12, linear_solver=lx.AutoLinearSolver(well_posed=False)
+    )
+    solution = optx.root_find(
+        lambda q, args: _residual(q, *args, settings),
+        solver,
+        start.q[:, 0],
+        (system, start, base, expected),
+        has_aux=True,
+        max_steps=32,
+        throw=False,
+    )
+    q, seen = solution.value, solution.aux
+    period = expected if base is None else seen.period
+    factors = seen.factors
+    if base is not None:
+        factors = _across(s, seen.legs, factors)
+    monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
+    singular = jnp.linalg.svd(monodromy - jnp.diag(valid * 1.0), compute_uv=False)
+    smallest = jnp.min(jnp.where(jnp.arange(n) < valid.sum(), singular, jnp.inf))
+    good = jnp.isfinite(seen.distance) & (seen.distance <= 1e-8 * (1 + jnp.max(jnp.abs(q))))
+    code = jnp.where(seen.result == Result.OK, Result.NOT_CONVERGED, seen.result)
+    code = jnp.where(good, jnp.where(smallest < _SINGULAR, Result.SINGULAR, Result.OK), code)
+    begin = eqx.tree_at(lambda x: x.q, start, q[:, None])
+    steps = solution.stats["num_steps"]
+    return begin, period, factors, seen, steps, code.astype(jnp.int32)
+
+
+class _Turn(eqx.Module):
+    """What Newton sees on one turn."""
+
+    legs: Lanes
+    factors: Float[Array, "K d d"]
+    codes: Int[Array, "K R"]
+    period: Float[Array, ""]
+    distance: Float[Array, ""]
+    result: Int[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def _residual(q, system, start, base, expected, settings):
+    """P(q) - q, and the `_Turn`. The Jacobian is that of the turn's legs, computed with it."""
+    residual, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
+    return residual, seen
+
+
+@_residual.def_jvp
+def _residual_jvp(primals, tangents):
+    q, system, start, base, expected, settings = primals
+    residual, seen, jacobian = _turn_with_jacobian(*primals)
+    t_q, *t_rest = tangents
+    t_residual = jnp.zeros_like(q) if t_q is None else jacobian @ t_q
+    if jax.tree_util.tree_leaves(t_rest):
+        # Parameters: through the same turn, by the flow's own derivative.
+        def of_parameters(system, start, base, expected):
+            return _turn(q, system, start, base, expected, settings, _flow)[0]
+
+        _, more = eqx.filter_jvp(of_parameters, (system, start, base, expected), tuple(t_rest[:4]))
+        t_residual = t_residual + more
+    nothing = jax.tree_util.tree_map(lambda _: None, seen)
+    return (residual, seen), (t_residual, nothing)
+
+
+def _turn_with_jacobian(q, system, start, base, expected, settings):
+    residual, end, result, (legs, jacobians, codes) = _turn(
+        q, system, start, base, expected, settings, _flow_with_jacobian
+    )
+    n = q.shape[0]
+    factors = jacobians[:, 0, 1 : n + 1, 1 : n + 1]
+    valid = jnp.arange(n) < jnp.array(Structure(system).dims)[start.chart[0]]
+    monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
+    jacobian = jnp.where(valid[:, None], monodromy, 0.0) - jnp.eye(n)
+    legs = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), legs)
+    seen = _Turn(
+        legs, factors, codes[..., 0], end.t[0] - start.t[0], jnp.max(jnp.abs(residual)), result
+    )
+    return residual, seen, jacobian
+
+
+def _flow(system, lanes, target, settings, h, result):
+    u = jnp.zeros((len(system.inputs), 1))
+    return move(system, lanes, u, target, settings, h, result), None
+
+
+def _flow_with_jacobian(system, lanes, target, settings, h, result):
+    jacobian, moved, tape = flow_jacobian(system, lanes, target, settings, h, result)
+    return moved, (lanes, jacobian, tape.code)
+
+
+def _turn(q, system, start: Lanes, base, expected, settings, flow):
+    """One turn from state q on the base section, leg by leg, each done by `flow`.
+
+    **Returns:** P(q) - q, the lane at the end, its result, and what `flow` returned besides.
+    """
+    s = Structure(system)
+    lanes = start_lanes(s, start.t, start.chart, q[:, None], expected)
+    if isinstance(base, AtEvent):
+        own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(base.name)
+        lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)
+    targets = _leg_targets(s, start.t[0], base, expected)
+    each, common = eqx.partition(targets, _per_lane(targets))
+
+    def leg(carry, target):
+        lanes, h, result = carry
+        target = jax.tree_util.tree_map(lambda x: x[None], target)
+        moved, extra = flow(system, lanes, eqx.combine(target, common), settings, h, result)
+        return (moved.lanes, moved.h, moved.result), extra
+
+    begin = (lanes, (0.1 * expected / LEGS)[None], jnp.zeros(1, jnp.int32))
+    (end, _, result), extra = jax.lax.scan(leg, begin, each)
+    valid = jnp.arange(s.d) < jnp.array(s.dims)[start.chart[0]]
+    same = (result[0] == Result.OK) & (end.chart[0] == start.chart[0])
+    residual = jnp.where(same, jnp.where(valid, end.q[:, 0], 0.0) - q, jnp.nan)
+    return residual, end, result[0], extra
+
+
+def _across(s: Structure, legs: Lanes, factors):
+    """The factors on the states modulo the direction of the flow.
+
+    Along the flow of an autonomous system nothing contracts. Taken out of every factor, that
+    direction cannot drown a strong contraction across it.
+    """
+    f = slopes(s, legs.t, legs.chart, legs.q, jnp.zeros((s.nu, legs.t.shape[0]))).T
+    f = f / jnp.linalg.norm(f, axis=1, keepdims=True)
+    project = jnp.eye(s.d) - f[:, :, None] * f[:, None, :]
+    return jnp.roll(project, -1, axis=0) @ factors @ project
+
+
+def _per_lane(targets):
+    """Mark the leaves of a `Target` that have one entry per lane."""
+    marks = jax.tree_util.tree_map(lambda _: False, targets)
+    fields = lambda x: (x.time, x.index, x.event, x.limit, x.hint)  # noqa: E731
+    return eqx.tree_at(fields, marks, (True,) * 5)
+
+
+def _leg_targets(s: Structure, t0, base, expected) -> Target:
+    """Targets of the pieces of one turn: K - 1 times, then the section the turn began on."""
+    k = jnp.arange(1, LEGS + 1)
+    if base is None:
+        return _to(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+    time = jnp.where(k < LEGS, t0 + _FREE * expected * k / (LEGS - 1), jnp.inf)
+    target = _to(time, -1, t0 + 3 * expected)
+    last = k == LEGS
+    if isinstance(base, AtEvent):
+        event = jnp.where(last, s.transition_index(base.name), -1).astype(jnp.int32)
+        return dataclasses.replace(target, event=event)
+    index = jnp.where(last, 0, -1).astype(jnp.int32)
+    return dataclasses.replace(target, index=index, levels=ListLevels((base,)))
+
+
+def _explain(cycle: LimitCycle, code: Result) -> str:
+    name = type(cycle.system).__name__
+    if code == Result.SINGULAR:
+        return (
+            f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
+            "cycles form a family: a quantity is conserved, or there is a symmetry. Fix that "
+            "quantity in the model, or take the cycle nearest to the guess with `throw=False`."
+        )
+    reason = code.message
+    if code == Result.NOT_CONVERGED:
+        reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
+    return (
+        f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "
+        "if the cycle is stable, e.g. `settle=60 * period`."
+    )
