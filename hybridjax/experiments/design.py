@@ -125,18 +125,18 @@ class Design(eqx.Module):
         self._refuse(outside, f"is applied to an input that is not one of the {nu}")
         check_sharing(self.experiment, self.line, P)
 
-        u = np.exp(1j * self.phase)
+        u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
-        count = np.bincount(group)
-        same = np.hypot(np.bincount(group, (u**2).real), np.bincount(group, (u**2).imag)) / count
+        power, square = np.bincount(group, np.abs(u) ** 2), u**2
+        alike = np.hypot(np.bincount(group, square.real), np.bincount(group, square.imag)) / power
         self._refuse(
-            (needs_two_phases(self.line, P, N) & (same > 1 - 1e-6)[group]),
+            (needs_two_phases(self.line, P, N) & (alike > 1 - 1e-6)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (half_integers='two-phase' does so), or "
             "leave it out (half_integers='skip')",
         )
         self._refuse(
-            is_real(self.line, P, N) & (np.abs(u.real) < 1e-3),
+            is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < 1e-3),
             "is zero at every section with this phase: give it the phase 0",
         )
 

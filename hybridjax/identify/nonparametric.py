@@ -124,7 +124,8 @@ def _excited(data: ExperimentData, threshold: float) -> _Lines:
             return ""
         return (
             f" ({number[experiment]} lines are excited, more than any experiment can hold: is the "
-            f"input periodic over the last P = {data.periods} periods?)"
+            f"input periodic over the last P = {data.periods} periods, and without noise above "
+            "`threshold`?)"
         )
 
     check_sharing(lines.experiment, lines.line, data.periods, hint)
