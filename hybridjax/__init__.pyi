@@ -1,3 +1,4 @@
+from . import models as models
 from ._core.cache import enable_compilation_cache as enable_compilation_cache
 from ._core.errors import (
     ComputationError as ComputationError,
@@ -18,6 +19,15 @@ from .experiments.multisine import (
     paper_design as paper_design,
     single_cosine as single_cosine,
 )
+from .flow.move import Settings as Settings
+from .flow.sections import (
+    AtEvent as AtEvent,
+    ClockPhase as ClockPhase,
+    Crossing as Crossing,
+    KinematicPhase as KinematicPhase,
+    Sections as Sections,
+)
+from .flow.trajectory import Event as Event, Trajectory as Trajectory, simulate as simulate
 from .identify.compare import MultiplierComparison as MultiplierComparison
 from .identify.nonparametric import (
     estimate_htf as estimate_htf,
@@ -28,7 +38,18 @@ from .identify.structured import (
     StructuredFit as StructuredFit,
     fit_multipliers as fit_multipliers,
 )
+from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
+from .orbits.linearize import linearize as linearize
+from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
+from .systems.chart import Chart as Chart
+from .systems.output import Output as Output
+from .systems.system import (
+    Guess as Guess,
+    HybridSystem as HybridSystem,
+    parameter as parameter,
+)
+from .systems.transition import Scheduled as Scheduled, Transition as Transition
 
 __version__: str

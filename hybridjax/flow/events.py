@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .lanes import by_lane, Lanes, only
+from .lanes import Lanes, by_lane, only
 from .target import until
 from .watch import Watch, watch
 

@@ -10,7 +10,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .lanes import Lanes
 from .replay import replay
-from .search import initial_step, search, Tape
+from .search import Tape, initial_step, search
 from .target import Target
 
 

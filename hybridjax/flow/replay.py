@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import apply_resets, scheduled_time
-from .lanes import for_each_chart, Lanes, only
+from .lanes import Lanes, for_each_chart, only
 from .search import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .step import rk_step
 from .target import Target

@@ -13,12 +13,12 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
-from .events import apply_resets, enabled, keep_pace, next_schedule, rearm, ZERO
+from .events import ZERO, apply_resets, enabled, keep_pace, next_schedule, rearm
 from .hermite import first_crossing
-from .lanes import for_each_chart, Lanes, only
+from .lanes import Lanes, for_each_chart, only
 from .step import rk_step
 from .target import Target
-from .watch import chart_field, settle, Settled, Watch, watch, watched
+from .watch import Settled, Watch, chart_field, settle, watch, watched
 
 
 # Codes on a tape. Codes >= 0 name the transition that fires at the end of a move.

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import numpy as np
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .tableau import VERNER76

@@ -12,10 +12,10 @@ import numpy as np
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
-from ..systems.structure import check_system, Structure
+from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
-from .move import record, Settings
+from .move import Settings, record
 from .search import IDLE
 from .target import until
 from .watch import slopes

@@ -15,13 +15,13 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from ..flow.events import start_lanes
 from ..flow.lanes import Lanes
-from ..flow.move import move, Settings
+from ..flow.move import Settings, move
 from ..flow.sections import AtEvent, Crossing, ListLevels
 from ..flow.target import Target
-from ..flow.trajectory import simulate, Trajectory
+from ..flow.trajectory import Trajectory, simulate
 from ..flow.watch import slopes
 from ..periodic.multipliers import product_eigenvalues
-from ..systems.structure import check_system, is_traced, Structure
+from ..systems.structure import Structure, check_system, is_traced
 from ..systems.system import Guess, HybridSystem
 from .jacobian import flow_jacobian
 

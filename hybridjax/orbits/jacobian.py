@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..flow.lanes import Lanes
-from ..flow.move import follow, Moved, record, Settings
+from ..flow.move import Moved, Settings, follow, record
 from ..flow.search import Tape
 from ..flow.target import Target
 from ..systems.structure import Structure

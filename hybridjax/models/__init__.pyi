@@ -1,0 +1,1 @@
+from .hopper import VerticalHopper as VerticalHopper

@@ -1,0 +1,272 @@
+"""A section family evaluated on a limit cycle: where each section lies, and that it is sound."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.errors import ComputationError
+from .._core.results import Result
+from ..flow.lanes import Lanes, by_lane, only
+from ..flow.move import Settings, move
+from ..flow.sections import AbstractSections, Bound, Crossing, ListLevels, as_sections
+from ..flow.target import Target
+from ..flow.watch import slopes, watch
+from ..systems.structure import Structure, is_traced
+from .cycle import LimitCycle
+
+
+class PlacedSections(eqx.Module):
+    """N sections of a family on a limit cycle.
+
+    **Fields:**
+
+    - `cycle`, `sections`: what was placed where.
+    - `bound`: the family with its numbers filled in.
+    - `lanes`: the cycle's state at each section (N lanes), in order, within one period from
+        section 0.
+    - `duration` (N,): time from section i to the next.
+    - `result` (N,): `Result` codes of the flow from section i to the next.
+    - `drop` (N,): the coordinate of (t, states...) that is left out on section i, or -1.
+    - `dims` (N,): number of coordinates on each section.
+    - `normal` (N, 1+d): gradient of section i's level; zero on clock and event sections.
+    """
+
+    cycle: LimitCycle
+    sections: AbstractSections
+    bound: Bound
+    lanes: Lanes
+    duration: Float[Array, " N"]
+    result: Int[Array, " N"]
+    drop: Int[Array, " N"]
+    dims: Int[Array, " N"]
+    normal: Float[Array, "N 1+d"]
+
+    @property
+    def count(self) -> int:
+        return self.sections.count
+
+    @property
+    def time_is_state(self) -> Bool[Array, " N"]:
+        """Whether the time of crossing is a coordinate: on state-based sections of a clocked
+        system."""
+        return jnp.isinf(self.bound.time) & self.cycle.clocked
+
+    def coordinates(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
+        of the chart's states, less the one that the section determines."""
+        s = Structure(self.cycle.system)
+        names = []
+        for i in range(self.count):
+            all_names = ("t", *s.charts[int(self.lanes.chart[i])].states)
+            keep = [k for k in range(len(all_names)) if k != int(self.drop[i])]
+            names.append(tuple(all_names[k] for k in keep if k or self.time_is_state[i]))
+        return tuple(names)
+
+    def target(self, i: Int[Array, " L"], t: Float[Array, " L"], turns: Int[Array, " L"]) -> Target:
+        """The target of lanes that flow to section i, `turns` periods after the first turn.
+
+        A lane gives up half a period after the cycle itself would have arrived.
+        """
+        arrival = self.lanes.t[i] + turns * self.cycle.period
+        return Target(
+            self.bound.time[i] + turns * self.cycle.period,
+            i,
+            self.bound.event[i],
+            jnp.maximum(arrival, t) + 0.5 * self.cycle.period,
+            jnp.full(t.shape, jnp.inf),
+            None,
+            self.bound.levels,
+            Result.SECTION_MISSED,
+        )
+
+
+def place_sections(cycle: LimitCycle, sections) -> PlacedSections:
+    """Find a family's sections on a cycle, and check them.
+
+    **Arguments:** `sections`, a family (`ClockPhase`, `KinematicPhase`, `Sections`), or a list of
+    `Crossing` and `AtEvent`.
+
+    **Raises:** `ComputationError` that names the first section that the cycle does not cross,
+    crosses more than once, touches tangentially, or meets out of order.
+    """
+    sections = as_sections(sections)
+    s = Structure(cycle.system)
+    sections.check(s)
+    anchor, result = _anchor(cycle, sections)
+    traced = is_traced((cycle, sections))
+    if not traced:
+        if int(result[0]) != Result.OK:
+            raise ComputationError(
+                f"the cycle has no point where {sections.start} (the anchor of section 0): "
+                f"{Result(int(result[0])).message}."
+            )
+    placed = _place(cycle, sections, anchor, cycle.settings)
+    if not traced:
+        _check(placed)
+    return placed
+
+
+def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
+    """The first point of the cycle, from its start on, where `crossing` happens."""
+    s = Structure(cycle.system)
+    start = cycle.start
+    one = jnp.zeros(1, jnp.int32)
+    target = Target(
+        jnp.full(1, jnp.inf), one, one - 1, start.t + 1.5 * cycle.period, jnp.full(1, jnp.inf),
+        None, ListLevels((crossing,)), Result.SECTION_MISSED,
+    )  # fmt: skip
+    settings = dataclasses.replace(cycle.settings, max_steps=2048)
+    moved = move(cycle.system, start, jnp.zeros((s.nu, 1)), target, settings)
+    return moved.lanes, moved.result
+
+
+@eqx.filter_jit
+def _anchor(cycle, sections):
+    if isinstance(sections.start, Crossing):
+        return find_on_cycle(cycle, sections.start)
+    return cycle.start, jnp.zeros(1, jnp.int32)
+
+
+@eqx.filter_jit
+def _place(cycle, sections, anchor: Lanes, settings: Settings) -> PlacedSections:
+    system, period = cycle.system, cycle.period
+    s = Structure(system)
+    N = sections.count
+    settings = dataclasses.replace(settings, max_steps=2048)
+    u = jnp.zeros((s.nu, 1))
+    f = slopes(s, anchor.t, anchor.chart, anchor.q, u)
+    bound = sections.bind(s, period, anchor.chart[0], anchor.t[0], anchor.q[:, 0], f[:, 0])
+    # Clock sections of the turn that begins at the anchor.
+    turns = jnp.ceil((anchor.t[0] - bound.time[0]) / period - 1e-9)
+    turns = jnp.where(jnp.isfinite(bound.time[0]), jax.lax.stop_gradient(turns), 0.0)
+    bound = dataclasses.replace(bound, time=bound.time + turns * period)
+
+    def to_section(carry, i):
+        lanes, h, result, first = carry
+        stay = first & isinstance(sections.start, Crossing)  # the anchor lies on section 0
+        again = jnp.where((i == 0) & ~first, 1, 0)
+        target = Target(
+            jnp.where(stay, lanes.t, bound.time[i] + again * period),
+            i[None],
+            bound.event[i][None],
+            lanes.t + 1.5 * period,
+            jnp.full(1, jnp.inf),
+            None,
+            bound.levels,
+            Result.SECTION_MISSED,
+        )
+        moved = move(system, lanes, u, target, settings, h, result)
+        return (moved.lanes, moved.h, moved.result, jnp.zeros((), bool)), (
+            moved.lanes,
+            moved.result,
+        )
+
+    begin = (anchor, (0.1 * period / N)[None], jnp.zeros(1, jnp.int32), jnp.ones((), bool))
+    order = jnp.concatenate([jnp.arange(N), jnp.zeros(1, int)])
+    _, (visited, result) = jax.lax.scan(to_section, begin, order)
+    visited = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), visited)
+    lanes = jax.tree_util.tree_map(lambda x: x[..., :-1], visited)
+    normal = _normals(s, bound, lanes)
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)))
+    speed = jnp.concatenate([jnp.ones((1, N)), f]).T
+    share = jnp.abs(normal * speed)
+    flat = jnp.max(share, axis=1) == 0
+    drop = jnp.where(flat, -1, jnp.argmax(share, axis=1))
+    with_time = jnp.isinf(bound.time) & (system.period() is not None)
+    dims = jnp.array(s.dims)[lanes.chart] + with_time - ~flat
+    return PlacedSections(
+        cycle, sections, bound, lanes, jnp.diff(visited.t), result[1:, 0], drop, dims, normal
+    )
+
+
+def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N 1+d"]:
+    """Gradients of the levels with respect to (t, q)."""
+    N = lanes.t.shape[0]
+    out = jnp.zeros((1 + s.d, N))
+    if bound.levels is None:
+        return out.T
+    state_based = jnp.isinf(bound.time) & (bound.event < 0)
+    for a in range(len(s.charts)):
+        if not bound.levels.present(s, a):
+            continue
+        n = s.dims[a]
+        here = state_based & (lanes.chart == a)
+
+        def gradient(i, t, q, a=a):
+            g = jax.grad(lambda t, q: bound.levels.level(s, a, i, t, q), argnums=(0, 1))(t, q)
+            return jnp.concatenate([g[0][None], g[1]])
+
+        def work(out, n=n, here=here, gradient=gradient):
+            point = only(here, jnp.arange(N)), only(here, lanes.t), only(here, lanes.q[:n])
+            return out.at[: 1 + n].set(jnp.where(here, by_lane(gradient)(*point), out[: 1 + n]))
+
+        out = jax.lax.cond(here.any(), work, lambda out: out, out)
+    return out.T
+
+
+def _check(placed: PlacedSections) -> None:
+    """Raise for the first section that is missed, tangent, out of order, or crossed twice."""
+    N = placed.count
+    describe = placed.sections.describe
+    for i, code in enumerate(np.asarray(placed.result)):
+        if code != Result.OK:
+            reason = Result(int(code)).message
+            raise ComputationError(
+                f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: {reason}."
+            )
+    counts = _crossings(placed)
+    for i in range(N):
+        if counts[i] > 1:
+            raise ComputationError(
+                f"{describe(i)} is crossed {counts[i]} times in one period; a section must be "
+                "crossed once. Restrict it to a chart, or choose another phase."
+            )
+    period = float(placed.cycle.period)
+    total = float(np.sum(placed.duration))
+    if abs(total - period) > 1e-6 * period:
+        late = int(np.argmax(np.asarray(placed.duration)))
+        raise ComputationError(
+            f"the sections are out of order: {describe((late + 1) % N)} comes before section "
+            f"{late} on the cycle, so that one round of all sections takes {total / period:.3g} "
+            "periods."
+        )
+    short = int(np.argmin(np.asarray(placed.duration)))
+    if float(placed.duration[short]) <= 1e-9 * period:
+        raise ComputationError(
+            f"{describe((short + 1) % N)} coincides with section {short} on the cycle; sections "
+            "must be distinct."
+        )
+
+
+def _crossings(placed: PlacedSections) -> np.ndarray:
+    """How often one period of the cycle crosses each state-based section."""
+    counts = np.ones(placed.count, int)
+    if placed.bound.levels is None:
+        return counts
+    t, chart, q = placed.cycle.trajectory().dense(per_step=16)
+    level = np.asarray(_levels_along(placed, jnp.asarray(t), jnp.asarray(chart), jnp.asarray(q)))
+    same = (np.diff(t) > 0) & (np.diff(chart) == 0)
+    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & same
+    state_based = np.isinf(np.asarray(placed.bound.time)) & (np.asarray(placed.bound.event) < 0)
+    # A section through the start of the sampled period may be seen at both its ends or at none.
+    return np.where(state_based, np.maximum(falls.sum(axis=1), 1), counts)
+
+
+@eqx.filter_jit
+def _levels_along(placed: PlacedSections, t, chart, q):
+    """Levels of all sections along a trajectory, (N, p)."""
+    s = Structure(placed.cycle.system)
+    zeros, p = jnp.zeros((s.nu, t.shape[0])), t.shape[0]
+    far = jnp.full(p, jnp.inf)
+
+    def one(i):
+        target = Target(
+            far, jnp.full(p, i), jnp.full(p, -1), far, far, None, placed.bound.levels, Result.OK
+        )
+        return watch(s, t, chart, q.T, zeros, target, jnp.ones(p, bool)).value[-1]
+
+    return jax.lax.map(one, jnp.arange(placed.count))
