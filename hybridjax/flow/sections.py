@@ -5,7 +5,7 @@ A family holds functions and numbers. `orbits.place` evaluates it on a limit cyc
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -89,6 +89,7 @@ class AtEvent(eqx.Module):
 class AbstractSections(eqx.Module):
     """A family of N Poincaré sections in the order in which a cycle meets them."""
 
+    label: eqx.AbstractClassVar[str]
     count: eqx.AbstractVar[int]
     start: eqx.AbstractVar[Crossing | Float[Array, ""] | None]
 
@@ -132,6 +133,7 @@ class ClockPhase(AbstractSections):
     the clock in periods.
     """
 
+    label: ClassVar[str] = "isochron"
     count: int = eqx.field(static=True)
     start: Crossing | Float[Array, ""] = eqx.field(
         converter=lambda x: x if isinstance(x, Crossing) else _number(x), default=0.0
@@ -178,6 +180,7 @@ class KinematicPhase(AbstractSections):
     an angle in radians.
     """
 
+    label: ClassVar[str] = "kinematic"
     count: int = eqx.field(static=True)
     position: str = eqx.field(static=True)
     velocity: str = eqx.field(static=True)
@@ -242,6 +245,7 @@ class Sections(AbstractSections):
     **Fields:** `items`: a list of `Crossing` and `AtEvent`.
     """
 
+    label: ClassVar[str] = "sections"
     items: tuple[Crossing | AtEvent, ...] = eqx.field(converter=tuple)
 
     def __check_init__(self):

@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._core.errors import DefinitionError
-from ..flow.lanes import by_lane, only
+from ..flow.lanes import by_lane, for_each_chart, only
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Structure, is_traced
@@ -58,7 +57,8 @@ def linearize(
                 f"there is no input '{name}'; inputs are {', '.join(cycle.system.inputs)}."
             )
     columns = np.array([cycle.system.inputs.index(n) for n in names], int)
-    A, B, C, D = _linearize(placed, tuple(z.items), cycle.settings)
+    A, B = _section_jacobians(placed, cycle.settings)
+    C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1 if traced else int(np.max(placed.dims))
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
@@ -72,64 +72,41 @@ def _as_tuple(names):
 
 
 @eqx.filter_jit
-def _linearize(placed: PlacedSections, outputs, settings):
-    system = placed.cycle.system
-    s = Structure(system)
-    N, n = placed.count, 1 + s.d
+def _section_jacobians(placed: PlacedSections, settings):
+    """A (N, c, c) and B (N, c, nu), padded."""
+    N, n = placed.count, 1 + placed.lanes.q.shape[0]
     following = (jnp.arange(N) + 1) % N
     turns = jnp.where(following == 0, 1, 0)
     target = placed.target(following, placed.lanes.t, turns)
-    h = 0.5 * placed.duration
-    jacobian, _, _ = flow_jacobian(system, placed.lanes, target, settings, h)
-    embed, select = jax.vmap(_frames, in_axes=(0, 0, 0, 0))(
-        placed.normal, placed.drop, placed.dims, placed.time_is_state
+    jacobian, _, _ = flow_jacobian(
+        placed.cycle.system, placed.lanes, target, settings, 0.5 * placed.duration
     )
+    embed, select = placed.frames()
     after = select[following]
-    A = after @ jacobian[:, :, :n] @ embed
-    B = after @ jacobian[:, :, n:]
-    CD = _output_jacobian(s, s.resolve_outputs(outputs), placed.lanes)
-    return A, B, CD[:, :, :n] @ embed, CD[:, :, n:]
+    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
 
-def _frames(
-    normal: Float[Array, " 1+d"], drop, dim, with_time
-) -> tuple[Float[Array, "1+d d"], Float[Array, "d 1+d"]]:
-    """From section coordinates to (t, q), and back.
+@eqx.filter_jit
+def _output_jacobians(placed: PlacedSections, outputs):
+    """C (N, ny, c) and D (N, ny, nu), padded."""
+    s, lanes = Structure(placed.cycle.system), placed.lanes
+    z = s.resolve_outputs(outputs)
+    n, ny = 1 + s.d, len(outputs)
 
-    Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous systems,
-    and skipping `drop`. A move in coordinate j takes the dropped entry along the section:
-    -normal_k / normal_drop.
-    """
-    n = normal.shape[0]
-    k = jnp.arange(n)
-    kept = (k != drop) & ((k > 0) | with_time)
-    order = jnp.argsort(~kept, stable=True)
-    # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-    valid = jnp.arange(n) < dim
-    select = jnp.where(valid[:, None], jnp.eye(n)[order], 0.0)
-    slope = -normal / jnp.where(drop >= 0, normal[drop], 1.0)
-    along = jnp.where((k == drop)[:, None], slope[None, :], 0.0)
-    embed = (jnp.eye(n) + jnp.where(drop >= 0, along, 0.0)) @ select.T
-    return embed, select
-
-
-def _output_jacobian(s: Structure, z, lanes) -> Float[Array, "N ny 1+d+nu"]:
-    N, ny = lanes.t.shape[0], len(z.names)
-    out = jnp.zeros((ny, 1 + s.d + s.nu, N))
-    for a in range(len(s.charts)):
+    def work(a, here, out):
         if not z.defined(a):
-            continue
-        here = lanes.chart == a
-        n = s.dims[a]
+            return out
+        d = s.dims[a]
 
-        def jacobian(t, q, a=a, n=n):
+        def jacobian(t, q):
             J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
             t, q, u = J(t, q, jnp.zeros(s.nu))
-            return jnp.concatenate([t[:, None], q, jnp.zeros((ny, s.d - n)), u], axis=1)
+            return jnp.concatenate([t[:, None], q, jnp.zeros((ny, s.d - d)), u], axis=1)
 
-        def work(out, here=here, n=n, jacobian=jacobian):
-            J = by_lane(jacobian)(only(here, lanes.t), only(here, lanes.q[:n]))
-            return jnp.where(here, J, out)
+        J = by_lane(jacobian)(only(here, lanes.t), only(here, lanes.q[:d]))
+        return jnp.where(here, J, out)
 
-        out = jax.lax.cond(here.any(), work, lambda out: out, out)
-    return jnp.moveaxis(out, -1, 0)
+    everywhere = jnp.ones(placed.count, bool)
+    J = for_each_chart(s, lanes.chart, everywhere, work, jnp.zeros((ny, n + s.nu, placed.count)))
+    J = jnp.moveaxis(J, -1, 0)
+    return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]

@@ -55,6 +55,10 @@ class PlacedSections(eqx.Module):
         system."""
         return jnp.isinf(self.bound.time) & self.cycle.clocked
 
+    def frames(self) -> tuple[Float[Array, "N 1+d c"], Float[Array, "N c 1+d"]]:
+        """Matrices from the coordinates on each section to deviations of (t, q), and back."""
+        return jax.vmap(_frames)(self.normal, self.drop, self.dims, self.time_is_state)
+
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
@@ -206,6 +210,28 @@ def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N 1+d"]:
 
         out = jax.lax.cond(here.any(), work, lambda out: out, out)
     return out.T
+
+
+def _frames(
+    normal: Float[Array, " 1+d"], drop, dim, with_time
+) -> tuple[Float[Array, "1+d d"], Float[Array, "d 1+d"]]:
+    """From section coordinates to (t, q), and back.
+
+    Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous systems,
+    and skipping `drop`. A move in coordinate j takes the dropped entry along the section:
+    -normal_k / normal_drop.
+    """
+    n = normal.shape[0]
+    k = jnp.arange(n)
+    kept = (k != drop) & ((k > 0) | with_time)
+    order = jnp.argsort(~kept, stable=True)
+    # One column more than a chart has states is never needed: (t, q) less the dropped entry.
+    valid = jnp.arange(n) < dim
+    select = jnp.where(valid[:, None], jnp.eye(n)[order], 0.0)
+    slope = -normal / jnp.where(drop >= 0, normal[drop], 1.0)
+    along = jnp.where((k == drop)[:, None], slope[None, :], 0.0)
+    embed = (jnp.eye(n) + jnp.where(drop >= 0, along, 0.0)) @ select.T
+    return embed, select
 
 
 def _check(placed: PlacedSections) -> None:

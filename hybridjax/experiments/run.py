@@ -1,0 +1,228 @@
+"""Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from tqdm.auto import tqdm
+
+from .._core.errors import ComputationError, DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..flow.lanes import Lanes, by_lane, for_each_chart, only
+from ..flow.move import Settings, move
+from ..orbits.cycle import LimitCycle
+from ..orbits.linearize import linearize
+from ..orbits.place import PlacedSections, place_sections
+from ..systems.output import Output
+from ..systems.structure import Structure
+from .data import ExperimentData
+from .design import Design
+
+
+DEFAULT = Settings(rtol=1e-9, atol=1e-10, max_steps=64)
+
+
+def run_experiments(
+    cycle: LimitCycle,
+    sections,
+    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    outputs: Sequence[str | Output] | str | Output,
+    *,
+    start: Literal["cycle", "periodic"] = "cycle",
+    discard: int | None = None,
+    periods: int | None = None,
+    batch: int = 256,
+    progress: bool = False,
+    settings: Settings = DEFAULT,
+) -> ExperimentData:
+    """Excite the system around its limit cycle and record its outputs at the sections.
+
+    All experiments of a batch run side by side in one compiled call. An experiment that fails
+    (a section missed, events in another order, ...) stops there; the others go on.
+
+    **Arguments:**
+
+    - `sections`: a family, or `PlacedSections`.
+    - `design`: a `Design`, or inputs (S, n, nu) that are held from section to section, with n a
+        whole number of periods; then `periods` says how many of the last ones are for estimation
+        (by default all that are not discarded).
+    - `outputs`: names or `Output`s, recorded at each section before the new input acts.
+    - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
+        linearisation predicts, so that there is almost no transient.
+    - `discard`: cycles that come before the design's periods and are meant to be discarded. By
+        default 20 from the cycle (the paper's) and 0 from the periodic start.
+    - `batch`: experiments per compiled call; more need more memory.
+    - `progress`: show a progress bar over the batches.
+    - `settings`: accuracy of the flow.
+
+    **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
+
+    **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for
+    an unstable cycle, from which any experiment would run away.
+    """
+    require_x64(cycle)
+    system = cycle.system
+    placed = sections if isinstance(sections, PlacedSections) else place_sections(cycle, sections)
+    s = Structure(system)
+    z = s.resolve_outputs(outputs)
+    if start not in ("cycle", "periodic"):
+        raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
+    if not cycle.stable:
+        largest = np.abs(cycle.multipliers[0])
+        raise ComputationError(
+            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
+            "experiments would leave it: stabilise the system, or use the exact linearisation "
+            "(`linearize`), which needs no experiments."
+        )
+    u, periods = _inputs(design, placed.count, len(system.inputs), start, discard, periods)
+    q = jnp.broadcast_to(_section_zero(placed), (1 + s.d, u.shape[0]))
+    if start == "periodic":
+        q = q + _periodic_start(cycle, placed, u, periods)
+    size = min(batch, u.shape[0])
+    y, result, failed_at = [], [], []
+    for k in tqdm(range(0, u.shape[0], size), disable=not progress, desc="experiments"):
+        rows = np.arange(k, k + size) % u.shape[0]  # the last batch is filled up with repetitions
+        out = _run(placed, q[:, rows], jnp.asarray(u[rows]), tuple(z.items), settings)
+        keep = min(size, u.shape[0] - k)
+        for whole, part in zip((y, result, failed_at), out, strict=True):
+            whole.append(np.asarray(part)[:keep])
+    y, result, failed_at = (np.concatenate(x) for x in (y, result, failed_at))
+    base = np.asarray(_on_cycle(placed, tuple(z.items)))
+    good = np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)
+    if not good.all():
+        for a in np.unique(placed.lanes.chart):
+            z.require(int(a))
+        raise DefinitionError(
+            "an output is NaN although its experiment ran well: it is not defined everywhere that "
+            "the experiments go."
+        )
+    return ExperimentData(
+        u,
+        y - np.tile(base, (u.shape[1] // placed.count, 1)),
+        sections=placed.count,
+        periods=periods,
+        inputs=system.inputs,
+        outputs=z.names,
+        result=result,
+        failed_at=failed_at,
+        cycle_outputs=base,
+        family=placed.sections.label,
+    )
+
+
+def _inputs(design, N: int, nu: int, start: str, discard, periods):
+    """Inputs (S, n, nu) as numpy, and the number of periods for estimation."""
+    discard = (20 if start == "cycle" else 0) if discard is None else discard
+    if discard < 0:
+        raise DefinitionError(f"discard is the number of cycles before the window, not {discard}.")
+    if isinstance(design, Design):
+        if design.sections != N:
+            raise DefinitionError(
+                f"the design is for {design.sections} sections, but the family has {N}."
+            )
+        if len(design.input_names) != nu:
+            raise DefinitionError(
+                f"the design has {len(design.input_names)} inputs, but the system has {nu}."
+            )
+        if periods not in (None, design.periods):
+            raise DefinitionError(
+                f"`periods` is for inputs given as an array; the design has {design.periods}."
+            )
+        return design.inputs(discard + design.periods), design.periods
+    u = np.asarray(design, float)
+    if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
+        raise DefinitionError(
+            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
+            f"the {N} sections; got {u.shape}."
+        )
+    if not np.isfinite(u).all():
+        worst = int(np.argwhere(~np.isfinite(u))[0, 0])
+        raise DefinitionError(f"the input of experiment {worst} is NaN or infinite.")
+    available = u.shape[1] // N - discard
+    periods = available if periods is None else periods
+    if not 1 <= periods <= available:
+        raise DefinitionError(
+            f"inputs of {u.shape[1] // N} cycles less {discard} discarded ones leave {available} "
+            f"for estimation; got periods = {periods}."
+        )
+    return u, periods
+
+
+def _section_zero(placed: PlacedSections) -> Float[Array, "1+d 1"]:
+    lanes = placed.lanes
+    return jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
+
+
+def _periodic_start(cycle, placed, u, periods) -> Float[np.ndarray, "1+d S"]:
+    """Deviations of (t, q) at section 0 that begin the predicted periodic response."""
+    if u.shape[1] // placed.count % periods:
+        raise DefinitionError(
+            "a periodic start needs inputs of a whole number of windows: use `discard=0`."
+        )
+    ldtp = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
+    embed = np.asarray(placed.frames()[0][0])[:, : ldtp.A.shape[1]]
+    window = u[:, : periods * placed.count]
+    return embed @ np.stack([np.asarray(ldtp.periodic_state(w, periods)) for w in window], axis=1)
+
+
+@eqx.filter_jit
+def _run(placed: PlacedSections, q0, u, outputs, settings):
+    """Records (S, n, ny), result codes (S,), and the samples of failure (S,) or -1."""
+    system = placed.cycle.system
+    s = Structure(system)
+    z = s.resolve_outputs(outputs)
+    N, S, period = placed.count, u.shape[0], placed.cycle.period
+    order = jnp.array(placed.cycle.order, jnp.int32)
+    first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
+    lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
+    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (q0[0], q0[1:]))
+
+    def section(carry, xs):
+        lanes, h, result, failed_at = carry
+        n, u = xs
+        i = n % N
+        y = _observe(s, z, lanes, u)
+        y = jnp.where(result == Result.OK, y, jnp.nan)
+        following = jnp.full(S, (i + 1) % N)
+        turns = (following == 0).astype(jnp.int32)
+        target = placed.target(following, lanes.t, turns)
+        hint = jnp.where(jnp.isinf(target.time), placed.duration[i], jnp.inf)
+        target = eqx.tree_at(
+            lambda x: (x.hint, x.order), target, (hint, order), is_leaf=lambda x: x is None
+        )
+        moved = move(system, lanes, u, target, settings, h, result)
+        # Time is counted within one period, so that every cycle is computed alike.
+        t = moved.lanes.t - turns * period
+        lanes = eqx.tree_at(lambda x: x.t, moved.lanes, t)
+        failed_at = jnp.where((failed_at < 0) & (moved.result != Result.OK), n, failed_at)
+        return (lanes, moved.h, moved.result, failed_at), y
+
+    h = jnp.full(S, 0.5 * period / N)
+    begin = (lanes, h, jnp.zeros(S, jnp.int32), jnp.full(S, -1))
+    xs = (jnp.arange(u.shape[1]), jnp.transpose(u, (1, 2, 0)))
+    (_, _, result, failed_at), y = jax.lax.scan(section, begin, xs)
+    return jnp.transpose(y, (2, 0, 1)), result, failed_at
+
+
+def _observe(s: Structure, z, lanes: Lanes, u) -> Float[Array, "ny L"]:
+    L = lanes.t.shape[0]
+
+    def work(a, here, out):
+        point = only(here, lanes.t), only(here, lanes.q[: s.dims[a]]), only(here, u)
+        values = by_lane(lambda t, q, u: z(a, t, q, u))(*point)
+        return jnp.where(here, values, out)
+
+    nothing = jnp.full((len(z.names), L), jnp.nan)
+    return for_each_chart(s, lanes.chart, jnp.ones(L, bool), work, nothing)
+
+
+@eqx.filter_jit
+def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
+    s = Structure(placed.cycle.system)
+    u = jnp.zeros((s.nu, placed.count))
+    return _observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
