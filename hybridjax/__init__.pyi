@@ -38,6 +38,7 @@ from .identify.structured import (
     StructuredFit as StructuredFit,
     fit_multipliers as fit_multipliers,
 )
+from .io import load as load, save as save
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
 from .orbits.linearize import linearize as linearize
 from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections

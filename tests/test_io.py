@@ -1,0 +1,243 @@
+import json
+import pickle
+import zipfile
+from fractions import Fraction
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+import hybridjax as hj
+
+
+def same(a, b):
+    """Equal types, names, dtypes and bits."""
+    assert type(a) is type(b)
+    for name in type(a).__dataclass_fields__:
+        x, y = getattr(a, name), getattr(b, name)
+        assert isinstance(x, jax.Array) == isinstance(y, jax.Array)
+        if hasattr(x, "dtype"):
+            x, y = np.asarray(x), np.asarray(y)
+            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+        else:
+            assert x == y
+    return True
+
+
+def trip(folder, thing):
+    path = folder / "thing.npz"
+    hj.save(path, thing)
+    return hj.load(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("io")
+
+
+@pytest.fixture(scope="module")
+def ldtp():
+    rng = np.random.default_rng(0)
+    A = [rng.normal(size=s) / 4 for s in ((3, 2), (2, 3))]
+    B, C = [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))], [np.ones((1, 2)), np.ones((1, 3))]
+    names = (("x", "y"), ("x", "y", "z"))
+    return hj.LDTP.from_blocks(
+        A, B, C, inputs=("force", "torque é"), outputs="y", coordinates=names
+    )
+
+
+@pytest.fixture(scope="module")
+def things(ldtp):
+    design = hj.multisine(sections=2, periods=16, f_max=1.0, inputs=("force", "torque é"))
+    data = hj.simulate_experiments(ldtp, design)
+    htf = hj.estimate_htf(data)
+    plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
+    fits = hj.fit_rational(htf), hj.fit_multipliers(htf, ldtp, overhang=2)
+    return [design, data, htf, ldtp, plain, *fits]
+
+
+def test_every_kind_comes_back_bit_by_bit(folder, things):
+    for thing in things:
+        assert same(thing, trip(folder, thing))
+    assert {p.name for p in folder.iterdir()} == {"thing.npz"}
+
+
+def test_failed_experiments_and_cycle_outputs(folder):
+    y = np.ones((2, 6, 1))
+    y[1, 3:] = np.nan
+    data = hj.ExperimentData(
+        np.zeros((2, 6, 1)), y, sections=3, periods=1, result=[0, hj.Result.GRAZING],
+        failed_at=[-1, 3], cycle_outputs=np.arange(3.0)[:, None], family="by hand",
+    )  # fmt: skip
+    object.__setattr__(data, "periods", np.int64(1))  # as where nobody checks annotations
+    back = trip(folder, data)
+    assert same(data, back)
+    assert back.summary() == data.summary() and type(back.periods) is int
+
+
+def test_a_file_can_be_read_without_the_package(folder, things):
+    path = folder / "thing.npz"
+    hj.save(path, things[2])
+    with np.load(path) as file:
+        header = json.loads(str(file["header"]))
+        np.testing.assert_array_equal(file["H"], things[2].H)
+    assert header["kind"] == "HTF" and header["package_version"] == hj.__version__
+    assert header["static"]["outputs"] == ["y"]
+    assert "evaluated at the input frequency" in header["conventions"]
+
+
+numbers = st.floats(width=64)  # with NaN, infinities, signed zeros and subnormals
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.data())
+def test_round_trip_of_any_htf(folder, data):
+    F, ny, nu = data.draw(array_shapes(min_dims=3, max_dims=3, max_side=3))
+    harmonics = data.draw(st.sets(st.integers(-3, 3), min_size=1).map(sorted))
+    H = data.draw(arrays(complex, (len(harmonics), F, ny, nu)))
+    f = data.draw(arrays(float, F, elements=st.floats(allow_nan=False, allow_infinity=False)))
+    names = data.draw(st.lists(st.text(), min_size=ny, max_size=ny, unique=True))
+    htf = hj.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
+    assert same(htf, trip(folder, htf))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.data())
+def test_round_trip_of_any_fit(folder, data):
+    ny, p, q = (data.draw(st.integers(1, 3)) for _ in range(3))
+    real = [data.draw(arrays(float, s, elements=numbers)) for s in ((ny, q + 1), (ny, p + 1), ny)]
+    other = [data.draw(arrays(complex, s)) for s in ((ny, p), (ny, q), (ny, p))]
+    code = data.draw(arrays(np.int64, ny))
+    names = tuple(f"y{i}" for i in range(ny))
+    fit = hj.RationalFit(
+        *real[:2], *other, real[2], code, 0, 32, "delayed", "uniform", names, data.draw(st.text())
+    )
+    assert same(fit, trip(folder, fit))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_damaged_files_are_refused_or_harmless(folder, things, data):
+    thing = things[data.draw(st.integers(0, len(things) - 1))]
+    path = folder / "damaged.npz"
+    hj.save(path, thing)
+    content = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    else:
+        # Half of the flips in the archive's directory at the end, where checksums do not reach.
+        low = data.draw(st.sampled_from([0, max(0, len(content) - 700)]))
+        for k in data.draw(st.lists(st.integers(low, len(content) - 1), min_size=1, max_size=3)):
+            content[k] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content)
+    try:
+        assert same(thing, hj.load(path))
+    except hj.FileFormatError as error:
+        assert str(path) in str(error)
+
+
+class _Trap:
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was executed",))
+
+
+def rewrite(path, header=None, arrays=None):
+    """Change a saved file as an editor of its content could, with valid checksums."""
+    with np.load(path) as file:
+        content = dict(file)
+    old = json.loads(str(content.pop("header")))
+    content.update(arrays or {})
+    old["arrays"].update({name: "" for name in arrays or {}})
+    np.savez(path, header=np.array(json.dumps({**old, **(header or {})})), **content)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"header": {"format_version": 2, "package_version": "9.0"}}, "version 2 .hybridjax 9.0"),
+        ({"header": {"format": "other"}}, "not written by hybridjax.save"),
+        ({"header": {"kind": "os.system"}}, "holds a 'os.system'; load knows Design"),
+        ({"header": {"kind": ["HTF"]}}, "load knows"),
+        ({"header": {"kind": "LDTP"}}, "not those of LDTP"),
+        ({"header": {"static": {}}}, "not those of HTF"),
+        ({"header": {"static": 3}}, "header is incomplete"),
+        ({"header": {"arrays": {}}}, "header lists"),
+        ({"arrays": {"source": np.zeros(2)}}, "not those of HTF"),
+        ({"arrays": {"H": np.zeros((1, 2, 3))}}, "content is no HTF"),
+        ({"arrays": {"f": np.array(["a"])}}, "content is no HTF"),
+    ],
+)
+def test_foreign_content(folder, things, change, says):
+    path = folder / "foreign.npz"
+    hj.save(path, things[2])
+    rewrite(path, **change)
+    with pytest.raises(hj.FileFormatError, match=says):
+        hj.load(path)
+
+
+def test_fields_are_checked_against_each_other(folder, things):
+    path = folder / "foreign.npz"
+    hj.save(path, things[5])
+    rewrite(path, arrays={"poles": np.zeros((7, 2), complex)})
+    with pytest.raises(hj.FileFormatError, match="poles"):
+        hj.load(path)
+
+
+def test_pickles_are_not_executed(folder, things):
+    path = folder / "trap.npz"
+    hj.save(path, things[2])
+    rewrite(path, arrays={"H": np.array([_Trap()], dtype=object)})
+    with pytest.raises(hj.FileFormatError, match="damaged"):
+        hj.load(path)
+    path.write_bytes(pickle.dumps(_Trap()))
+    with pytest.raises(hj.FileFormatError, match="not an npz file"):
+        hj.load(path)
+
+
+def test_other_files(folder):
+    path = folder / "other.npz"
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(hj.FileFormatError, match="not written by hybridjax.save"):
+        hj.load(path)
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("readme.txt", "hello")
+    with pytest.raises(hj.FileFormatError, match="damaged"):
+        hj.load(path)
+    path.write_bytes(b"")
+    with pytest.raises(hj.FileFormatError, match="not an npz file"):
+        hj.load(path)
+
+
+@pytest.mark.parametrize(
+    "thing", [None, 3, Fraction(1, 2), {"f": np.zeros(3)}, np.zeros(3), hj.HTF]
+)
+def test_other_objects(folder, thing):
+    with pytest.raises(hj.DefinitionError, match="save takes Design"):
+        hj.save(folder / "x.npz", thing)
+
+
+def test_where_nothing_can_be_written_or_read(folder, things):
+    with pytest.raises(hj.DefinitionError, match="end in '.npz'"):
+        hj.save(folder / "data.mat", things[0])
+    with pytest.raises(hj.DefinitionError, match="cannot write .*No such file or directory"):
+        hj.save(folder / "absent" / "x.npz", things[0])
+    (folder / "taken.npz").mkdir()
+    with pytest.raises(hj.DefinitionError, match="cannot write .*Is a directory"):
+        hj.save(folder / "taken.npz", things[0])
+    with pytest.raises(hj.DefinitionError, match="cannot read .*No such file or directory"):
+        hj.load(folder / "absent.npz")
+    assert not [p for p in folder.iterdir() if p.name.startswith(".")]
+
+
+def test_traced_and_batched_objects(folder, ldtp):
+    def inside(f):
+        hj.save(folder / "x.npz", ldtp.htf(f))
+        return f
+
+    with pytest.raises(hj.DefinitionError, match="outside of jit"):
+        jax.jit(inside)(np.zeros(1))
+    batch = jax.vmap(lambda f: ldtp.htf(f))(np.linspace(0.1, 0.4, 4).reshape(2, 2))
+    with pytest.raises(hj.DefinitionError, match="cannot be saved: f is float64"):
+        hj.save(folder / "x.npz", batch)
