@@ -10,6 +10,13 @@ hj.enable_x64()
 
 DATA = pathlib.Path(__file__).parent / "data"
 
+APEX = hj.Crossing("vM", "falling")
+ISOCHRONS = hj.ClockPhase(32, start=APEX)
+KINEMATIC = hj.KinematicPhase(
+    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+)
+OUTPUTS = ("yM", "vM")
+
 
 @pytest.fixture(scope="session")
 def reference():
@@ -20,3 +27,44 @@ def reference():
             return dict(file)
 
     return load
+
+
+@pytest.fixture(scope="session")
+def hopper_cycle():
+    return hj.find_limit_cycle(hj.models.VerticalHopper())
+
+
+@pytest.fixture(scope="session")
+def lossy_cycle():
+    """A hopper that loses a fifth of its speed at touchdown: its saltation is not trivial."""
+    return hj.find_limit_cycle(hj.models.VerticalHopper(retention=0.8))
+
+
+@pytest.fixture(scope="session")
+def placed_isochrons(hopper_cycle):
+    return hj.place_sections(hopper_cycle, ISOCHRONS)
+
+
+@pytest.fixture(scope="session")
+def placed_kinematic(hopper_cycle):
+    return hj.place_sections(hopper_cycle, KINEMATIC)
+
+
+@pytest.fixture(scope="session")
+def isochron_ldtp(hopper_cycle, placed_isochrons):
+    return hj.linearize(hopper_cycle, placed_isochrons, OUTPUTS)
+
+
+@pytest.fixture(scope="session")
+def kinematic_ldtp(hopper_cycle, placed_kinematic):
+    return hj.linearize(hopper_cycle, placed_kinematic, OUTPUTS)
+
+
+@pytest.fixture(scope="session")
+def bar_cycle():
+    return hj.find_limit_cycle(hj.models.TwoLeggedBar())
+
+
+@pytest.fixture(scope="session")
+def vanderpol_cycle():
+    return hj.find_limit_cycle(hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling"))

@@ -38,7 +38,7 @@ def start_lanes(
     return Lanes(t, chart, q, armed[:-1], jnp.zeros(L, jnp.int32), pace)
 
 
-def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "G+1 L"]:
+def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
     """Which rows of a `Watch` belong to the chart of each lane (the target's row to all)."""
     source = jnp.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)

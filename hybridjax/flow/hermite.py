@@ -20,20 +20,20 @@ NEAR = 1e-2
 class Crossing(NamedTuple):
     """What a guard does within a step."""
 
-    s: Float[Array, " L"]
+    s: Float[Array, "*shape"]
     """Position of the first falling zero as a fraction of the step; infinity if there is none."""
-    touch: Bool[Array, " L"]
+    touch: Bool[Array, "*shape"]
     """The guard touches zero without a clear crossing."""
-    near: Bool[Array, " L"]
+    near: Bool[Array, "*shape"]
     """It comes so close to zero without crossing that the interpolant cannot be trusted."""
 
 
 def first_crossing(
-    v0: Float[Array, " L"],
-    v1: Float[Array, " L"],
-    d0: Float[Array, " L"],
-    d1: Float[Array, " L"],
-    armed: Bool[Array, " L"],
+    v0: Float[Array, "*shape"],
+    v1: Float[Array, "*shape"],
+    d0: Float[Array, "*shape"],
+    d1: Float[Array, "*shape"],
+    armed: Bool[Array, "*shape"],
 ) -> Crossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 

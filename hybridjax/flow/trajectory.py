@@ -1,13 +1,15 @@
 """Single trajectories with their events, dense enough to plot."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int
 
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
@@ -41,20 +43,19 @@ class Event(NamedTuple):
 class Trajectory(eqx.Module):
     """A hybrid trajectory: steps, events, and interpolation between steps.
 
-    **Fields:** `t` (n,), the ends of the steps; `chart` (n,), the chart after each; `before` and
-    `after` (n, d), the states at each before and after an event's reset; `slope_before`,
-    `slope_after` (n, d), their time derivatives; `event` (n,), the transition that fired there or
-    -1; `result`, what became of it.
+    **Fields:** `t`, the ends of the steps; `chart`, the chart after each; `before` and `after`,
+    the states at each before and after an event's reset; `slope_before`, `slope_after`, their
+    time derivatives; `event`, the transition that fired there or -1; `result`, what became of it.
     """
 
     system: HybridSystem
-    t: np.ndarray
-    chart: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    slope_before: np.ndarray
-    slope_after: np.ndarray
-    event: np.ndarray
+    t: Float[np.ndarray, " n"]
+    chart: Int[np.ndarray, " n"]
+    before: Float[np.ndarray, "n d"]
+    after: Float[np.ndarray, "n d"]
+    slope_before: Float[np.ndarray, "n d"]
+    slope_after: Float[np.ndarray, "n d"]
+    event: Int[np.ndarray, " n"]
     result: Result = eqx.field(static=True)
 
     @property
@@ -104,11 +105,11 @@ class Trajectory(eqx.Module):
 def simulate(
     system: HybridSystem,
     chart: str,
-    state,
-    duration: float,
+    state: ArrayLike | Sequence[ArrayLike],
+    duration: ArrayLike,
     *,
-    time: float = 0.0,
-    input: Callable | np.ndarray | float | None = None,
+    time: ArrayLike = 0.0,
+    input: Callable[[Any], Any] | ArrayLike | Sequence[ArrayLike] | None = None,
     settings: Settings | None = None,
     max_steps: int = 100_000,
     throw: bool = True,
@@ -129,8 +130,8 @@ def simulate(
     require_x64(system)
     check_system(system)
     s = Structure(system)
-    start = Guess(chart, state, time)
     a = s.chart_index(chart)
+    start = Guess(chart, state, time)
     if start.state.shape != (s.dims[a],):
         raise DefinitionError(
             f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
@@ -141,10 +142,9 @@ def simulate(
     if not (np.isfinite(duration) and duration > 0):
         raise DefinitionError(f"the duration must be positive and finite; got {duration}.")
     settings = Settings() if settings is None else settings
+    u = jnp.asarray(_constant_input(s, input), float)[:, None]
     if callable(input):
-        system, u = Driven(system, input), jnp.zeros((s.nu, 1))
-    else:
-        u = jnp.broadcast_to(jnp.asarray(0.0 if input is None else input, float), (s.nu,))[:, None]
+        system = Driven(system, input)
 
     end = start.time + duration
     lanes = _start(system, start.time[None], a, start.state, jnp.asarray(duration, float))
@@ -172,8 +172,8 @@ def simulate(
         charts,
         before.T,
         after.T,
-        _slopes(system, t, source, before, u).T,
-        _slopes(system, t, charts, after, u).T,
+        np.asarray(_slopes(system, t, source, before, u)).T,
+        np.asarray(_slopes(system, t, charts, after, u)).T,
         event,
         result,
     )
@@ -183,6 +183,25 @@ def simulate(
             f"{result.message}. Use `throw=False` to look at it."
         )
     return trajectory
+
+
+def _constant_input(s: Structure, input) -> np.ndarray:
+    """The constant part of an input, after a look at its shape; zero for a function of time."""
+    if callable(input):
+        shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), jnp.zeros(())).shape
+    else:
+        value = np.asarray(0.0 if input is None else input, float)
+        shape = value.shape
+    if shape not in ((), (s.nu,)):
+        raise DefinitionError(
+            f"the input has shape {shape}, but {type(s.system).__name__} has the {s.nu} inputs "
+            f"({', '.join(s.system.inputs)}): give one number for each."
+        )
+    if callable(input):
+        return np.zeros(s.nu)
+    if not np.all(np.isfinite(value)):
+        raise DefinitionError(f"the input must be finite; got {value}.")
+    return np.broadcast_to(value, (s.nu,))
 
 
 @eqx.filter_jit

@@ -17,8 +17,8 @@ class Watch(NamedTuple):
     transition, and a last one for the target's level. Rows that mean nothing in a lane's chart
     have value 1 and rate 0."""
 
-    value: Float[Array, "G+1 L"]
-    rate: Float[Array, "G+1 L"]
+    value: Float[Array, "W L"]
+    rate: Float[Array, "W L"]
 
 
 def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:

@@ -20,7 +20,7 @@ def flow_jacobian(
     settings: Settings,
     h: Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
-) -> tuple[Float[Array, "L 1+d 1+d+nu"], Moved, Tape]:
+) -> tuple[Float[Array, "L n m"], Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0.
 
     Exact, through every event on the way, and differentiable once more. Each column is one

@@ -43,7 +43,7 @@ class PlacedSections(eqx.Module):
     result: Int[Array, " N"]
     drop: Int[Array, " N"]
     dims: Int[Array, " N"]
-    normal: Float[Array, "N 1+d"]
+    normal: Float[Array, "N n"]
 
     @property
     def count(self) -> int:
@@ -55,7 +55,7 @@ class PlacedSections(eqx.Module):
         system."""
         return jnp.isinf(self.bound.time) & self.cycle.clocked
 
-    def frames(self) -> tuple[Float[Array, "N 1+d c"], Float[Array, "N c 1+d"]]:
+    def frames(self) -> tuple[Float[Array, "N n c"], Float[Array, "N c n"]]:
         """Matrices from the coordinates on each section to deviations of (t, q), and back."""
         return jax.vmap(_frames)(self.normal, self.drop, self.dims, self.time_is_state)
 
@@ -187,7 +187,7 @@ def _place(cycle, sections, anchor: Lanes, settings: Settings) -> PlacedSections
     )
 
 
-def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N 1+d"]:
+def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N n"]:
     """Gradients of the levels with respect to (t, q)."""
     N = lanes.t.shape[0]
     out = jnp.zeros((1 + s.d, N))
@@ -213,8 +213,8 @@ def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N 1+d"]:
 
 
 def _frames(
-    normal: Float[Array, " 1+d"], drop, dim, with_time
-) -> tuple[Float[Array, "1+d d"], Float[Array, "d 1+d"]]:
+    normal: Float[Array, " n"], drop, dim, with_time
+) -> tuple[Float[Array, "n c"], Float[Array, "c n"]]:
     """From section coordinates to (t, q), and back.
 
     Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous systems,

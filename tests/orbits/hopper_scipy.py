@@ -1,0 +1,114 @@
+"""The vertical hopper in plain numpy and scipy, written independently of the package.
+
+A point is (t, yM, vM, ym, vm) in flight and (t, yM, vM) in stance. A section is ("clock", time) or
+("angle", angle): the level set of the angle of (yM - 1.9) / 0.3 + i vM / 1.9, which decreases.
+"""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+
+NAMES = ("t", "yM", "vM", "ym", "vm")
+
+
+def _leg(t, yM, ym):
+    return 10.0 * (2.0 - (yM - ym)) + 20.0 * np.sin(2 * np.pi * t)
+
+
+def _field(t, q, u):
+    yM, vM = q[:2]
+    if len(q) == 2:
+        return np.array([vM, (_leg(t, yM, 0.0) + u) / 2.0 - 2.0])
+    ym, vm = q[2:]
+    leg = _leg(t, yM, ym)
+    return np.array([vM, (leg + u) / 2.0 - 2.0, vm, -leg - 5.0 * vm - 2.0])
+
+
+def plane(point):
+    return (point[1] - 1.9) / 0.3, point[2] / 1.9
+
+
+def _level(section, t, q):
+    """Falls through zero at the section."""
+    kind, value = section
+    if kind == "clock":
+        return value - t
+    x, y = plane((t, *q))
+    return y * np.cos(value) - x * np.sin(value)
+
+
+def _guard(t, q):
+    return _leg(t, q[0], 0.0) + 2.0 if len(q) == 2 else q[2]
+
+
+def _polish(function, t, q, u):
+    """Newton along the flow: corrections of about 1e-12 to the root of a dense output."""
+    for _ in range(2):
+        e = 1e-6
+        f = _field(t, q, u)
+        rate = (function(t + e, q + e * f) - function(t - e, q - e * f)) / (2 * e)
+        dt = -function(t, q) / rate
+        t, q = t + dt, q + dt * f
+    return t, q
+
+
+def flow(point, section, u=0.0, retention=1.0):
+    """The point at which the flow from `point` reaches `section`."""
+    t, q = point[0], np.asarray(point[1:])
+    while True:
+        watched = [lambda t, q: _guard(t, q), lambda t, q: _level(section, t, q)]
+        for function in watched:
+            function.terminal, function.direction = True, -1.0
+        run = solve_ivp(
+            lambda t, q: _field(t, q, u), (t, t + 2.0), q,
+            method="DOP853", rtol=1e-13, atol=1e-14, events=watched,
+        )  # fmt: skip
+        assert run.status == 1, f"nothing happens after {point}"
+        which = int(len(run.t_events[1]) > 0)
+        # Once more over the last step, so that its end is a true step and no interpolant.
+        last, start = run.t[-2], run.y[:, -2]
+        if run.t[-1] > last:
+            again = solve_ivp(
+                lambda t, q: _field(t, q, u), (last, run.t[-1]), start,
+                method="DOP853", rtol=1e-13, atol=1e-14,
+            )  # fmt: skip
+            t, q = _polish(watched[which], run.t[-1], again.y[:, -1], u)
+        if which == 1:
+            return np.array([t, *q])
+        if len(q) == 4:
+            q = np.array([q[0], retention * q[1]])
+        else:
+            q = np.array([q[0], q[1], 0.0, 0.0])
+
+
+def onto(section, point, names):
+    """`point` with the one coordinate that is not in `names` set so that it lies on `section`."""
+    point = np.array(point)
+    kind, value = section
+    if kind == "clock":
+        point[0] = value
+    elif "vM" not in names:
+        point[2] = 1.9 * np.tan(value) * (point[1] - 1.9) / 0.3
+    else:
+        assert "yM" not in names
+        point[1] = 1.9 + 0.3 * (point[2] / 1.9) / np.tan(value)
+    return point
+
+
+def jacobian(point, here, there, names, names_after, retention=1.0, e=2e-4):
+    """Derivatives of the coordinates `names_after` on `there` with respect to `names` on `here`,
+    and (last column) to an input held in between; central differences of fourth order."""
+    columns = [NAMES.index(n) for n in names] + [None]
+    rows = [NAMES.index(n) for n in names_after]
+    out = np.empty((len(rows), len(columns)))
+    for j, k in enumerate(columns):
+
+        def value(x, k=k):
+            start = np.array(point)
+            if k is not None:
+                start[k] += x
+            start = onto(here, start, names)
+            return flow(start, there, x if k is None else 0.0, retention)[rows]
+
+        out[:, j] = (8 * (value(e) - value(-e)) - (value(2 * e) - value(-2 * e))) / (12 * e)
+    return out
