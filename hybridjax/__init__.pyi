@@ -1,4 +1,4 @@
-from . import models as models
+from . import models as models, plot as plot
 from ._core.cache import enable_compilation_cache as enable_compilation_cache
 from ._core.errors import (
     ComputationError as ComputationError,

@@ -1,0 +1,10 @@
+from .look import COLORS as COLORS, COLUMN as COLUMN, PAGE as PAGE, save as save, style as style
+from .orbit import cycle as cycle
+from .plane import multipliers as multipliers, poles_zeros as poles_zeros
+from .signals import experiment as experiment
+from .transfer import (
+    bode as bode,
+    bodes as bodes,
+    harmonics as harmonics,
+    magnitude as magnitude,
+)

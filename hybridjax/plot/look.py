@@ -1,0 +1,126 @@
+"""One look for all figures: sizes of a two-column paper, colours, fonts; and saving."""
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from .._core.errors import DefinitionError
+
+
+COLUMN = 3.5
+"""Width of one column, in inches."""
+PAGE = 7.16
+"""Width of two columns and the space between, in inches."""
+
+COLORS = {
+    "blue": "#0072B2",
+    "red": "#D55E00",
+    "green": "#009E73",
+    "purple": "#CC79A7",
+    "orange": "#E69F00",
+    "sky": "#56B4E9",
+    "black": "#000000",
+    "grey": "#8C8C8C",
+}
+"""The palette of Okabe and Ito (2008), which colour-blind readers can tell apart, and a grey."""
+
+CYCLE = [COLORS[name] for name in ("blue", "red", "green", "purple", "orange", "sky")]
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": matplotlib.cycler(color=CYCLE),
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.borderaxespad": 0.3,
+    "lines.linewidth": 1.0,
+    "lines.markersize": 4,
+    "figure.dpi": 150,
+}
+# Text stays text: fonts are embedded whole (TrueType), and can be searched and edited.
+_FONTS_IN_FILES = {"pdf.fonttype": 42, "svg.fonttype": "none"}
+
+
+def style() -> contextlib.AbstractContextManager:
+    """The package's look, for figures of your own: `with hj.plot.style(): ...`.
+
+    Functions of this module use it when they make the figure; on Axes that they are given they
+    leave fonts and sizes alone. Global settings of matplotlib are never changed.
+    """
+    return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float = 2.6, **options
+) -> tuple[Figure, np.ndarray]:
+    """A figure and its array of Axes (rows, columns)."""
+    return pyplot.subplots(
+        rows, columns, figsize=(width, height), layout="constrained", squeeze=False, **options
+    )
+
+
+@contextlib.contextmanager
+def axes_or_new(ax: Axes | None, **options):
+    """`ax` as it is, or new Axes in the package's style."""
+    if ax is not None:
+        yield ax
+        return
+    with style():
+        yield new_figure(**options)[1][0, 0]
+
+
+def label_of(name: str, labels: Mapping[str, str] | None) -> str:
+    """The text for a state, input or output: the user's, or its name."""
+    return (labels or {}).get(name, name)
+
+
+def letters(axes: Any) -> None:
+    """Call the Axes of a figure A, B, C, ..."""
+    for ax, letter in zip(np.ravel(axes), "ABCDEFGHIJKLMNOPQRSTUVWXYZ", strict=False):
+        ax.set_title(letter, loc="left", fontweight="bold")
+
+
+def save(figure: Figure | Axes, path: str | os.PathLike, dpi: int = 150) -> tuple[Path, Path]:
+    """Write a figure as PNG and as PDF.
+
+    **Arguments:** `figure`, or some Axes of it; `path` without suffix (one of `.png`, `.pdf` is
+    dropped); `dpi` of the PNG.
+
+    **Returns:** the paths of the PNG and of the PDF.
+
+    **Raises:** `DefinitionError` if they cannot be written.
+    """
+    if isinstance(figure, Axes):
+        figure = figure.get_figure(root=True)
+    path = Path(path)
+    if path.suffix in (".png", ".pdf"):
+        path = path.with_suffix("")
+    paths = tuple(path.with_name(path.name + suffix) for suffix in (".png", ".pdf"))
+    try:
+        with matplotlib.rc_context(_FONTS_IN_FILES):
+            for one in paths:
+                figure.savefig(one, dpi=dpi)
+    except OSError as error:
+        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
+    return paths

@@ -1,0 +1,180 @@
+"""A limit cycle in phase space (paper Fig. 1)."""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
+
+from .._core.errors import DefinitionError
+from ..flow.trajectory import Trajectory
+from ..orbits.cycle import LimitCycle
+from ..orbits.place import PlacedSections
+from ..systems.structure import Structure
+from .look import COLORS, axes_or_new, label_of
+
+
+_CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
+_BAR = 0.035  # half of a section's bar, as a part of the width of the picture
+
+
+def cycle(
+    cycle: LimitCycle,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    sections: PlacedSections | None = None,
+    perturbed: Trajectory | None = None,
+    labels: Mapping[str, str] | None = None,
+    numbers: int | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """The limit cycle in the plane of two states or outputs, coloured by chart.
+
+    Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
+    along the section where it is a curve in this plane (its level depends on x and y only),
+    across the orbit elsewhere.
+
+    **Arguments:**
+
+    - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
+    - `sections`: from `place_sections`, drawn as bars and numbered.
+    - `numbers`: number every so manyth section (0: none); by default about 8 of them.
+    - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
+    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$ (m)"}`.
+    - `ax`: where to draw; a new figure of one column's width by default.
+
+    **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
+    """
+    s = Structure(cycle.system)
+    x, y = _plane(s, x, y)
+    for what, own in (("sections", sections), ("perturbed", perturbed)):
+        system = None if own is None else (own.cycle.system if what == "sections" else own.system)
+        if system is not None and Structure(system).names != s.names:
+            raise DefinitionError(f"`{what}` and the cycle belong to different systems.")
+    orbit = cycle.trajectory()
+    with axes_or_new(ax, height=3.0) as ax:
+        if perturbed is not None:
+            pieces = _pieces(perturbed, x, y)
+            for _, px, py in pieces:
+                ax.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
+            ax.plot(pieces[0][1][0], pieces[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
+        seen = set()
+        for a, px, py in _pieces(orbit, x, y):
+            label = None if a in seen else s.names[a]
+            seen.add(a)
+            color = _CHARTS[a % len(_CHARTS)]
+            ax.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
+        _, px, py = orbit(x, y)
+        center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
+        _events(ax, s, orbit, (x, y), center)
+        ax.autoscale_view()
+        ax.margins(0.08)
+        if sections is not None:
+            step = max(1, round(sections.count / 8)) if numbers is None else numbers
+            _sections(ax, s, sections, (x, y), center, step)
+        if perturbed is not None:
+            ax.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
+        ax.set_xlabel(label_of(x, labels))
+        ax.set_ylabel(label_of(y, labels))
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+    return ax
+
+
+def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
+    everywhere = [
+        n
+        for n in s.state_names()
+        if all(s.state_function(n, a) is not None for a in range(len(s.charts)))
+    ]
+    if (x is None or y is None) and len(everywhere) < 2:
+        raise DefinitionError(
+            "no two states are defined in every chart: say what to draw with `x` and `y`."
+        )
+    x = everywhere[0] if x is None else x
+    y = next(n for n in everywhere if n != x) if y is None else y
+    s.resolve_outputs((x, y))
+    return x, y
+
+
+def _pieces(trajectory: Trajectory, x: str, y: str):
+    """(chart, x, y) of each stay between two events."""
+    t, chart, _ = trajectory.dense()
+    _, px, py = trajectory(x, y)
+    cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
+    pieces = zip(np.split(chart, cuts), np.split(px, cuts), np.split(py, cuts), strict=True)
+    return [
+        (int(c[0]), px, py) for c, px, py in pieces if len(c) > 1 and np.any(np.isfinite(px + py))
+    ]
+
+
+def _point(s: Structure, a: int, names, t, q) -> np.ndarray:
+    """Where a state lies in the plane."""
+    return np.asarray(s.resolve_outputs(names)(a, t, q[: s.dims[a]], jnp.zeros(s.nu)))
+
+
+def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
+    for k in np.flatnonzero(orbit.event >= 0):
+        transition = s.transitions[orbit.event[k]]
+        a, b = s.chart_index(transition.source), s.chart_index(transition.target)
+        before = _point(s, a, names, orbit.t[k], orbit.before[k])
+        after = _point(s, b, names, orbit.t[k], orbit.after[k])
+        if not np.all(np.isfinite([before, after])):
+            continue
+        if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
+            ends = np.stack([before, after], axis=1)
+            ax.plot(*ends, "--", color="black", lw=0.8, zorder=2)
+            ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
+        ax.plot(*before, "o", ms=4, color="black", zorder=5)
+        _text(ax, transition.name, before, center, distance=-9)
+
+
+def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
+    """A text beside `point`, away from `center` (towards it if `distance` is negative)."""
+    span = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
+    away = (np.asarray(point) - center) / span
+    away = np.sign(distance) * away / (np.linalg.norm(away) or 1.0)
+    ax.annotate(
+        text, point, xytext=abs(distance) * away, textcoords="offset points", zorder=6,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        ha="left" if away[0] > 0.35 else "right" if away[0] < -0.35 else "center",
+        va="bottom" if away[1] > 0.35 else "top" if away[1] < -0.35 else "center",
+        **options,
+    )  # fmt: skip
+
+
+def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center, step: int) -> None:
+    width, height = ax.get_position().size * ax.get_figure(root=True).get_size_inches()
+    unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
+    lanes = placed.lanes
+    charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
+    bars = []
+    for i in range(placed.count):
+        a, t, q = int(charts[i]), times[i], states[:, i]
+        here = _point(s, a, names, t, q)
+        along = _along(s, placed, i, a, t, q, names, unit)
+        bars.append(np.stack([here - _BAR * along, here + _BAR * along]))
+        if step and i % step == 0:
+            _text(ax, str(i), here, center, distance=12, fontsize="x-small", color="0.35")
+    bars = np.stack(bars)
+    gaps = np.full((len(bars), 1), np.nan)
+    flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]
+    ax.plot(*flat, color="0.35", lw=0.8, zorder=4, label=f"sections ({placed.count})")
+
+
+def _along(s: Structure, placed: PlacedSections, i, a, t, q, names, unit) -> np.ndarray:
+    """A step of length 1 on the page along section i, in the units of the axes."""
+    states = s.charts[a].states
+    normal = np.asarray(placed.normal[i])
+    inside = [1 + states.index(n) for n in names if n in states]
+    others = np.delete(normal, inside)
+    if len(inside) == 2 and np.any(normal) and not np.any(np.abs(others) > 1e-12):
+        slope = normal[inside]
+        step = np.array([-slope[1], slope[0]]) / unit
+    else:
+        f = s.field(a, t, jnp.asarray(q[: s.dims[a]]), jnp.zeros(s.nu))
+        ahead = _point(s, a, names, t + 1e-6, q[: s.dims[a]] + 1e-6 * np.asarray(f))
+        step = (ahead - _point(s, a, names, t, q)) / unit
+        step = np.array([-step[1], step[0]])
+    return unit * step / (np.linalg.norm(step) or 1.0)

@@ -1,0 +1,222 @@
+"""Floquet multipliers, poles and zeros in the complex plane."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from .._core.errors import DefinitionError
+from ..identify.compare import compare_multipliers
+from ..identify.rational import RationalFit
+from ..identify.structured import StructuredFit
+from ..orbits.cycle import LimitCycle
+from ..periodic.ldtp import LDTP
+from .look import (
+    COLORS,
+    COLUMN,
+    CYCLE,
+    PAGE,
+    axes_or_new,
+    label_of,
+    letters,
+    new_figure,
+    style,
+)
+
+
+_MARKERS = "osD^vP*X"
+_RATIO = 2.4  # width of a panel of poles_zeros, in heights
+
+
+def multipliers(
+    true: Any,
+    estimates: Mapping[str, Any] | None = None,
+    *,
+    zoom: bool = True,
+    labels: Mapping[str, str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Floquet multipliers in the unit disc: the true ones as crosses, estimates as open markers.
+
+    The legend gives each estimate's largest distance |Δλ| from the true ones, and an inset
+    enlarges the surroundings of the leading multiplier so that the estimates can be told apart.
+
+    **Arguments:**
+
+    - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them.
+    - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`, or
+        multipliers.
+    - `zoom`: draw the inset. `labels`: texts for the outputs by name.
+
+    **Raises:** `DefinitionError` if there are no multipliers.
+    """
+    true = _values(true.multipliers() if isinstance(true, LDTP) else true)
+    if true.size == 0:
+        raise DefinitionError("there is no multiplier to draw.")
+    series = _series(estimates or {}, labels)
+    own = ax is None
+    with axes_or_new(ax, height=3.5 + 0.15 * len(series)) as ax:
+        _unit_circle(ax)
+        boxes = [ax]
+        far = max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
+        ax.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
+        ax.locator_params(nbins=5)
+        if zoom and series:
+            boxes.append(_zoom(ax, true, series))
+        for box in boxes:
+            box.plot(true.real, true.imag, "+", ms=9, mew=1.2, color="black", label="exact", ls="")
+            for k, (label, z) in enumerate(series.items()):
+                error = compare_multipliers(z, true).max_error
+                box.plot(
+                    z.real, z.imag, _MARKERS[k % len(_MARKERS)], mfc="none", ms=5, mew=1.0, ls="",
+                    color=CYCLE[k % len(CYCLE)],
+                    label=rf"{label}: $|\Delta\lambda|$ = {_power(error)}",
+                )  # fmt: skip
+        _complex_axes(ax, r"\lambda")
+        if own and series:
+            shown = ax.get_legend_handles_labels()
+            ax.get_figure(root=True).legend(*shown, loc="outside lower center")
+        elif series:
+            ax.legend()
+    return ax
+
+
+def poles_zeros(
+    fits: Mapping[str, RationalFit], *, labels: Mapping[str, str] | None = None
+) -> Figure:
+    """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
+
+    The upper row shows them all, the lower one the surroundings of the poles. A family of
+    sections has one colour, so that one sees whether another family moves poles or zeros.
+
+    **Arguments:** `fits`: by name of the section family, all with the same outputs.
+
+    **Raises:** `DefinitionError` if there are none, or their outputs differ.
+    """
+    if not fits or len({fit.outputs for fit in fits.values()}) != 1:
+        raise DefinitionError("poles_zeros needs one or more fits with the same outputs.")
+    outputs = next(iter(fits.values())).outputs
+    with style():
+        width = COLUMN if len(outputs) == 1 else PAGE
+        figure, axes = new_figure(2, len(outputs), width=width, height=4.0)
+        for i, output in enumerate(outputs):
+            upper, lower = axes[:, i]
+            for ax in (upper, lower):
+                _unit_circle(ax)
+                for k, (family, fit) in enumerate(fits.items()):
+                    # Equal ones stay visible: each family is smaller than the one before.
+                    line = {"ls": "", "mfc": "none", "ms": 8 - 2.5 * (k % 3), "mew": 1.0}
+                    line["color"] = CYCLE[k % len(CYCLE)]
+                    p, z = fit.poles[i], fit.zeros[i]
+                    ax.plot(p.real, p.imag, marker="x", label=f"poles, {family}", **line)
+                    ax.plot(z.real, z.imag, marker="o", label=f"zeros, {family}", **line)
+            poles = np.concatenate([fit.poles[i] for fit in fits.values()])
+            zeros = np.concatenate([fit.zeros[i] for fit in fits.values()])
+            _limits(lower, *_near(poles, zeros[np.isfinite(zeros)]))
+            everything = np.concatenate([poles, zeros[np.isfinite(zeros)], [1, -1, 1j, -1j]])
+            _equal_limits(upper, everything, _RATIO)
+            lower.set_box_aspect(1 / _RATIO)
+            (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
+            upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
+            upper.set_title(label_of(output, labels))
+            lower.set_title("enlarged: around the poles")
+            _complex_axes(lower, "z")
+            _complex_axes(upper, "z")
+        figure.legend(
+            *axes[0, 0].get_legend_handles_labels(), loc="outside upper center",
+            ncols=4 if len(outputs) > 1 else 2,
+        )  # fmt: skip
+        letters(axes)
+    return figure
+
+
+def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Real and imaginary parts of the poles, the zeros close to them, and the unit circle there."""
+    center = poles.real.mean()
+    reach = np.abs(poles - center).max()
+    points = np.concatenate([poles, poles.conj(), zeros[np.abs(zeros - center) <= 2 * reach]])
+    edge = poles.real[np.argmax(np.abs(poles))]
+    circle = [np.sign(edge)] if abs(abs(edge) - 1) <= reach else []
+    return np.concatenate([points.real, circle]), points.imag
+
+
+def _values(source: Any) -> np.ndarray:
+    if isinstance(source, LimitCycle | StructuredFit):
+        source = source.multipliers
+    values = np.asarray(source)
+    if values.dtype.kind not in "fciu":
+        raise DefinitionError(f"multipliers are numbers, not {values.dtype}.")
+    return values.ravel().astype(complex)
+
+
+def _series(estimates: Mapping[str, Any], labels) -> dict[str, np.ndarray]:
+    series = {}
+    for label, estimate in estimates.items():
+        if isinstance(estimate, RationalFit):
+            for name, z in zip(estimate.outputs, estimate.multipliers, strict=True):
+                series[f"{label}, {label_of(name, labels)}"] = _values(z)
+        else:
+            series[label] = _values(estimate)
+    return series
+
+
+def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray]) -> Axes:
+    """An inset around the leading true multiplier, at a place that is free of markers."""
+    leading = true[np.lexsort((-true.imag, -np.abs(true)))[0]]
+    nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
+    reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest)])
+    side = 0.36
+    points = (np.concatenate([true, *series.values()]) / ax.get_xlim()[1] + 1 + 1j) / 2
+    places = [0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j]
+    place = max(places, key=lambda c: _largest_part(points - c).min())
+    inset = ax.inset_axes(
+        (place.real - side / 2, place.imag - side / 2, side, side),
+        xlim=(leading.real - reach, leading.real + reach),
+        ylim=(leading.imag - reach, leading.imag + reach),
+    )
+    inset.set_aspect("equal")
+    inset.tick_params(labelsize="xx-small", length=2)
+    for spine in inset.spines.values():
+        spine.set(visible=True, color="0.4")
+    inset.locator_params(nbins=3)
+    ax.indicate_inset_zoom(inset, edgecolor="0.4")
+    return inset
+
+
+def _largest_part(z: np.ndarray) -> np.ndarray:
+    return np.maximum(np.abs(z.real), np.abs(z.imag))
+
+
+def _unit_circle(ax: Axes) -> None:
+    ax.add_patch(Circle((0, 0), 1, fill=False, ec=COLORS["grey"], lw=0.6, zorder=0))
+    ax.axhline(0, color=COLORS["grey"], lw=0.3, zorder=0)
+    ax.axvline(0, color=COLORS["grey"], lw=0.3, zorder=0)
+
+
+def _complex_axes(ax: Axes, symbol: str) -> None:
+    ax.set(xlabel=rf"$\mathrm{{Re}}\,{symbol}$", ylabel=rf"$\mathrm{{Im}}\,{symbol}$")
+
+
+def _limits(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    for setter, values in ((ax.set_xlim, x), (ax.set_ylim, y)):
+        margin = 0.15 * (np.ptp(values) or 1.0)
+        setter(values.min() - margin, values.max() + margin)
+
+
+def _equal_limits(ax: Axes, z: np.ndarray, ratio: float) -> None:
+    """Limits around z, with one scale on both axes, `ratio` times as wide as high."""
+    width = 1.2 * max(np.ptp(z.real), ratio * np.ptp(z.imag))
+    for setter, values, part in ((ax.set_xlim, z.real, 1), (ax.set_ylim, z.imag, 1 / ratio)):
+        middle, half = (values.min() + values.max()) / 2, width * part / 2
+        setter(middle - half, middle + half)
+    ax.set_aspect("equal")
+
+
+def _power(error: float) -> str:
+    if error == 0:
+        return "0"
+    exponent = int(np.floor(np.log10(error)))
+    return rf"${error / 10.0**exponent:.1f} \cdot 10^{{{exponent}}}$"

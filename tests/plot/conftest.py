@@ -1,0 +1,33 @@
+import pytest
+from matplotlib import pyplot
+
+import hybridjax as hj
+
+from ..periodic.conftest import hopper as hopper
+
+
+@pytest.fixture(autouse=True)
+def figures_are_closed():
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="session")
+def estimate(hopper):
+    design = hj.multisine(periods=16, f_max=4.0)
+    return hj.estimate_htf(hj.simulate_experiments(hopper, design, start="periodic"), (-1, 0, 1))
+
+
+@pytest.fixture(scope="session")
+def exact(hopper, estimate):
+    return hopper.htf(estimate.f, (-1, 0, 1))
+
+
+@pytest.fixture(scope="session")
+def rational(estimate):
+    return hj.fit_rational(estimate)
+
+
+@pytest.fixture(scope="session")
+def structured(estimate):
+    return hj.fit_multipliers(estimate, 2, overhang=16)

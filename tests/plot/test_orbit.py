@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+def labelled(ax):
+    return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
+
+
+def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
+    lanes = placed_kinematic.lanes
+    start = np.asarray(lanes.q[:, 0]) + [0.03, 0, 0, 0]
+    perturbed = hj.simulate(hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0]))
+    ax = hj.plot.cycle(
+        hopper_cycle, sections=placed_kinematic, perturbed=perturbed, labels={"yM": "$y_M$ (m)"}
+    )
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y_M$ (m)", "vM")
+    lines = labelled(ax)
+    assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
+    names = [t.get_text() for t in ax.texts]
+    assert names == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
+
+    # Bars lie on their sections: rays from the centre of the kinematic phase, in equal angles.
+    bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]
+    r = (bars - [1.9, 0.0]) / [0.3, 1.9]
+    angle = np.unwrap(np.angle(r[..., 0] + 1j * r[..., 1]), axis=0)
+    np.testing.assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
+    np.testing.assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
+    np.testing.assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
+
+
+def test_chart_colours_meet_at_the_events(hopper_cycle):
+    ax = hj.plot.cycle(hopper_cycle)
+    liftoff = hopper_cycle.trajectory().events[0].before
+    lines = labelled(ax)
+    np.testing.assert_allclose(lines["flight"].get_xydata()[0], [liftoff["yM"], liftoff["vM"]])
+    assert lines["flight"].get_color() != lines["stance"].get_color()
+
+
+def test_resets_that_jump_are_dashed(hopper_cycle):
+    ax = hj.plot.cycle(hopper_cycle, "ym", "vm")
+    (jump,) = [x for x in ax.get_lines() if x.get_linestyle() == "--"]
+    touchdown = hopper_cycle.trajectory().events[1].before
+    np.testing.assert_allclose(jump.get_xydata(), [[0, touchdown["vm"]], [0, 0]], atol=1e-12)
+
+
+def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
+    placed = hj.place_sections(vanderpol_cycle, hj.ClockPhase(6))
+    ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed, numbers=0)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x") and not ax.texts
+    bars = labelled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
+    np.testing.assert_allclose(bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9)
+
+
+def test_bad_input(hopper_cycle, vanderpol_cycle, placed_kinematic):
+    with pytest.raises(hj.DefinitionError, match="no output 'yN'; outputs are 'yM'"):
+        hj.plot.cycle(hopper_cycle, "yN")
+    with pytest.raises(hj.DefinitionError, match="belong to different systems"):
+        hj.plot.cycle(vanderpol_cycle, sections=placed_kinematic)
+    with pytest.raises(hj.DefinitionError, match="belong to different systems"):
+        hj.plot.cycle(hopper_cycle, perturbed=vanderpol_cycle.trajectory())

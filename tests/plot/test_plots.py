@@ -1,0 +1,209 @@
+import equinox as eqx
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import hybridjax as hj
+
+
+def labelled(ax):
+    """Lines by label, without the helpers that matplotlib or the axes hide."""
+    return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
+
+
+def texts(ax):
+    return [t.get_text() for t in ax.texts]
+
+
+# Transfer functions
+
+
+def test_magnitude_draws_the_values(estimate, exact):
+    ax = hj.plot.magnitude(estimate, exact, output="vM")
+    lines = labelled(ax)
+    assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
+    drawn = lines["$H_{1}$"]
+    np.testing.assert_array_equal(drawn.get_xdata(), estimate.f)
+    np.testing.assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
+    assert drawn.get_color() == lines["$H_{-1}$"].get_color() != lines["$H_{0}$"].get_color()
+    assert drawn.get_linestyle() == "-" and lines["$H_{-1}$"].get_linestyle() == "--"
+    assert ax.get_yscale() == "log" and "cycles/period" in ax.get_xlabel()
+    assert ax.get_ylabel() == "$|H_m|$, vM"
+
+
+def test_exact_lies_under_the_estimate_in_any_order(estimate, exact):
+    for htfs in ((estimate, exact), (exact, estimate)):
+        ax = hj.plot.magnitude(*htfs, harmonics=(0,))
+        wide, thin = (x for x in ax.get_lines() if len(x.get_xdata()))
+        assert wide.get_zorder() < thin.get_zorder() and wide.get_linewidth() > 2
+        np.testing.assert_array_equal(thin.get_ydata(), np.abs(estimate[0][:, 0, 0]))
+
+
+def test_only_exact(exact):
+    assert "exact" in labelled(hj.plot.magnitude(exact))
+    hj.plot.bode(exact)
+
+
+def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
+    figure = hj.plot.harmonics(
+        {"isochron": (estimate, exact), "again": exact}, labels={"vM": r"$\dot y_M$"}
+    )
+    assert isinstance(figure, Figure)
+    grid = np.reshape(figure.axes, (2, 2))
+    assert [ax.get_title() for ax in grid[0]] == ["isochron", "again"]
+    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", r"$|H_m|$, $\dot y_M$"]
+    assert [ax.get_title(loc="left") for ax in grid.ravel()] == list("ABCD")
+    assert sum(ax.get_legend() is not None for ax in grid.ravel()) == 1
+    assert grid[0, 0].get_ylim() == grid[0, 1].get_ylim()
+
+
+def test_bode_with_fits(estimate, exact, rational, structured):
+    figure = hj.plot.bode(estimate, exact, fits=[rational, structured])
+    upper, lower = figure.axes
+    assert list(labelled(upper)) == ["yM", "vM", "rational fit", "structured fit", "exact"]
+    assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
+    curves = [x for x in upper.get_lines() if len(x.get_xdata())]
+    assert len(curves) == len(lower.get_lines()) == 2 * 4
+    np.testing.assert_allclose(curves[2].get_ydata(), np.abs(rational.evaluate(estimate.f)[:, 0]))
+    phases = [x.get_ydata() for x in lower.get_lines()]
+    np.testing.assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
+    np.testing.assert_allclose(phases[1], phases[0], atol=2)
+
+
+def test_bode_of_another_harmonic_and_one_output(estimate, structured, rational):
+    figure = hj.plot.bode(estimate, fits=structured, harmonic=-1, outputs="vM")
+    assert list(labelled(figure.axes[0])) == ["vM", "structured fit"]
+    with pytest.raises(hj.DefinitionError, match="the rational fit is of H_0, not of H_1"):
+        hj.plot.bode(estimate, fits=rational, harmonic=1)
+
+
+def test_bodes(estimate, exact, rational):
+    families = {"a": (estimate, exact), "b": estimate}
+    figure = hj.plot.bodes(families, fits={"b": rational})
+    assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
+    with pytest.raises(hj.DefinitionError, match="fits of 'c', but the HTFs are"):
+        hj.plot.bodes(families, fits={"c": rational})
+
+
+def test_on_given_axes_nothing_else_is_made(estimate):
+    with hj.plot.style():
+        figure = Figure()
+        axes = figure.subplots(2, 2)
+    assert hj.plot.magnitude(estimate, ax=axes[0, 0]) is axes[0, 0]
+    assert hj.plot.bode(estimate, axes=axes[:, 1]) is figure
+    assert hj.plot.multipliers([0.5], ax=axes[1, 0]) is axes[1, 0]
+    assert matplotlib.pyplot.get_fignums() == []
+
+
+def test_bad_input_of_transfer_functions(estimate, hopper):
+    with pytest.raises(hj.DefinitionError, match="no HTF to draw"):
+        hj.plot.magnitude()
+    with pytest.raises(hj.DefinitionError, match="no HTF to draw"):
+        hj.plot.bode()
+    with pytest.raises(hj.DefinitionError, match="no 'ym' among yM, vM"):
+        hj.plot.magnitude(estimate, output="ym")
+    with pytest.raises(hj.DefinitionError, match="no 2 among yM, vM"):
+        hj.plot.magnitude(estimate, output=2)
+    with pytest.raises(hj.DefinitionError, match="no 'force' among u"):
+        hj.plot.bode(estimate, input="force")
+    with pytest.raises(hj.DefinitionError, match="Harmonic 3 is not stored"):
+        hj.plot.magnitude(estimate, harmonics=(0, 3))
+    with pytest.raises(hj.DefinitionError, match="at least one HTF"):
+        hj.plot.harmonics({})
+    other = hj.HTF(estimate.f, estimate.H[:, :, :1], estimate.harmonics, 32)
+    with pytest.raises(hj.DefinitionError, match="the same outputs"):
+        hj.plot.harmonics({"a": estimate, "b": other})
+
+
+# The complex plane
+
+
+def test_multipliers(hopper, rational, structured):
+    ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured})
+    lines = labelled(ax)
+    assert [name.split(":")[0] for name in lines] == ["exact", "2p1z, yM", "2p1z, vM", "structured"]
+    z = hopper.multipliers()
+    np.testing.assert_array_equal(lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1))
+    assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
+    error = structured.compare(z).max_error
+    assert f"{error:.1e}".split("e")[0] in list(lines)[-1]
+    (inset,) = ax.child_axes
+    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    for points in (z, *rational.multipliers, structured.multipliers):
+        first = points[points.imag > 0][0]
+        assert left < first.real < right and low < first.imag < high
+
+
+def test_multipliers_outside_the_disc_and_without_estimates():
+    ax = hj.plot.multipliers([3.0, 0.5])
+    assert ax.get_xlim()[1] > 3 and not ax.child_axes
+    ax = hj.plot.multipliers([1.5], {"same": [1.5]})
+    assert "= 0" in list(labelled(ax))[1]
+
+
+@pytest.mark.parametrize("bad", [[], ["a"]])
+def test_multipliers_of_nothing(bad):
+    with pytest.raises(hj.DefinitionError, match="multiplier"):
+        hj.plot.multipliers(bad)
+
+
+def test_poles_and_zeros(rational):
+    moved = eqx.tree_at(lambda fit: fit.zeros, rational, np.array([[np.nan + 0j], [0.9 + 0j]]))
+    figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved})
+    assert len(figure.axes) == 4
+    for i, ax in enumerate(figure.axes[:2]):
+        poles = labelled(ax)["poles, isochron"].get_xydata()
+        np.testing.assert_array_equal(poles[:, 1], rational.poles[i].imag)
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 4
+    with pytest.raises(hj.DefinitionError, match="one or more fits"):
+        hj.plot.poles_zeros({})
+
+
+# Experiments
+
+
+def test_experiment(hopper):
+    data = hj.simulate_experiments(hopper, hj.multisine(periods=4, f_max=2.0), discard=2)
+    figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"})
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ $y_M$", r"$\delta$ vM"]
+    y = figure.axes[2].get_lines()[0]
+    np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
+    np.testing.assert_allclose(y.get_xdata()[32], 1.0)
+    assert "cycles" in figure.axes[2].get_xlabel()
+    with pytest.raises(hj.DefinitionError, match="no experiment 99"):
+        hj.plot.experiment(data, 99)
+
+
+def test_failed_experiment():
+    y = np.ones((1, 8, 1))
+    y[0, 5:] = np.nan
+    data = hj.ExperimentData(
+        np.zeros((1, 8, 1)), y, sections=2, periods=2, result=[hj.Result.GRAZING], failed_at=[5]
+    )
+    figure = hj.plot.experiment(data)
+    assert "grazing" in figure.axes[0].get_title()
+    assert figure.axes[0].get_lines()[1].get_xdata()[0] == 2.5
+
+
+# The look
+
+
+def test_saved_as_png_and_pdf(tmp_path):
+    ax = hj.plot.multipliers([0.5])
+    png, pdf = hj.plot.save(ax, tmp_path / "multipliers.png")
+    assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
+    assert {p.name for p in tmp_path.iterdir()} == {"multipliers.png", "multipliers.pdf"}
+    again = hj.plot.save(ax.get_figure(), str(tmp_path / "v1.0"))
+    assert [p.name for p in again] == ["v1.0.png", "v1.0.pdf"]
+    with pytest.raises(hj.DefinitionError, match="cannot write"):
+        hj.plot.save(ax, tmp_path / "absent" / "x")
+
+
+def test_global_settings_stay(estimate):
+    before = dict(matplotlib.rcParams)
+    hj.plot.magnitude(estimate)
+    with hj.plot.style():
+        assert matplotlib.rcParams["font.size"] == 8
+    assert dict(matplotlib.rcParams) == before
