@@ -75,9 +75,13 @@ def new_figure(
     rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float = 2.6, **options
 ) -> tuple[Figure, np.ndarray]:
     """A figure and its array of Axes (rows, columns)."""
-    return pyplot.subplots(
+    figure, axes = pyplot.subplots(
         rows, columns, figsize=(width, height), layout="constrained", squeeze=False, **options
     )
+    for ax in axes.ravel():
+        # Said here, since ticks are chosen when the figure is drawn, in whatever style then.
+        ax.tick_params(labelsize=_STYLE["xtick.labelsize"])
+    return figure, axes
 
 
 @contextlib.contextmanager
