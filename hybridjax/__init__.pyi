@@ -19,6 +19,7 @@ from .experiments.multisine import (
     paper_design as paper_design,
     single_cosine as single_cosine,
 )
+from .experiments.run import run_experiments as run_experiments
 from .flow.move import Settings as Settings
 from .flow.sections import (
     AtEvent as AtEvent,
@@ -41,6 +42,7 @@ from .identify.structured import (
 from .io import load as load, save as save
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
 from .orbits.linearize import linearize as linearize
+from .orbits.maps import SectionMap as SectionMap, section_map as section_map
 from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
