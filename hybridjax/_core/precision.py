@@ -31,7 +31,8 @@ def require_x64(*trees: Any) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(trees):
         dtype = getattr(leaf, "dtype", None)
         if dtype is not None and jnp.issubdtype(dtype, jnp.floating) and dtype != jnp.float64:
+            name = jax.tree_util.keystr(path[1:]).lstrip(".") or "argument"
             raise PrecisionError(
-                f"`{jax.tree_util.keystr(path[1:]) or 'argument'}` is {dtype}: it was built before "
-                "`hybridjax.enable_x64()`. Switch 64-bit mode on first, then build it again."
+                f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`. Switch 64-bit "
+                "mode on first, then build it again."
             )

@@ -15,8 +15,12 @@ from .watch import Watch, watch
 # A watched function counts as zero if its rate would have made its value in this fraction of the
 # time span at hand.
 ZERO = 1e-12
+# Times of a schedule are equal if they differ by less than this fraction of its period.
+_TIE = 1e-9
 # Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
+# A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno too.
+_ZENO_SLOW = 3
 
 
 def start_lanes(
@@ -99,14 +103,21 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
     return out
 
 
-def next_schedule(s: Structure, t: Float[Array, " L"], chart: Int[Array, " L"]):
-    """Time of the next scheduled event after t (infinity if there is none), and its transition."""
+def next_schedule(
+    s: Structure, t: Float[Array, " L"], chart: Int[Array, " L"], end: Float[Array, " L"]
+) -> tuple[Float[Array, " L"], Int[Array, " L"]]:
+    """Time of the next scheduled event after t (infinity if there is none), and its transition.
+
+    Times that differ by rounding are one: an event that was due at t is past, and one that is due
+    at `end` happens at `end`.
+    """
     best, which = jnp.full_like(t, jnp.inf), jnp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         schedule = transition.guard
         if isinstance(schedule, Scheduled):
-            k = jnp.floor((t - schedule.offset) / schedule.period + 1e-9) + 1
+            k = jnp.floor((t - schedule.offset) / schedule.period + _TIE) + 1
             time = schedule.offset + k * schedule.period
+            time = jnp.where(jnp.abs(time - end) <= _TIE * schedule.period, end, time)
             sooner = (chart == s.chart_index(transition.source)) & (time < best)
             best, which = jnp.where(sooner, time, best), jnp.where(sooner, g, which)
     return best, which
@@ -125,9 +136,15 @@ def scheduled_time(s: Structure, fired: Int[Array, " L"], t: Float[Array, " L"])
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"], moved: Float[Array, " L"], event: Bool[Array, " L"]
+    pace: Float[Array, "4 L"],
+    moved: Float[Array, " L"],
+    event: Bool[Array, " L"],
+    slow: Bool[Array, " L"],
 ) -> tuple[Float[Array, "4 L"], Bool[Array, " L"]]:
-    """Bookkeeping for Zeno: do the intervals between events shrink with a sum that converges?"""
+    """Bookkeeping for Zeno: do the intervals between events shrink with a sum that converges?
+
+    `slow` marks events whose guard is crossed at a vanishing speed.
+    """
     since, gap, streak, total = pace
     since = since + moved
     ratio = jnp.where(gap > 0, since / jnp.where(gap > 0, gap, 1.0), 0.0)
@@ -135,6 +152,7 @@ def keep_pace(
     streak = jnp.where(event, jnp.where(shrinks, streak + 1, 0.0), streak)
     total = jnp.where(event, jnp.where(shrinks, total + since, 0.0), total)
     rest = since * ratio / (1 - jnp.minimum(ratio, 0.999))
-    zeno = event & (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
+    zeno = (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
+    zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap, since = jnp.where(event, since, gap), jnp.where(event, 0.0, since)
     return jnp.stack([since, gap, streak, total]), zeno

@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -18,7 +19,7 @@ from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
 from .move import Settings, record
-from .search import IDLE
+from .search import IDLE, initial_step
 from .target import until
 from .watch import slopes
 
@@ -121,7 +122,7 @@ def simulate(
     - `chart`, `state`, `time`: where it starts. A guard that is zero there is not an event.
     - `duration`: how long it lasts, in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Zero by default.
-    - `max_steps`: bound on the number of steps.
+    - `max_steps`: bound on the number of steps, rounded up to a multiple of 512.
     - `throw`: raise if the trajectory ends early; otherwise its `result` says why it did.
 
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
@@ -147,12 +148,14 @@ def simulate(
         system = Driven(system, input)
 
     end = start.time + duration
-    lanes = _start(system, start.time[None], a, start.state, jnp.asarray(duration, float))
+    span = jnp.asarray(duration, float)
+    lanes, h = _start(system, start.time[None], a, start.state, u, span, settings)
     rows = [(lanes.t, lanes.q, lanes.q, lanes.chart, jnp.full(1, -1))]
-    h, steps = None, 0
+    steps = 0
     while True:
         moved, tape = _piece(system, lanes, u, end, settings, h)
-        used = np.asarray(tape.code[:, 0] != IDLE)
+        tape = jax.tree_util.tree_map(np.asarray, tape)
+        used = tape.code[:, 0] != IDLE
         rows.append(
             (tape.t[used], tape.before[used, :, 0].T, tape.after[used, :, 0].T)
             + (tape.chart[used, 0], tape.code[used, 0])
@@ -172,8 +175,8 @@ def simulate(
         charts,
         before.T,
         after.T,
-        np.asarray(_slopes(system, t, source, before, u)).T,
-        np.asarray(_slopes(system, t, charts, after, u)).T,
+        _slopes(system, t, source, before, u).T,
+        _slopes(system, t, charts, after, u).T,
         event,
         result,
     )
@@ -204,22 +207,31 @@ def _constant_input(s: Structure, input) -> np.ndarray:
     return np.broadcast_to(value, (s.nu,))
 
 
-@eqx.filter_jit
-def _start(system, t, a, state, span):
+@quick_jit
+def _start(system, t, a, state, u, span, settings):
     s = Structure(system)
     q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
-    return start_lanes(s, t, jnp.full(1, a, jnp.int32), q, span)
+    lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q, span)
+    return lanes, initial_step(s, lanes, u, span[None], settings.rtol)
 
 
-@eqx.filter_jit
+@quick_jit
 def _piece(system, lanes, u, end, settings, h):
     settings = dataclasses.replace(settings, max_steps=_ROWS)
     return record(system, lanes, u, until(end[None]), settings, h)
 
 
-@eqx.filter_jit
-def _slopes(system, t, chart, q, u):
-    """Fields at rows of states, (d, n)."""
+def _slopes(system, t, chart, q, u) -> np.ndarray:
+    """Fields at states (d, n). Filled up to whole pieces, so that few lengths are compiled."""
+    n = t.shape[0]
+    t, chart, q = (
+        np.concatenate([x, np.repeat(x[..., -1:], -n % _ROWS, -1)], -1) for x in (t, chart, q)
+    )
+    return np.asarray(_fields(system, t, chart, q, u))[:, :n]
+
+
+@quick_jit
+def _fields(system, t, chart, q, u):
     s = Structure(system)
     return slopes(s, t, chart, q, jnp.broadcast_to(u, (s.nu, t.shape[0])))
 

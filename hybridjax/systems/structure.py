@@ -13,15 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.errors import DefinitionError
+from .._core.tracing import is_traced
 from .chart import Chart
 from .output import Output
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
-
-
-def is_traced(tree: Any) -> bool:
-    """Whether a JAX transformation is at work on some leaf of `tree`."""
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree_util.tree_leaves(tree))
 
 
 def as_vector(value: Any) -> jax.Array:
@@ -167,15 +163,15 @@ class Outputs:
         return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))
 
 
-def check_system(system: HybridSystem) -> None:
+def check_system(system: Any) -> None:
     """Check that a system is well formed: names, shapes of every function, finite parameters.
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
     if not isinstance(system, HybridSystem):
         raise DefinitionError(
-            f"expected a HybridSystem, got {type(system).__name__}; pass an instance of the model, "
-            "e.g. `VerticalHopper()`."
+            f"expected a HybridSystem, got {system!r:.80}; pass an instance of the model, e.g. "
+            "`VerticalHopper()`."
         )
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
         if (
@@ -187,9 +183,9 @@ def check_system(system: HybridSystem) -> None:
                 f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
-    s = Structure(system)
-    if not s.charts:
+    if not system.charts():
         raise DefinitionError(f"{type(system).__name__} has no charts.")
+    s = Structure(system)
     t, u = jnp.zeros(()), jnp.zeros(s.nu)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         for unknown in set(chart.inputs or ()) - set(system.inputs):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,6 +19,12 @@ class Scheduled(eqx.Module):
 
     period: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
     offset: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+
+    def __check_init__(self):
+        if not isinstance(self.period, jax.core.Tracer) and not 0 < self.period < jnp.inf:
+            raise DefinitionError(
+                f"the period of a schedule must be positive and finite; it is {self.period}."
+            )
 
 
 def _identity(t, q, u):

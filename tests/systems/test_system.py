@@ -1,0 +1,159 @@
+"""Systems as users write them: names, shapes and numbers checked, each error in one sentence."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.systems.structure import Structure, check_system
+
+from ..toys import Field, Switched, TwoInputs
+
+
+ROOM = {
+    "a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0])),
+    "b": Field(("z",), lambda t, q, u: -q),
+}
+TO_B = hj.Transition("go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],))
+
+
+class Anything(hj.HybridSystem):
+    """A system from its parts."""
+
+    parts: dict = eqx.field(static=True)
+    links: tuple = eqx.field(static=True, default=())
+    named: tuple = eqx.field(static=True, default=())
+
+    def charts(self):
+        return self.parts
+
+    def transitions(self):
+        return self.links
+
+    def outputs(self):
+        return self.named
+
+
+@pytest.mark.parametrize("model", ["VerticalHopper", "TwoLeggedBar", "VanDerPol", "BouncingBall"])
+def test_models_are_well_formed(model):
+    system = getattr(hj.models, model)()
+    check_system(system)
+    for field in dataclasses.fields(system):
+        value = getattr(system, field.name)
+        assert isinstance(value, jax.Array) and value.dtype == np.float64 and value.shape == ()
+        assert field.metadata["doc"]
+
+
+def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
+    hopper = hj.models.VerticalHopper(M=3)
+    assert hopper.M == 3.0 and hopper.M.dtype == np.float64
+    period = eqx.filter_grad(lambda h: h.period())(hopper)
+    np.testing.assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
+    many = eqx.filter_vmap(lambda M: hj.models.VerticalHopper(M=M))(jnp.arange(1.0, 4.0))
+    np.testing.assert_array_equal(many.M, [1.0, 2.0, 3.0])
+
+
+def replaced(**changes):
+    """`TO_B` with some fields changed."""
+    return Anything(ROOM, (dataclasses.replace(TO_B, **changes),))
+
+
+@pytest.mark.parametrize(
+    "system, message",
+    [
+        (Anything({}), "has no charts"),
+        (
+            Anything({"a": Field(("x",), lambda t, q, u: (q[0], 1.0))}),
+            r"field of chart 'a' returns",
+        ),
+        (Anything({"a": Field(("x", "x"), lambda t, q, u: q)}), "names a state twice"),
+        (
+            Anything({"a": Field(("x",), lambda t, q, u: q[3] + "s")}),
+            "field of chart 'a' cannot be",
+        ),
+        (replaced(source="c"), "there is no chart 'c'; charts are 'a', 'b'"),
+        (replaced(target="c"), "there is no chart 'c'"),
+        (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
+        (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
+        (Anything(ROOM, (TO_B, TO_B)), "two transitions are called 'go'"),
+        (hj.models.VerticalHopper(k=np.nan), "parameter `k` of VerticalHopper is nan"),
+        (hj.models.VerticalHopper(g=np.inf), "parameter `g` of VerticalHopper is inf"),
+        (hj.models.VerticalHopper, "expected a HybridSystem, got <class"),
+        ("hopper", "expected a HybridSystem, got 'hopper'"),
+    ],
+)
+def test_what_is_wrong_is_said(system, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        check_system(system)
+
+
+def test_an_input_that_the_system_does_not_have():
+    class Bad(hj.Chart):
+        states = ("x",)
+        inputs = ("up",)
+
+        def field(self, t, q, u):
+            return u
+
+    with pytest.raises(hj.DefinitionError, match="chart 'a' uses input 'up'"):
+        check_system(Anything({"a": Bad()}))
+
+
+def test_directions_have_two_names():
+    with pytest.raises(hj.DefinitionError, match="transition 'go': direction is 'down'"):
+        hj.Transition("go", "a", "b", lambda t, q, u: q[0], "down")
+    with pytest.raises(hj.DefinitionError, match="Crossing has direction 'down'"):
+        hj.Crossing("x", "down")
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, np.inf])
+def test_a_schedule_needs_a_positive_period(period):
+    with pytest.raises(hj.DefinitionError, match="period of a schedule"):
+        hj.Scheduled(period)
+
+
+def test_charts_see_their_own_inputs():
+    s = Structure(TwoInputs())
+    t, q, u = jnp.zeros(()), jnp.zeros(1), jnp.array([2.0, 3.0])
+    assert [float(s.field(a, t, q, u)[0]) for a in range(3)] == [32.0, 3.0, 0.5]
+
+
+def test_a_guard_falls_at_its_event():
+    rising = Structure(replaced(direction="rising"))
+    assert rising.guard(0, 0.0, jnp.array([2.0, 0.0]), jnp.zeros(1)) == -2.0
+    assert Structure(Switched()).schedules(0) == [1] and Structure(Switched()).guards(0) == []
+
+
+def test_outputs_by_name_by_function_and_by_chart():
+    energy = hj.Output("energy", {"a": lambda t, q, u: q[0] ** 2 + q[1] ** 2 + t + u[0]})
+    s = Structure(Anything(ROOM, named=(energy,)))
+    z = s.resolve_outputs(("x", "energy", hj.Output("sum", lambda t, q, u: q.sum())))
+    assert z.names == ("x", "energy", "sum")
+    values = z(0, 1.0, jnp.array([2.0, 3.0]), jnp.array([10.0]))
+    np.testing.assert_array_equal(values, [2.0, 24.0, 5.0])
+    assert z.defined(0) and not z.defined(1)
+    with pytest.raises(hj.DefinitionError, match="output 'x' is not defined in chart 'b'"):
+        z.require(1)
+    with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are 'x', 'v'"):
+        s.resolve_outputs("y")
+
+
+def test_states_that_a_chart_does_not_carry_have_values_there():
+    s = Structure(hj.models.VerticalHopper())
+    stance = s.chart_index("stance")
+    z = s.resolve_outputs(("yM", "ym"))
+    np.testing.assert_array_equal(z(stance, 0.0, jnp.array([2.0, 1.0]), jnp.zeros(1)), [2.0, 0.0])
+    assert s.state_names() == ("yM", "vM", "ym", "vm")
+
+
+def test_single_precision_is_refused():
+    with jax.enable_x64(False):
+        early = hj.models.VerticalHopper()
+        with pytest.raises(hj.PrecisionError, match="enable_x64"):
+            hj.simulate(early, "stance", (2.0, 1.9), 1.0)
+    with pytest.raises(hj.PrecisionError, match="`m` is float32"):
+        hj.find_limit_cycle(early)
