@@ -1,0 +1,264 @@
+"""Single trajectories, against formulas."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+
+from ..toys import Blowup, Ceiling, Dip, Paddle, Switched, Turning, TwoInputs
+
+
+G = 9.81
+FALL = np.sqrt(2 / G)  # time to fall from height 1
+
+
+def ball(restitution, duration=60.0, **options):
+    system = hj.models.BouncingBall(restitution=restitution)
+    return hj.simulate(system, "fall", (1.0, 0.0), duration, **options)
+
+
+def times(trajectory, name=None):
+    return np.array([e.time for e in trajectory.events if name in (None, e.name)])
+
+
+def test_two_hundred_bounces():
+    bounces = ball(1.0, 400 * FALL)
+    n = np.arange(1, 201)
+    np.testing.assert_allclose(times(bounces), FALL * (2 * n - 1), rtol=1e-11)
+    first = bounces.events[0]
+    assert (first.name, first.source, first.target) == ("bounce", "fall", "fall")
+    np.testing.assert_allclose(first.before["v"], -np.sqrt(2 * G), rtol=1e-13)
+    np.testing.assert_allclose(first.after["v"], np.sqrt(2 * G), rtol=1e-13)
+
+
+@pytest.mark.parametrize("e", [0.1, 0.5, 0.9])
+def test_zeno_is_seen_before_its_limit(e):
+    found = ball(e, throw=False)
+    limit = FALL * (1 + e) / (1 - e)
+    assert found.result == hj.Result.ZENO
+    assert limit * (1 - 1e-3) < found.t[-1] < limit
+    n = np.arange(len(found.events))
+    expected = FALL * (1 + 2 * e * (1 - e**n) / (1 - e))
+    np.testing.assert_allclose(times(found), expected, rtol=1e-10)
+    with pytest.raises(hj.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"):
+        ball(e)
+
+
+def test_many_bounces_are_not_zeno():
+    assert ball(0.99, 60.0).result == hj.Result.OK
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12, -1e-12, 1e-9, -1e-9, 1e-3, -1e-3])
+def test_grazing(gap):
+    """A ball that would rise to 1 + 1e-16, under a ceiling at 1 + gap."""
+    found = hj.simulate(Ceiling(height=1 + gap), "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
+    hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
+    if abs(gap) < 1e-10:
+        assert found.result == hj.Result.GRAZING
+        assert all(abs(t - hit) < 1e-6 for t in times(found))
+    else:
+        assert found.result == hj.Result.OK
+        np.testing.assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
+
+
+@settings(max_examples=20, deadline=None)
+@given(exponent=st.floats(-9.0, -1.0))
+def test_a_guard_that_dips_within_a_step_fires(exponent):
+    depth = 10**exponent
+    found = hj.simulate(Dip(depth=depth), "dip", (1.0 - depth, 0.0), 3.0)
+    np.testing.assert_allclose(times(found), [1 - np.sqrt(depth)], atol=1e-11)
+    above = hj.simulate(Dip(depth=-depth), "dip", (1.0 + depth, 0.0), 3.0)
+    assert not above.events and above.result == hj.Result.OK
+
+
+def test_blow_up():
+    found = hj.simulate(Blowup(), "x", (1.0,), 2.0, throw=False)
+    assert found.result == hj.Result.BLOW_UP
+    assert abs(found.t[-1] - 1.0) < 1e-6
+    with pytest.raises(hj.ComputationError, match="the state left all bounds"):
+        hj.simulate(Blowup(), "x", (1.0,), 2.0)
+    decay = hj.simulate(Blowup(), "x", (-1.0,), 2.0)
+    np.testing.assert_allclose(decay.after[-1], [-1 / 3], rtol=1e-10)
+
+
+def test_the_step_limit():
+    found = ball(1.0, 1000.0, max_steps=10, throw=False)
+    assert found.result == hj.Result.STEP_LIMIT and len(found.t) <= 513
+    with pytest.raises(hj.ComputationError, match="the limit on steps was reached"):
+        ball(1.0, 1000.0, max_steps=10)
+
+
+@pytest.mark.parametrize(
+    "low, high, order",
+    [
+        (-0.5, 0.5, ["high", "low"]),
+        (0.4999999, 0.5, ["high", "low"]),
+        (0.5, 0.4999999, ["low", "high"]),
+        (0.5, 0.5, ["low", "high"]),
+    ],
+)
+def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, order):
+    found = hj.simulate(Turning(low=low, high=high), "turn", (0.0, -1.0, 0.0), 2 * np.pi)
+    assert [e.name for e in found.events if e.name != "gated"] == order
+    for name, level in (("low", low), ("high", high)):
+        expected = np.pi / 2 + np.arccos(level)
+        np.testing.assert_allclose(times(found, name), [expected], atol=1e-12)
+    assert found.after[-1, 2] == len(found.events)
+
+
+def test_a_crossing_that_is_not_enabled_is_passed():
+    turns = 4 * np.pi
+    always = hj.simulate(Turning(gate=10.0), "turn", (0.0, -1.0, 0.0), turns)
+    np.testing.assert_allclose(times(always, "gated"), np.pi * np.array([1.5, 3.5]), atol=1e-11)
+    never = hj.simulate(Turning(gate=0.0), "turn", (0.0, -1.0, 0.0), turns)
+    assert len(times(never, "gated")) == 0 and len(never.events) == 4
+
+
+def test_scheduled_events():
+    """Pulse-width modulation of x' = -x + on(t), exactly solvable."""
+    system = Switched(duty=0.3)
+    x0 = float(system.exact())
+    found = hj.simulate(system, "off", (x0,), 5.0, time=0.0)
+    # The switch at the start itself is past, so the first half second is off.
+    np.testing.assert_array_equal(times(found, "switch on"), [1, 2, 3, 4, 5])
+    np.testing.assert_allclose(times(found, "switch off"), [1.3, 2.3, 3.3, 4.3], rtol=1e-15)
+    on_cycle = hj.simulate(system, "on", (x0,), 1.0, time=3.0)
+    np.testing.assert_allclose(on_cycle.after[-1, 0], x0, rtol=1e-10)
+
+
+@settings(max_examples=25, deadline=None)
+@given(k=st.integers(1, 40), pieces=st.integers(2, 7))
+def test_a_tick_at_the_end_of_a_piece_happens_once(k, pieces):
+    """Times such as 0.3 and 3 * 0.1 differ by rounding; the tick between is counted once."""
+    system = Tick()
+    chart, state, time = "a", (0.0,), 0.0
+    for end in np.linspace(0.0, k * 0.1, pieces + 1)[1:]:
+        run = hj.simulate(system, chart, state, end - time, time=time)
+        state, time = run.after[-1], float(run.t[-1])
+    assert state[0] == k
+
+
+class Tick(hj.HybridSystem):
+    """Counts the ticks of a clock with period 0.1."""
+
+    def charts(self):
+        from ..toys import Field
+
+        return {"a": Field(("n",), lambda t, q, u: (0.0,))}
+
+    def transitions(self):
+        reset = lambda t, q, u: q + 1  # noqa: E731
+        return (hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=reset),)
+
+
+def test_each_chart_sees_its_own_inputs():
+    found = hj.simulate(TwoInputs(), "first", (0.0,), 3.0, input=(1.0, 2.0))
+    np.testing.assert_allclose(found.after[-1], [1 + 20 + 2 + 0.5], rtol=1e-13)
+
+
+def test_an_input_that_varies_in_time():
+    system = hj.models.BouncingBall()
+    found = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=lambda t: jnp.sin(3 * t) + G)
+    t, y = found("y")
+    np.testing.assert_allclose(y[-1], 5 + 1 / 3 - np.sin(3.0) / 9, rtol=1e-10)
+    np.testing.assert_allclose(y, 5 + t / 3 - np.sin(3 * t) / 9, atol=2e-5)  # between steps too
+    constant = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=G)
+    np.testing.assert_allclose(constant.after[-1], [5.0, 0.0], atol=1e-14)
+
+
+def test_a_guard_that_moves_in_time():
+    """Holmes' juggler has a closed form: v = g T / 2 after every impact, one impact per period."""
+    phase = 0.406734366583117 / (2 * np.pi)
+    start = 0.15 * np.sin(2 * np.pi * phase), G / 2
+    found = hj.simulate(Paddle(), "air", start, 5.2, time=phase)
+    np.testing.assert_allclose(times(found), phase + np.arange(1, 6), atol=1e-12)
+    np.testing.assert_allclose([e.after["v"] for e in found.events], G / 2, rtol=1e-11)
+
+
+def test_feet_that_land_together():
+    """The bar dropped flat: both feet touch the table at the same instant, and both land."""
+    bar = hj.models.TwoLeggedBar(A=0.0)
+    found = hj.simulate(bar, "air", (1.5, 0.0, 0.0, 0.0), 0.4)
+    assert [e.name for e in found.events] == ["hind lands (air)", "front lands (hind)"]
+    fall = np.sqrt(2 * 0.5 / 10.0)
+    np.testing.assert_allclose(times(found), [fall, fall], rtol=1e-14)
+    speed, rotation, J = -10.0 * fall, 0.0, 0.2
+    for s in (-0.5, 0.55):  # two impulses, one after the other
+        impulse = -0.2 * (speed + s * rotation) / (1 + s**2 / J)
+        speed, rotation = speed + impulse, rotation + s * impulse / J
+    after = found.events[-1].after
+    np.testing.assert_allclose([after["v"], after["p"]], [speed, rotation], rtol=1e-12)
+
+
+def test_starting_on_a_guard_is_no_event(reference):
+    """After liftoff the hopper's foot leaves the ground to third order only, ym ~ 23.9 tau^3."""
+    data = reference("limit_cycle")
+    for duration in (1e-3, 4e-3, 0.5):
+        found = hj.simulate(
+            hj.models.VerticalHopper(), "flight", data["liftoff_post"], duration,
+            time=data["liftoff_clock"],
+        )  # fmt: skip
+        assert not found.events
+        if duration < 0.1:
+            np.testing.assert_allclose(found.after[-1, 2], 23.9 * duration**3, rtol=0.05)
+
+
+def test_samples_between_steps(reference, hopper_cycle):
+    """Both sides of an event appear; values are NaN where a chart does not define an output."""
+    data = reference("limit_cycle")
+    orbit = hopper_cycle.trajectory()
+    t, chart, q = orbit.dense(per_step=4)
+    assert np.all(np.diff(t) >= 0)
+    for event in orbit.events:
+        assert np.sum(t == event.time) == 2
+    clock = np.round(t % 1, 12)
+    expected = np.interp(clock, data["orbit_clock"], data["orbit_q"][:, 0], period=1.0)
+    np.testing.assert_allclose(q[:, 0], expected, atol=2e-5)
+    t2, yM, ym = orbit("yM", "ym", per_step=4)
+    np.testing.assert_array_equal(t2, t)
+    np.testing.assert_allclose(yM, q[:, 0], rtol=1e-15)
+    np.testing.assert_array_equal(ym[chart == 1], 0.0)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("air", (1.0, 0.0), 1.0), "there is no chart 'air'; charts are 'fall'"),
+        (("fall", (1.0,), 1.0), r"chart 'fall' has the states y, v, so the start needs shape"),
+        (("fall", (1.0, np.nan), 1.0), "the start of a trajectory must be finite"),
+        (("fall", (1.0, 0.0), np.inf), "the duration must be positive and finite"),
+        (("fall", (1.0, 0.0), -1.0), "the duration must be positive and finite"),
+        (("fall", (1.0, 0.0), np.nan), "the duration must be positive and finite"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.simulate(hj.models.BouncingBall(), *arguments)
+
+
+@pytest.mark.parametrize(
+    "value, message",
+    [
+        ((1.0, 2.0), r"the input has shape \(2,\), but BouncingBall has the 1 inputs \(u\)"),
+        (lambda t: jnp.zeros(3), r"the input has shape \(3,\)"),
+        (np.nan, "the input must be finite"),
+    ],
+)
+def test_bad_inputs(value, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.simulate(hj.models.BouncingBall(), "fall", (1.0, 0.0), 1.0, input=value)
+
+
+@settings(max_examples=15, deadline=None)
+@given(y=st.floats(), v=st.floats(), duration=st.floats(), time=st.floats())
+def test_any_numbers_give_a_trajectory_or_a_clear_error(y, v, duration, time):
+    try:
+        found = hj.simulate(
+            hj.models.BouncingBall(), "fall", (y, v), duration, time=time, max_steps=512
+        )
+    except hj.HybridJaxError as error:
+        assert str(error).count(". ") <= 1
+    else:
+        assert np.all(np.isfinite(found.after))
