@@ -1,0 +1,68 @@
+"""The README's python blocks run, one after the other, and print what it shows."""
+
+import pathlib
+import re
+import sys
+import types
+
+import numpy as np
+import pytest
+from matplotlib import pyplot
+
+
+ROOT = pathlib.Path(__file__).parents[1]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
+
+
+def blocks(language):
+    return [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text())
+            if kind == language]  # fmt: skip
+
+
+def same_output(shown: str, printed: str) -> bool:
+    """The same words, and the same numbers: to 6 digits, or small ones to a factor of 5."""
+    words = [NUMBER.sub("#", text).split() for text in (shown, printed)]
+    a, b = (
+        np.array([float(x.replace(" ", "")) for x in NUMBER.findall(text)])
+        for text in (shown, printed)
+    )
+    if words[0] != words[1] or a.shape != b.shape:
+        return False
+    close = np.abs(a - b) <= 1e-6 * np.abs(b)
+    small = (np.abs(a) < 1e-3) & (np.abs(b) < 1e-3)
+    rounding = (np.abs(a) < 1e-11) & (np.abs(b) < 1e-11)
+    return bool(np.all(close | rounding | (small & (b < 5 * a) & (a < 5 * b))))
+
+
+def test_the_comparison_sees_differences():
+    assert same_output("x 1.0 error 2.0e-05\n", "x 1.0000001  error 3.0e-05")
+    assert not same_output("x 1.0", "x 1.01")
+    assert not same_output("x 1.0", "y 1.0")
+    assert not same_output("error 2e-5", "error 2e-4")
+
+
+def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session = types.ModuleType("readme_session")
+    monkeypatch.setitem(sys.modules, session.__name__, session)
+    for code, shown in zip(blocks("python"), blocks("text"), strict=True):
+        exec(compile(code, "README.md", "exec"), vars(session))
+        printed = capsys.readouterr().out
+        assert same_output(shown, printed), f"README.md shows\n{shown}\nbut this is printed\n{printed}"
+    pyplot.close("all")
+    assert (tmp_path / "bode.png").stat().st_size > 10_000
+
+
+def test_links_lead_somewhere():
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    for page in pages:
+        for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            if "://" not in link:
+                assert (page.parent / link).exists(), f"{page.name} links to {link}"
+
+
+@pytest.mark.skipif(not (ROOT / ".ci/run").exists(), reason="not a clone")
+def test_ci_installs_and_tests_by_the_command_of_the_readme():
+    command = next(block for block in blocks("bash") if "pytest" in block)
+    assert command.strip() in (ROOT / ".ci/run").read_text()
