@@ -26,11 +26,11 @@ from jaxtyping import jaxtyped
 from . import __version__
 from ._core.errors import DefinitionError, FileFormatError, HybridJaxError
 from ._core.precision import require_x64
+from ._core.tracing import is_traced
 from .experiments.data import ExperimentData
 from .experiments.design import Design
 from .identify.rational import RationalFit
 from .identify.structured import StructuredFit
-from .periodic._checks import is_traced
 from .periodic.htf import HTF
 from .periodic.ldtp import LDTP
 

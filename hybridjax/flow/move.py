@@ -14,12 +14,16 @@ from .search import Tape, initial_step, search
 from .target import Target
 
 
+def _number(x) -> Array:
+    return jnp.asarray(x, float)
+
+
 class Settings(eqx.Module):
     """Accuracy and effort of the flow."""
 
-    rtol: float = eqx.field(static=True, default=1e-10)
+    rtol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
     """Bound on a step's error estimate relative to each state's size."""
-    atol: float = eqx.field(static=True, default=1e-10)
+    atol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
     """Bound on a step's error estimate, absolute."""
     max_steps: int = eqx.field(static=True, default=256)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
@@ -57,12 +57,28 @@ class Found(NamedTuple):
     tape: Tape | None
 
 
+class _Approach(NamedTuple):
+    """Lanes that have seen a crossing in a step and are about to land on it."""
+
+    on: Bool[Array, " L"]
+    which: Int[Array, " L"]
+    """The watched function that crosses."""
+    tau: Float[Array, " L"]
+    """Where the crossing is thought to be, as a time from where the lane is."""
+    reach: Float[Array, " L"]
+    """Length of the step in which it was seen."""
+    rate: Float[Array, " L"]
+    """The largest rate of that function at the step's ends."""
+    tries: Int[Array, " L"]
+
+
 class _State(NamedTuple):
     lanes: Lanes
     seen: Watch
     """The watched functions where the lanes are."""
     aimed: Array
     """Whether the target's level would end the flow at its next falling zero."""
+    approach: _Approach
     h: Array
     result: Array
     arrived: Array
@@ -74,16 +90,13 @@ class _Attempt(NamedTuple):
     """A step of every lane, before it is accepted."""
 
     q: Array
-    f1: Array
+    f: Array
+    """The field at its end."""
     error: Array
-
-
-class _Landing(NamedTuple):
-    """Lanes on the zero of the function that they cross."""
-
-    tau: Array
-    q: Array
-    ok: Array
+    past: Array
+    """Time from its end to the zero of the function that an approaching lane crosses."""
+    first: Array
+    """The first of the two corrections that `past` is made of."""
 
 
 def search(
@@ -94,8 +107,8 @@ def search(
     *,
     h: Float[Array, " L"],
     result: Int[Array, " L"],
-    rtol: float,
-    atol: float,
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
     max_steps: int,
     tape: bool,
 ) -> Found:
@@ -112,6 +125,7 @@ def search(
         lanes,
         seen,
         _aims(seen, span),
+        _no_approach(L),
         jnp.minimum(h, 1.05 * target.hint),
         result,
         jnp.zeros(L, bool),
@@ -135,82 +149,89 @@ def search(
 
 def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
     lanes, seen, h, result = state.lanes, state.seen, state.h, state.result
+    approach = state.approach
     G = len(s.transitions)
 
     # 1. Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    scheduled, schedule = next_schedule(s, lanes.t, lanes.chart)
+    scheduled, schedule = next_schedule(s, lanes.t, lanes.chart, target.time)
     known = jnp.minimum(target.time, scheduled)
     rest = jnp.maximum(known - lanes.t, 0.0)
     pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / h, 2.0) - 1e-9)
     last = pieces <= 1
     step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), h)
-    step = jnp.where(active, step, 0.0)
+    step = jnp.where(active, jnp.where(approach.on, approach.tau, step), 0.0)
 
-    # 2. A step of every lane, and what it crosses first.
-    attempt = _attempt(s, lanes, active, u, step, rtol, atol)
-    end = watch(s, lanes.t + step, lanes.chart, attempt.q, u, target, active, attempt.f1)
+    # 2. A step of every lane. Approaching lanes go to their crossing: Newton by full steps until
+    # the two corrections of `settle` are exact to rounding.
+    attempt = _attempt(s, lanes, active, approach, u, target, step, rtol, atol)
+    enough = 1e-6 * approach.reach + 1e-13 * span
+    tau = approach.tau + attempt.past
+    inside = (tau >= -enough) & (tau <= approach.reach + enough)
+    lands = active & approach.on & (jnp.abs(attempt.first) <= enough) & inside
+    closer = active & approach.on & ~lands & (approach.tries < 8)
+    lost = active & approach.on & ~lands & ~closer
+    moved = jnp.where(lands, tau, step)
+
+    # 3. What is at the end of the step, and what was crossed on the way.
+    t = jnp.where(last & ~approach.on, jnp.where(active, known, lanes.t), lanes.t + moved)
+    end = watch(s, t, lanes.chart, attempt.q, u, target, active, attempt.f)
     ready = jnp.concatenate([lanes.armed, state.aimed[None]])
     crossing = first_crossing(seen.value, end.value, step * seen.rate, step * end.rate, ready)
     which = jnp.argmin(crossing.s, axis=0).astype(jnp.int32)
     first = jnp.min(crossing.s, axis=0)
-    crosses = jnp.isfinite(first)
-    refine = crossing.near.any(axis=0) & ~crosses
-    accept = active & (attempt.error <= 1.0) & ~refine
+    fresh = active & ~approach.on & (attempt.error <= 1.0)
+    crosses = fresh & jnp.isfinite(first)
+    refine = fresh & ~crosses & crossing.near.any(axis=0)
+    touch = fresh & ~crosses & crossing.touch.any(axis=0)
+    plain = fresh & ~crosses & ~refine
+    accept = plain | lands
 
-    # 3. Lanes that cross something land on it.
-    landing = _land(s, lanes, accept & crosses, u, target, step, span, first, which)
-    lands = accept & crosses & landing.ok
-    lost = accept & crosses & ~landing.ok
-    accept = accept & ~lost
-    plain = accept & ~crosses
-    moved = jnp.where(lands, landing.tau, step)
-    t = jnp.where(plain & last, known, jnp.where(accept, lanes.t + moved, lanes.t))
-    q = jnp.where(plain, attempt.q, jnp.where(lands, landing.q, lanes.q))
-
-    # 4. What is there: the watched functions, and whether they count from now on.
-    here = jax.lax.cond(
-        lands.any(),
-        lambda: _merge(lands, watch(s, t, lanes.chart, q, u, target, lands), end),
-        lambda: end,
-    )
-    clear = here.value > ZERO * step * (jnp.abs(seen.rate) + jnp.abs(end.rate))
-    chosen = lands & (jnp.arange(G + 1)[:, None] == which)
-    ready = ((ready & (here.value > 0)) | (ready & lands) | clear) & ~chosen
-    fired = jnp.where(lands & (which < G) & enabled(s, t, q, u, which), which, -1)
+    # 4. What happens there.
+    clear = end.value > ZERO * step * (jnp.abs(seen.rate) + jnp.abs(end.rate))
+    chosen = lands & (jnp.arange(G + 1)[:, None] == approach.which)
+    ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
+    guard = lands & (approach.which < G)
+    fires = guard & enabled(s, t, attempt.q, u, approach.which)
     by_clock = plain & last & (scheduled <= target.time)
-    fired = jnp.where(by_clock, schedule, fired)
-    level = lands & (which == G)
-    arrived = (plain & last & ~by_clock) | level | ((fired >= 0) & (fired == target.event))
+    fired = jnp.where(fires, approach.which, jnp.where(by_clock, schedule, -1))
+    level = lands & (approach.which == G)
+    on_time = plain & last & ~by_clock
+    arrived = on_time | level | ((fired >= 0) & (fired == target.event))
+    slow = lands & (jnp.abs(_row(end.rate, approach.which)) < _SLOW * approach.rate)
 
-    slow = _slow(lands, which, here, seen, end)
-
-    # 5. Events.
-    pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0)
+    pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.order, lanes.events, fired)
-    near = jnp.abs(here.value[:-1]) <= ZERO * span * jnp.abs(here.rate[:-1])
-    together = (ready[:-1] & near & (here.rate[:-1] < 0)).any(axis=0)
+    near = jnp.abs(end.value[:-1]) <= ZERO * span * jnp.abs(end.rate[:-1])
+    together = (ready[:-1] & near & (end.rate[:-1] < 0)).any(axis=0)
     new = Lanes(
-        t,
+        jnp.where(accept, t, lanes.t),
         lanes.chart,
-        q,
-        jnp.where(accept, ready[:-1], lanes.armed),
+        jnp.where(accept, attempt.q, lanes.q),
+        ready[:-1],
         lanes.events + (fired >= 0),
         pace,
     )
-    aimed = jnp.where(accept, ready[-1], state.aimed)
-    new, here, aimed = _reset(s, new, here, aimed, fired, u, target, together, span)
-    seen = _merge(accept, here, seen)
+    seen = _merge(accept, end, seen)
+    new, seen, aimed = _reset(s, new, seen, ready[-1], fired, u, target, together, span)
 
-    # 6. Step size, and reasons to stop.
+    # 5. The next step, and reasons to stop.
+    fastest = jnp.maximum(jnp.abs(_row(state.seen.rate, which)), jnp.abs(_row(end.rate, which)))
+    approach = _Approach(
+        crosses | closer,
+        jnp.where(crosses, which, approach.which),
+        jnp.where(crosses, first * step, jnp.clip(tau, 0.0, approach.reach)),
+        jnp.where(crosses, step, approach.reach),
+        jnp.where(crosses, fastest, approach.rate),
+        jnp.where(crosses, 0, approach.tries + 1),
+    )
     bad = ~jnp.isfinite(attempt.error)
     factor = jnp.where(bad, 0.1, jnp.clip(0.9 * attempt.error ** (-1 / 7), 0.2, 5.0))
     grown = jnp.where(step < h, jnp.maximum(h, step * factor), step * factor)
-    again = active & ~accept
-    h = jnp.where(plain, grown, h)
-    h = jnp.where(again, step * jnp.where(lost | refine, 0.5, factor), h)
-    stuck = again & (h < _TINY * span)
-    touch = accept & crossing.touch.any(axis=0)
-    graze = touch | slow | (stuck & (refine | lost))
+    too_long = active & ~state.approach.on & (attempt.error > 1.0)
+    h = jnp.where(plain, grown, jnp.where(too_long, step * factor, h))
+    h = jnp.where(refine, 0.5 * step, jnp.where(lost, 0.5 * state.approach.reach, h))
+    stuck = (too_long | refine | lost) & (h < _TINY * span)
+    graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
     result = update_result(result, graze, Result.GRAZING)
     result = update_result(result, stuck, Result.BLOW_UP)
     result = update_result(result, zeno, Result.ZENO)
@@ -220,75 +241,51 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
     tape = state.tape
     if tape is not None:
         code = jnp.where(accept, MOVE, IDLE)
-        code = jnp.where(plain & last & ~by_clock, ARRIVE_TIME, code)
+        code = jnp.where(on_time, ARRIVE_TIME, code)
         code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
-        row = (moved, code.astype(jnp.int32), t, q, new.q, new.chart)
+        row = (moved, code.astype(jnp.int32), t, attempt.q, new.q, new.chart)
         tape = Tape(*(x.at[state.i].set(y) for x, y in zip(tape, row, strict=True)))
-    return _State(new, seen, aimed, h, result, state.arrived | arrived, state.i + 1, tape)
+    arrived = state.arrived | arrived
+    return _State(new, seen, aimed, approach, h, result, arrived, state.i + 1, tape)
 
 
-def _attempt(s, lanes, active, u, h, rtol, atol) -> _Attempt:
-    empty = _Attempt(lanes.q, jnp.zeros_like(lanes.q), jnp.zeros_like(h))
+def _attempt(s, lanes, active, approach: _Approach, u, target, h, rtol, atol) -> _Attempt:
+    zero = jnp.zeros_like(h)
+    empty = _Attempt(lanes.q, jnp.zeros_like(lanes.q), zero, zero, zero)
 
     def work(a, here, out):
         n = s.dims[a]
         t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
-        step = rk_step(chart_field(s, a, uu), t, q, jnp.where(here, h, 0.0))
+        tau = jnp.where(here, h, 0.0)
+        step = rk_step(chart_field(s, a, uu), t, q, tau)
         size = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         error = jnp.max(jnp.abs(step.error) / (atol + rtol * size), axis=0, initial=0.0)
         finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
         error = jnp.where(finite, error, jnp.inf)
-
-        def put(x, y):
-            return x.at[:n].set(jnp.where(here, y, x[:n]))
-
+        end = Settled(zero, step.q, zero)
+        if watched(s, a, target):
+            which = jnp.where(here & approach.on, approach.which, -1)
+            index = only(here, target.index)
+            end = jax.lax.cond(
+                (which >= 0).any(),
+                lambda: settle(s, a, target, t + tau, step.q, uu, index, which),
+                lambda: end,
+            )
         return _Attempt(
-            put(out.q, step.q),
-            put(out.f1, step.f1),
+            out.q.at[:n].set(jnp.where(here, end.q, out.q[:n])),
+            out.f.at[:n].set(jnp.where(here, step.f1, out.f[:n])),
             jnp.where(here, error, out.error),
+            jnp.where(here, end.past, out.past),
+            jnp.where(here, end.first, out.first),
         )
 
     return for_each_chart(s, lanes.chart, active, work, empty)
 
 
-def _land(s, lanes, mask, u, target, h, span, first, which) -> _Landing:
-    L = lanes.t.shape[0]
-    empty = _Landing(jnp.zeros(L), lanes.q, jnp.zeros(L, bool))
-    # Below this correction `settle` is exact to rounding.
-    enough = 1e-6 * h + 1e-13 * span
-
-    def work(a, here, out):
-        if not watched(s, a, target):
-            return out
-        n = s.dims[a]
-        t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
-        index = only(here, target.index)
-        chosen = jnp.where(here, which, -1)
-        field = chart_field(s, a, uu)
-
-        # Newton by full steps until the two corrections of `settle` are enough.
-        def unsettled(carry):
-            _, settled, k = carry
-            return (k < 8) & (jnp.abs(settled.first) > enough).any()
-
-        def newton(carry):
-            tau, settled, k = carry
-            tau = jnp.clip(tau + settled.past, 0.0, h)
-            end = rk_step(field, t, q, tau).q
-            return tau, settle(s, a, target, t + tau, end, uu, index, chosen), k + 1
-
-        tau = jnp.where(here, first, 0.0) * h
-        start = Settled(jnp.zeros(L), q, jnp.full(L, jnp.inf))
-        tau, settled, _ = jax.lax.while_loop(unsettled, newton, (tau, start, 0))
-        tau = tau + settled.past
-        ok = (jnp.abs(settled.first) <= enough) & (tau >= -enough) & (tau <= h + enough)
-        return _Landing(
-            jnp.where(here, tau, out.tau),
-            out.q.at[:n].set(jnp.where(here, settled.q, out.q[:n])),
-            jnp.where(here, ok, out.ok),
-        )
-
-    return for_each_chart(s, lanes.chart, mask, work, empty)
+def _no_approach(L: int) -> _Approach:
+    none = jnp.zeros(L, jnp.int32)
+    zero = jnp.zeros(L)
+    return _Approach(jnp.zeros(L, bool), none, zero, zero, zero, none)
 
 
 def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):
@@ -314,13 +311,8 @@ def _merge(mask, new: Watch, old: Watch) -> Watch:
     return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
 
 
-def _slow(lands, which, here: Watch, start: Watch, end: Watch):
-    """Whether lanes land at a small fraction of the rates at the step's ends."""
-
-    def pick(rate):
-        return jnp.abs(jnp.take_along_axis(rate, which[None], axis=0)[0])
-
-    return lands & (pick(here.rate) < _SLOW * jnp.maximum(pick(start.rate), pick(end.rate)))
+def _row(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
+    return jnp.take_along_axis(x, which[None], axis=0)[0]
 
 
 def _expected(order, events, fired):
@@ -344,7 +336,7 @@ def _blank_tape(rows: int, lanes: Lanes) -> Tape:
     )
 
 
-def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol: float):
+def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol):
     """A cautious first step: a fraction of the time in which the state changes by its size."""
 
     def work(a, here, out):

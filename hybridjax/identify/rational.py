@@ -10,6 +10,7 @@ import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -197,7 +198,7 @@ def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
 
 
-@eqx.filter_jit
+@quick_jit
 def _fit(
     w: Complex[Array, " F"],
     delay: Complex[Array, " F"],

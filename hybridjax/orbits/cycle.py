@@ -10,9 +10,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Complex, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.tracing import is_traced
 from ..flow.events import start_lanes
 from ..flow.lanes import Lanes
 from ..flow.move import Settings, move
@@ -21,7 +23,7 @@ from ..flow.target import Target
 from ..flow.trajectory import Trajectory, simulate
 from ..flow.watch import slopes
 from ..periodic.multipliers import product_eigenvalues
-from ..systems.structure import Structure, check_system, is_traced
+from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .jacobian import flow_jacobian
 
@@ -32,8 +34,6 @@ LEGS = 16
 _FREE = 0.75
 # J - I counts as singular below this fraction of its largest singular value.
 _SINGULAR = 1e-7
-
-DEFAULT = Settings(rtol=1e-12, atol=1e-12)
 
 
 class _Plane(eqx.Module):
@@ -147,7 +147,7 @@ def find_limit_cycle(
     section: Crossing | AtEvent | None = None,
     settle: float = 0.0,
     max_period: float = 100.0,
-    settings: Settings = DEFAULT,
+    settings: Settings | None = None,
     throw: bool = True,
 ) -> LimitCycle:
     """Find a limit cycle by Newton on the return map; stable or not makes no difference.
@@ -165,7 +165,7 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton begins, so that transients die out (the paper
         takes 60 s). No help where the cycle is unstable.
     - `max_period`: for autonomous systems: give up if no return is seen in this time.
-    - `settings`: accuracy of the flow.
+    - `settings`: accuracy of the flow; 1e-12 by default.
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
     **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
@@ -175,6 +175,7 @@ def find_limit_cycle(
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation and nothing is raised.
     """
+    settings = Settings(rtol=1e-12, atol=1e-12) if settings is None else settings
     traced = is_traced(system)
     if not traced:
         require_x64(system)
@@ -273,13 +274,13 @@ def _pad(s: Structure, q):
     return jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
 
 
-@eqx.filter_jit
+@quick_jit
 def start_at(system, t, chart, q, span) -> Lanes:
     """Lanes at the given times, charts and padded states."""
     return start_lanes(Structure(system), t, chart, q, span)
 
 
-@eqx.filter_jit
+@quick_jit
 def _go(system, lanes, section, target, settings):
     """One lane to a time, or to one section, however many steps it takes."""
     s = Structure(system)
@@ -303,7 +304,7 @@ def _to(time, event, limit, index: int = 0) -> Target:
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _solve(system, start, base, expected, settings):
     """Newton on the return map, and what it saw in its last turn."""
     s = Structure(system)

@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.compile import quick_jit
 from .._core.errors import DefinitionError
+from .._core.tracing import is_traced
 from ..flow.lanes import by_lane, for_each_chart, only
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output
-from ..systems.structure import Structure, is_traced
+from ..systems.structure import Structure
 from .cycle import LimitCycle
 from .jacobian import flow_jacobian
 from .place import PlacedSections, place_sections
@@ -71,7 +72,7 @@ def _as_tuple(names):
     return (names,) if isinstance(names, str) else tuple(names)
 
 
-@eqx.filter_jit
+@quick_jit
 def _section_jacobians(placed: PlacedSections, settings):
     """A (N, c, c) and B (N, c, nu), padded."""
     N, n = placed.count, 1 + placed.lanes.q.shape[0]
@@ -86,7 +87,7 @@ def _section_jacobians(placed: PlacedSections, settings):
     return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
 
-@eqx.filter_jit
+@quick_jit
 def _output_jacobians(placed: PlacedSections, outputs):
     """C (N, ny, c) and D (N, ny, nu), padded."""
     s, lanes = Structure(placed.cycle.system), placed.lanes

@@ -6,12 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
+from .._core.tracing import is_traced
 from ..flow.move import move
-from ..systems.structure import is_traced, Structure
+from ..systems.structure import Structure
 from .cycle import LimitCycle
-from .place import place_sections, PlacedSections
+from .place import PlacedSections, place_sections
 
 
 class Arrival(NamedTuple):
@@ -83,11 +85,13 @@ def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
     placed = sections if isinstance(sections, PlacedSections) else place_sections(cycle, sections)
     for k in (i, j):
         if not 0 <= k < placed.count:
-            raise DefinitionError(f"section {k} does not exist; sections are 0..{placed.count - 1}.")
+            raise DefinitionError(
+                f"section {k} does not exist; sections are 0..{placed.count - 1}."
+            )
     return SectionMap(placed, int(i), int(j))
 
 
-@eqx.filter_jit
+@quick_jit
 def _map(placed, i, j, q, u, t):
     system = placed.cycle.system
     s = Structure(system)

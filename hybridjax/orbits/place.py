@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError
 from .._core.results import Result
+from .._core.tracing import is_traced
 from ..flow.lanes import Lanes, by_lane, only
 from ..flow.move import Settings, move
 from ..flow.sections import AbstractSections, Bound, Crossing, ListLevels, as_sections
 from ..flow.target import Target
 from ..flow.watch import slopes, watch
-from ..systems.structure import Structure, is_traced
+from ..systems.structure import Structure
 from .cycle import LimitCycle
 
 
@@ -100,7 +102,9 @@ def place_sections(cycle: LimitCycle, sections) -> PlacedSections:
     sections = as_sections(sections)
     s = Structure(cycle.system)
     sections.check(s)
-    anchor, result = _anchor(cycle, sections)
+    anchor, result = cycle.start, jnp.zeros(1, jnp.int32)
+    if isinstance(sections.start, Crossing):
+        anchor, result = find_on_cycle(cycle, sections.start)
     traced = is_traced((cycle, sections))
     if not traced:
         if int(result[0]) != Result.OK:
@@ -114,6 +118,7 @@ def place_sections(cycle: LimitCycle, sections) -> PlacedSections:
     return placed
 
 
+@quick_jit
 def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
     """The first point of the cycle, from its start on, where `crossing` happens."""
     s = Structure(cycle.system)
@@ -128,14 +133,7 @@ def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
     return moved.lanes, moved.result
 
 
-@eqx.filter_jit
-def _anchor(cycle, sections):
-    if isinstance(sections.start, Crossing):
-        return find_on_cycle(cycle, sections.start)
-    return cycle.start, jnp.zeros(1, jnp.int32)
-
-
-@eqx.filter_jit
+@quick_jit
 def _place(cycle, sections, anchor: Lanes, settings: Settings) -> PlacedSections:
     system, period = cycle.system, cycle.period
     s = Structure(system)
@@ -282,7 +280,7 @@ def _crossings(placed: PlacedSections) -> np.ndarray:
     return np.where(state_based, np.maximum(falls.sum(axis=1), 1), counts)
 
 
-@eqx.filter_jit
+@quick_jit
 def _levels_along(placed: PlacedSections, t, chart, q):
     """Levels of all sections along a trajectory, (N, p)."""
     s = Structure(placed.cycle.system)

@@ -8,11 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.errors import DefinitionError
-
-
-def is_traced(*trees: Any) -> bool:
-    """Whether a leaf of `trees` has no value yet (inside `jit`, `grad`, `vmap`)."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+from .._core.tracing import is_traced
 
 
 def real_array(name: str, value: Any, ndim: int) -> jax.Array:

@@ -12,7 +12,8 @@ from jaxtyping import Array, Complex, Float
 from scipy.interpolate import CubicSpline
 
 from .._core.errors import DefinitionError
-from ._checks import is_traced, names, real_array, require_finite
+from .._core.tracing import is_traced
+from ._checks import names, real_array, require_finite
 from .transfer import check_harmonics
 
 

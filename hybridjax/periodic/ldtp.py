@@ -12,8 +12,9 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
+from .._core.tracing import is_traced
 from . import response
-from ._checks import is_traced, names, real_array, require_finite
+from ._checks import names, real_array, require_finite
 from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
 from .transfer import check_harmonics, harmonic_transfer
