@@ -304,11 +304,11 @@ def _observations(families: Mapping[str, Family]) -> list[dict]:
         power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
         within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
-        beyond = max(np.max(top(family, m) / top(family, 0)) for m in (-2, 2))
+        second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)
         note(
             f"{name}: |H_m| is negligible for |m| >= 2",
-            beyond < 0.1,
-            f"max|H_2| / max|H_0|: {_pairs(top(family, 2) / top(family, 0))}; share of the energy "
+            np.all(second < 0.1),
+            f"max|H_+-2| / max|H_0|: {_pairs(second)}; share of the energy "
             f"in |m| <= 1: {_pairs(within[0])}, in |m| <= 2: {_pairs(within[1])}",
         )
         close = [c.max_error for c in family.rational.compare(family.ldtp.multipliers())]
