@@ -42,7 +42,11 @@ from .identify.structured import (
 from .io import load as load, save as save
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
 from .orbits.linearize import linearize as linearize
-from .orbits.maps import SectionMap as SectionMap, section_map as section_map
+from .orbits.maps import (
+    Arrival as Arrival,
+    SectionMap as SectionMap,
+    section_map as section_map,
+)
 from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
