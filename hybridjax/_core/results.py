@@ -31,7 +31,7 @@ _MESSAGES = {
     Result.OK: "ok",
     Result.SECTION_MISSED: "the section was not crossed within the time allowed",
     Result.EVENT_MISSED: "the planned event did not happen within the time allowed",
-    Result.EVENT_ORDER: "events came in another order than on the limit cycle",
+    Result.EVENT_ORDER: "events came in another order or number than on the limit cycle",
     Result.GRAZING: "a guard or section was touched tangentially (grazing)",
     Result.ZENO: "events accumulate in finite time (Zeno)",
     Result.BLOW_UP: "the state left all bounds, or the field returned NaN or infinity",

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
-from .._core.results import Result
+from .._core.results import Result, update_result
 from ..flow.lanes import Lanes, by_lane, for_each_chart, only
 from ..flow.move import Settings, move
 from ..orbits.cycle import LimitCycle
@@ -196,11 +196,16 @@ def _run(placed: PlacedSections, q0, u, outputs, settings):
             lambda x: (x.hint, x.order), target, (hint, order), is_leaf=lambda x: x is None
         )
         moved = move(system, lanes, u, target, settings, h, result)
+        # An event may change places with a section, but none may be left out or come in addition.
+        due = placed.lanes.events[(i + 1) % N] + (n + 1) // N * order.shape[0]
+        result = update_result(
+            moved.result, jnp.abs(moved.lanes.events - due) > 1, Result.EVENT_ORDER
+        )
         # Time is counted within one period, so that every cycle is computed alike.
         t = moved.lanes.t - turns * period
         lanes = eqx.tree_at(lambda x: x.t, moved.lanes, t)
-        failed_at = jnp.where((failed_at < 0) & (moved.result != Result.OK), n, failed_at)
-        return (lanes, moved.h, moved.result, failed_at), y
+        failed_at = jnp.where((failed_at < 0) & (result != Result.OK), n, failed_at)
+        return (lanes, moved.h, result, failed_at), y
 
     h = jnp.full(S, 0.5 * period / N)
     begin = (lanes, h, jnp.zeros(S, jnp.int32), jnp.full(S, -1))
