@@ -105,6 +105,31 @@ class Turning(hj.HybridSystem):
         )
 
 
+class Close(hj.HybridSystem):
+    """A point on the unit circle and two guards on x that fall a `gap` apart.
+
+    The second one is so far from a cubic that its crossing is first estimated wrongly.
+    """
+
+    gap: Float[Array, ""] = hj.parameter(0.0)
+    k: Float[Array, ""] = hj.parameter(20.0)
+
+    def charts(self):
+        return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}
+
+    def transitions(self):
+        def plain(t, q, u):
+            return q[0] - 0.5
+
+        def curved(t, q, u):
+            return jnp.exp(self.k * (q[0] - 0.5 - self.gap)) - 1
+
+        return (
+            hj.Transition("plain", "turn", "turn", plain),
+            hj.Transition("curved", "turn", "turn", curved),
+        )
+
+
 class Dip(hj.HybridSystem):
     """y = (t - 1)^2 - depth as a state: below zero for 2 sqrt(depth), then back."""
 

@@ -177,18 +177,24 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
     end = watch(s, t, lanes.chart, attempt.q, u, target, active, attempt.f)
     ready = jnp.concatenate([lanes.armed, state.aimed[None]])
     crossing = first_crossing(seen.value, end.value, step * seen.rate, step * end.rate, ready)
-    which = jnp.argmin(crossing.s, axis=0).astype(jnp.int32)
-    first = jnp.min(crossing.s, axis=0)
+    zero = ZERO * span * jnp.abs(end.rate)
+    chosen = lands & (jnp.arange(G + 1)[:, None] == approach.which)
+    # Where a lane lands, another function may have fallen before: then that one comes first.
+    s_first = jnp.where(chosen | (lands & (end.value >= -zero)), jnp.inf, crossing.s)
+    which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
+    first = jnp.min(s_first, axis=0)
+    overtaken = lands & jnp.isfinite(first)
+    lands = lands & ~overtaken
+    chosen = chosen & lands
     fresh = active & ~approach.on & (attempt.error <= 1.0)
-    crosses = fresh & jnp.isfinite(first)
+    crosses = (fresh & jnp.isfinite(first)) | overtaken
     refine = fresh & ~crosses & crossing.near.any(axis=0)
     touch = fresh & ~crosses & crossing.touch.any(axis=0)
     plain = fresh & ~crosses & ~refine
     accept = plain | lands
 
     # 4. What happens there.
-    clear = end.value > ZERO * step * (jnp.abs(seen.rate) + jnp.abs(end.rate))
-    chosen = lands & (jnp.arange(G + 1)[:, None] == approach.which)
+    clear = end.value > zero
     ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
     guard = lands & (approach.which < G)
     fires = guard & enabled(s, t, attempt.q, u, approach.which)
@@ -201,8 +207,8 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
 
     pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.order, lanes.events, fired)
-    near = jnp.abs(end.value[:-1]) <= ZERO * span * jnp.abs(end.rate[:-1])
-    together = (ready[:-1] & near & (end.rate[:-1] < 0)).any(axis=0)
+    falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
+    together = (ready & falls)[:-1].any(axis=0)
     new = Lanes(
         jnp.where(accept, t, lanes.t),
         lanes.chart,

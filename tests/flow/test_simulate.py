@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..toys import Blowup, Ceiling, Dip, Paddle, Switched, Turning, TwoInputs
+from ..toys import Blowup, Ceiling, Close, Dip, Paddle, Switched, Turning, TwoInputs
 
 
 G = 9.81
@@ -106,6 +106,21 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, or
         expected = np.pi / 2 + np.arccos(level)
         np.testing.assert_allclose(times(found, name), [expected], atol=1e-12)
     assert found.after[-1, 2] == len(found.events)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    gap=st.floats(-12.0, -2.0).map(lambda x: 10**x),
+    sign=st.sampled_from([-1, 1]),
+    k=st.sampled_from([1.0, 5.0, 20.0]),
+)
+def test_close_crossings_of_different_shape(gap, sign, k):
+    found = hj.simulate(Close(gap=sign * gap, k=k), "turn", (0.0, -1.0), 2 * np.pi)
+    expected = [(np.arccos(0.5), "plain"), (np.arccos(0.5 + sign * gap), "curved")]
+    if gap > 1e-11:  # otherwise they are at the same instant, up to rounding
+        assert [e.name for e in found.events] == [name for _, name in sorted(expected)]
+    for angle, name in expected:
+        np.testing.assert_allclose(times(found, name), [np.pi / 2 + angle], atol=1e-11)
 
 
 def test_a_crossing_that_is_not_enabled_is_passed():
