@@ -1,7 +1,6 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
 from collections.abc import Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -31,7 +30,7 @@ def run_experiments(
     design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
     outputs: Sequence[str | Output] | str | Output,
     *,
-    start: Literal["cycle", "periodic"] = "cycle",
+    start: str = "cycle",
     discard: int | None = None,
     periods: int | None = None,
     batch: int = 256,
@@ -153,12 +152,12 @@ def _inputs(design, N: int, nu: int, start: str, discard, periods):
     return u, periods
 
 
-def _section_zero(placed: PlacedSections) -> Float[Array, "1+d 1"]:
+def _section_zero(placed: PlacedSections) -> Float[Array, "n 1"]:
     lanes = placed.lanes
     return jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
 
 
-def _periodic_start(cycle, placed, u, periods) -> Float[np.ndarray, "1+d S"]:
+def _periodic_start(cycle, placed, u, periods) -> Float[np.ndarray, "n S"]:
     """Deviations of (t, q) at section 0 that begin the predicted periodic response."""
     if u.shape[1] // placed.count % periods:
         raise DefinitionError(

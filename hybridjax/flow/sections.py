@@ -4,7 +4,7 @@ A family holds functions and numbers. `orbits.place` evaluates it on a limit cyc
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -284,7 +284,7 @@ def as_sections(sections: Any) -> AbstractSections:
     """A family from a family, a single section, or a list of sections."""
     if isinstance(sections, Crossing | AtEvent):
         return Sections([sections])
-    if isinstance(sections, Sequence):
+    if isinstance(sections, list | tuple):
         return Sections(sections)
     if not isinstance(sections, AbstractSections):
         raise DefinitionError(

@@ -1,0 +1,180 @@
+"""Batched experiments on the hopper: accuracy, isolation of failures, bad input.
+
+All runs have 80 experiments of 84 cycles, so that one program per section family is compiled.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import hypothesis
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import OUTPUTS
+from ..orbits import hopper_scipy
+
+
+FAMILIES = ("isochron", "kinematic")
+N, CYCLES = 32, 84
+
+
+@pytest.fixture(scope="session")
+def design():
+    return hj.paper_design()
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request, hopper_cycle, design):
+    placed = request.getfixturevalue(
+        {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}[request.param]
+    )
+    ldtp = request.getfixturevalue(f"{request.param}_ldtp")
+    data = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS)
+    return request.param, placed, ldtp, data
+
+
+@pytest.fixture(scope="session")
+def isochron_data(hopper_cycle, placed_isochrons, design):
+    return hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS)
+
+
+def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
+    name, _, ldtp, data = family
+    assert data.summary() == "80/80 ok"
+    assert data.family == name and data.periods == 64
+    exact = ldtp.htf(design.frequencies)
+    estimate = hj.estimate_htf(data)
+    bound = {"isochron": 2.5e-4, "kinematic": 6e-4}[name]
+    errors = np.asarray(estimate.harmonic_errors(exact))
+    assert errors[estimate.harmonics.index(0)].max() < bound
+    true = hopper_cycle.multipliers
+    assert hj.fit_multipliers(estimate, ldtp).compare(true).max_error < 5e-5
+    fits = [hj.fit_rational(htf).compare(true) for htf in (estimate, exact)]
+    for measured, bias in zip(*fits, strict=True):
+        assert abs(measured.max_error - bias.max_error) < 0.1 * bias.max_error
+
+
+def test_records_agree_with_scipy(family, design):
+    name, placed, _, data = family
+    lanes = placed.lanes
+    apex = np.array([float(lanes.t[0]), *np.asarray(lanes.q[:, 0])])
+    angle = np.arctan2(*hopper_scipy.plane(apex)[::-1])
+    point, y = apex, []
+    for n in range(40):  # a cycle and a quarter: liftoff, touchdown, liftoff
+        on_cycle = np.asarray(data.cycle_outputs)[n % N]
+        y.append(point[1:3] - on_cycle)
+        if name == "isochron":
+            section = ("clock", apex[0] + (n + 1) / N)
+        else:
+            section = ("angle", angle - 2 * np.pi * (n + 1) / N)
+        point = hopper_scipy.flow(point, section, data.u[3, n, 0])
+    scale = np.ptp(np.asarray(data.cycle_outputs), axis=0)
+    assert np.max(np.abs(np.array(y) - data.y[3, :40]) / scale) < 1e-8
+
+
+def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, design):
+    _, placed, _, data = family
+    u = design.inputs(CYCLES)
+    u[17, 3 * N : 4 * N] = 60.0
+    broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20)
+    assert list(np.flatnonzero(~broken.ok)) == [17]
+    assert 3 * N <= broken.failed_at[17] < 8 * N
+    assert "#17: section" in broken.summary() and "79/80 ok" in broken.summary()
+    others = np.arange(80) != 17
+    np.testing.assert_allclose(broken.y[others], data.y[others], atol=1e-9)
+    after = broken.failed_at[17] + 1
+    assert np.all(np.isfinite(broken.y[17, :after])) and np.all(np.isnan(broken.y[17, after:]))
+    estimate = hj.estimate_htf(broken)
+    lost = hj.missing_frequencies(broken)
+    assert len(estimate.f) + len(lost) == len(design.frequencies)
+
+
+def test_batches_do_not_change_the_result(hopper_cycle, placed_isochrons, isochron_data):
+    u = np.concatenate([isochron_data.u, isochron_data.u[:20]])
+    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, batch=80)
+    np.testing.assert_array_equal(data.y[:80], isochron_data.y)
+    np.testing.assert_allclose(data.y[80:], isochron_data.y[:20], atol=1e-12)
+
+
+def test_a_periodic_start_has_no_transient(hopper_cycle, family):
+    _, placed, ldtp, _ = family
+    line = np.arange(1, 81)[:, None]
+    u = 1e-5 * np.cos(2 * np.pi * line * np.arange(CYCLES * N) / (CYCLES * N))[..., None]
+    data = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, start="periodic", discard=0)
+    assert data.periods == CYCLES
+    for k in (3, 24, 79):
+        x0 = ldtp.periodic_state(u[k], CYCLES)
+        predicted = np.asarray(ldtp.simulate(u[k], x0))
+        assert np.max(np.abs(predicted - data.y[k])) < 1e-3 * np.max(np.abs(predicted))
+
+
+def test_large_inputs_that_change_the_order_of_events_are_reported(
+    hopper_cycle, placed_isochrons, design
+):
+    u = design.inputs(CYCLES) * 100
+    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20)
+    assert 0 < data.ok.sum() < 80
+    codes = {hj.Result(int(r)) for r in data.result[~data.ok]}
+    assert codes == {hj.Result.EVENT_ORDER}
+
+
+def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
+    unstable = dataclasses.replace(hopper_cycle, factors=1.1 * hopper_cycle.factors)
+    with pytest.raises(hj.ComputationError, match="not stable .largest multiplier 3.4"):
+        hj.run_experiments(unstable, placed_isochrons, design, OUTPUTS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(outputs=("yM", "height")), "no output 'height'"),
+        (
+            dict(design=hj.multisine(sections=16, f_max=7.0)),
+            "for 16 sections, but",
+        ),
+        (dict(design=np.zeros((2, 33, 1))), "multiple of the 32 sections"),
+        (dict(design=np.zeros((2, 64, 2))), r"shape \(experiments, samples, 1\)"),
+        (dict(design=np.full((2, 64, 1), np.nan)), "input of experiment 0 is NaN"),
+        (dict(design=np.zeros((2, 64, 1)), discard=2), "leave 0 for estimation"),
+        (dict(design=np.zeros((2, 96, 1)), discard=1, periods=5), "periods = 5"),
+        (dict(start="anywhere"), "'cycle' or 'periodic'"),
+        (dict(discard=-1), "not -1"),
+        (dict(start="periodic", discard=7), "whole number of windows"),
+        (dict(sections="apex"), "sections are a family"),
+    ],
+)
+def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
+    arguments = dict(sections=placed_isochrons, design=design, outputs=OUTPUTS) | change
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.run_experiments(hopper_cycle, **arguments)
+
+
+def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isochrons, design):
+    hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS)
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+    )
+    stiffer = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(10.001, float))
+    hj.run_experiments(hopper_cycle, stiffer, design, OUTPUTS)
+    assert not compiled
+
+
+@hypothesis.settings(max_examples=15, deadline=None)
+@hypothesis.given(st.integers(0, 2**32 - 1), st.sampled_from([60, 80, 100]))
+def test_second_order_products_can_be_kept_off_the_lines(seed, experiments):
+    design = hj.multisine(
+        periods=32, f_max=8.0, seed=seed, experiments=experiments, second_order="avoid"
+    )
+    for e in range(design.experiments):
+        own = design.line[design.experiment == e] % 32
+        own = set(np.minimum(own, 32 - own).tolist())
+        for a in own:
+            for b in own:
+                for product in ((a + b) % 32, (a - b) % 32):
+                    assert min(product, 32 - product) not in own
