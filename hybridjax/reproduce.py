@@ -260,7 +260,7 @@ def _observations(families: Mapping[str, Family]) -> list[dict]:
     """The paper's observations (Secs. VI-C1 to C3), each with what is measured here."""
     found = []
 
-    def note(claim: str, holds: bool, measured: str):
+    def note(claim, holds, measured):
         found.append({"claim": claim, "holds": bool(holds), "measured": measured})
 
     def top(family, m):
