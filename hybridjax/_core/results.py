@@ -20,6 +20,7 @@ class Result(enum.IntEnum):
     NOT_CONVERGED = 8
     SINGULAR = 9
     BAD_INPUT = 10
+    EQUILIBRIUM = 11
 
     @property
     def message(self) -> str:
@@ -39,6 +40,7 @@ _MESSAGES = {
     Result.NOT_CONVERGED: "the iteration did not converge",
     Result.SINGULAR: "J - I is singular: the cycle is not isolated",
     Result.BAD_INPUT: "the start or the input is NaN or infinite",
+    Result.EQUILIBRIUM: "the iteration ended in an equilibrium instead of a cycle",
 }
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.compile import quick_jit
@@ -145,12 +146,15 @@ def find_limit_cycle(
     guess: Guess | LimitCycle | None = None,
     *,
     section: Crossing | AtEvent | None = None,
-    settle: float = 0.0,
-    max_period: float = 100.0,
+    settle: ArrayLike = 0.0,
+    max_period: ArrayLike = 100.0,
     settings: Settings | None = None,
     throw: bool = True,
 ) -> LimitCycle:
     """Find a limit cycle by Newton on the return map; stable or not makes no difference.
+
+    Where Newton fails, as it does if it steps out of the domain of the return map, the search is
+    repeated with the smaller steps of Levenberg and Marquardt.
 
     A clocked system has its clock's period, and the return map is taken at the guess's phase of
     the clock. The period of an autonomous one is found; its return map lives on `section`.
@@ -161,7 +165,8 @@ def find_limit_cycle(
         the best guess.
     - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
-        flow.
+        flow. Newton starts at the guess if it lies on the section, else where the flow from the
+        guess first meets it.
     - `settle`: time to simulate before Newton begins, so that transients die out (the paper
         takes 60 s). No help where the cycle is unstable.
     - `max_period`: for autonomous systems: give up if no return is seen in this time.
@@ -169,8 +174,9 @@ def find_limit_cycle(
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
     **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
-    found: no convergence, an event or section that does not come, grazing, or a singular J - I
-    (there is a whole family of cycles, from a conserved quantity or a symmetry).
+    found: no convergence, an event or section that does not come, grazing, an equilibrium in
+    place of a cycle, or a singular J - I (there is a whole family of cycles, from a conserved
+    quantity or a symmetry).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation and nothing is raised.
@@ -194,7 +200,12 @@ def find_limit_cycle(
         order = None
     if clocked:
         expected = jnp.asarray(system.period(), float)
-    start, period, factors, seen, steps, result = _solve(system, start, base, expected, settings)
+    solution = _solve(system, start, base, expected, settings, False)
+    if not traced and int(solution[-1]) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
+        # Newton may have stepped out of the domain of the return map: smaller steps.
+        second = _solve(system, start, base, expected, settings, True)
+        solution = second if int(second[-1]) == Result.OK else solution
+    start, period, factors, seen, steps, result = solution
     if not traced:
         order = tuple(int(g) for g in np.ravel(seen.codes) if g >= 0)
     dims = jnp.array(Structure(system).dims)[seen.legs.chart]
@@ -221,6 +232,11 @@ def _prepare(system, guess, section, settle, max_period, settings):
             f"the guess must give finite values for the {s.dims[a]} states "
             f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
         )
+    if not np.isfinite(guess.time):
+        raise DefinitionError(f"the guess's time must be finite; got {guess.time}.")
+    for name, value in (("settle", settle), ("max_period", max_period)):
+        if not (np.isfinite(value) and value >= 0):
+            raise DefinitionError(f"{name} must be a finite time, not negative; got {value}.")
     period = system.period()
     if period is not None and not (np.isfinite(period) and period > 0):
         raise DefinitionError(f"the clock's period must be positive; it is {period}.")
@@ -244,19 +260,37 @@ def _prepare(system, guess, section, settle, max_period, settings):
             lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - turns)
     if period is not None:
         return lanes, None, jnp.asarray(period, float)
+    a = int(lanes.chart[0])
+    t, q = lanes.t[0], lanes.q[: s.dims[a], 0]
+    f = s.field(a, t, q, jnp.zeros(s.nu))
+    if not jnp.any(f != 0):
+        raise ComputationError(
+            f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
+            "moves: start elsewhere."
+        )
     if section is None:
-        a = int(lanes.chart[0])
-        q = lanes.q[: s.dims[a], 0]
-        f = s.field(a, lanes.t[0], q, jnp.zeros(s.nu))
         section = Crossing(_Plane(q, f / jnp.linalg.norm(f)), "rising", charts=(s.names[a],))
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
-    target = _to(jnp.full(1, jnp.inf), event, lanes.t + max_period)
-    first = _go(system, lanes, section, target, settings)
-    _require(first, f"looking for the section ({section})", s)
-    target = _to(jnp.full(1, jnp.inf), event, first.lanes.t + max_period)
-    second = _go(system, first.lanes, section, target, settings)
-    _require(second, f"looking for the return to the section ({section})", s)
-    return second.lanes, section, second.lanes.t[0] - first.lanes.t[0]
+
+    def next_meeting(lanes, doing):
+        target = _to(jnp.full(1, jnp.inf), event, lanes.t + max_period)
+        moved = _go(system, lanes, section, target, settings)
+        _require(moved, f"{doing} ({section})", s)
+        return moved.lanes
+
+    if not _is_on(section, s, a, t, q, f, max_period):
+        lanes = next_meeting(lanes, "looking for the section")
+    back = next_meeting(lanes, "looking for the return to the section")
+    return lanes, section, back.t[0] - lanes.t[0]
+
+
+def _is_on(section, s: Structure, a: int, t, q, f, span) -> bool:
+    """Whether (t, q) in chart a lies on a section, crossing it the right way."""
+    if isinstance(section, AtEvent) or not section.in_chart(s, a):
+        return False
+    level = lambda t, q: section.level(s, a, t, q)  # noqa: E731
+    value, rate = jax.jvp(level, (t, q), (jnp.ones_like(t), f))
+    return bool((rate < 0) & (jnp.abs(value) <= -1e-9 * span * rate))
 
 
 def _require(moved, doing: str, s: Structure) -> None:
@@ -305,21 +339,23 @@ def _to(time, event, limit, index: int = 0) -> Target:
 
 
 @quick_jit
-def _solve(system, start, base, expected, settings):
+def _solve(system, start, base, expected, settings, damped):
     """Newton on the return map, and what it saw in its last turn."""
     s = Structure(system)
     n = s.d
     valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
-    solver = optx.Newton(
-        rtol=1e-11, atol=1e-12, linear_solver=lx.AutoLinearSolver(well_posed=False)
-    )
+    if damped:
+        solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
+    else:
+        # Along a direction in which J - I is singular, Newton does not move.
+        solver = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=lx.SVD(rcond=_SINGULAR))
     solution = optx.root_find(
         lambda q, args: _residual(q, *args, settings),
         solver,
         start.q[:, 0],
         (system, start, base, expected),
         has_aux=True,
-        max_steps=32,
+        max_steps=64 if damped else 32,
         throw=False,
     )
     q, seen = solution.value, solution.aux
@@ -333,6 +369,11 @@ def _solve(system, start, base, expected, settings):
     good = jnp.isfinite(seen.distance) & (seen.distance <= 1e-8 * (1 + jnp.max(jnp.abs(q))))
     code = jnp.where(seen.result == Result.OK, Result.NOT_CONVERGED, seen.result)
     code = jnp.where(good, jnp.where(smallest < _SINGULAR, Result.SINGULAR, Result.OK), code)
+    if base is not None:
+        same = seen.legs.chart == start.chart
+        apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
+        still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
+        code = jnp.where(good & still, Result.EQUILIBRIUM, code)
     begin = eqx.tree_at(lambda x: x.q, start, q[:, None])
     steps = solution.stats["num_steps"]
     return begin, period, factors, seen, steps, code.astype(jnp.int32)
@@ -469,7 +510,9 @@ def _explain(cycle: LimitCycle, code: Result) -> str:
             "quantity in the model, or take the cycle nearest to the guess with `throw=False`."
         )
     reason = code.message
-    if code == Result.NOT_CONVERGED:
+    if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
+        reason = "Newton came to a state from where one period ends in another chart"
+    elif code == Result.NOT_CONVERGED:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
     return (
         f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "

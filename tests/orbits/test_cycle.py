@@ -1,0 +1,204 @@
+"""Limit cycles: stable and unstable, clocked and autonomous, and none."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+
+from ..toys import Paddle, Switched
+
+
+FALL = hj.Crossing("v", "falling")
+# mu: amplitude, period, multiplier; from an integration in 34 digits.
+VANDERPOL = {
+    0.5: (2.00248793044711, 6.38067580177359, 0.0391769202592733),
+    1.0: (2.00861986087484, 6.66328685932313, 8.59695063603805e-4),
+    3.0: (2.02330414168221, 8.85909549971992, 6.98947562607979e-16),
+}
+
+
+def vanderpol(mu, guess=None, section=FALL, **options):
+    guess = None if guess is None else hj.Guess("oscillation", guess)
+    return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), guess, section=section, **options)
+
+
+def check_hopper(cycle, data):
+    np.testing.assert_allclose(cycle.start.q[:2, 0], data["state_clock_half"], atol=1e-10)
+    assert cycle.result == hj.Result.OK and cycle.stable
+    assert cycle.period == 1.0 and cycle.residual < 1e-12
+
+
+def test_the_hopper_and_its_events(reference, hopper_cycle):
+    data = reference("limit_cycle")
+    check_hopper(hopper_cycle, data)
+    liftoff, touchdown = hopper_cycle.trajectory().events
+    assert (liftoff.name, touchdown.name) == ("liftoff", "touchdown")
+    np.testing.assert_allclose(liftoff.time % 1, data["liftoff_clock"], atol=1e-10)
+    np.testing.assert_allclose(touchdown.time % 1, data["touchdown_clock"], atol=1e-10)
+    for found, name in (
+        (liftoff.before, "liftoff_pre"),
+        (liftoff.after, "liftoff_post"),
+        (touchdown.before, "touchdown_pre"),
+        (touchdown.after, "touchdown_post"),
+    ):
+        np.testing.assert_allclose(list(found.values()), data[name], atol=1e-10)
+    text = repr(hopper_cycle)
+    assert "liftoff, touchdown" in text and "-0.248983335+0.699333252j" in text
+
+
+@pytest.mark.parametrize("guess", [(2.0, 1.9), (1.9, 1.8), (5.0, -3.0)])
+def test_the_hopper_from_rough_guesses(guess, reference):
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper(), hj.Guess("stance", guess, 0.5))
+    check_hopper(cycle, reference("limit_cycle"))
+
+
+def test_the_hopper_after_settling(reference):
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper(), settle=60.0)
+    check_hopper(cycle, reference("limit_cycle"))
+    assert cycle.iterations <= 2
+
+
+def test_the_lossy_hopper(lossy_cycle):
+    state = [1.87978886663710, 1.75832736962547]
+    np.testing.assert_allclose(lossy_cycle.start.q[:2, 0], state, atol=1e-10)
+    multiplier = -0.317897006349938 + 0.694628822735891j
+    np.testing.assert_allclose(lossy_cycle.multipliers[0], multiplier, atol=1e-9)
+    events = [e.time % 1 for e in lossy_cycle.trajectory().events]
+    np.testing.assert_allclose(events, [0.522453086774101, 0.332748511553392], atol=1e-10)
+
+
+def test_the_two_legged_bar(bar_cycle):
+    state = [0.400516754055274, -0.764126541534894, -0.00728487463290610, 0.399159213578728]
+    np.testing.assert_allclose(bar_cycle.start.q[:, 0], state, atol=1e-9)
+    first = -0.153520955429110 + 0.361043052961495j
+    second = 0.151655665357578 + 0.227749294883360j
+    truth = [first, np.conj(first), second, np.conj(second)]
+    np.testing.assert_allclose(bar_cycle.multipliers, truth, atol=1e-9)
+    events = bar_cycle.trajectory().events
+    assert [e.name.split(" (")[0] for e in events] == [
+        "front lifts", "hind lifts", "front lands", "hind lands"
+    ]  # fmt: skip
+    times = [0.485372036855771, 0.520707713616307, 0.745498454894426, 0.759897208341559]
+    np.testing.assert_allclose([e.time for e in events], times, atol=1e-9)
+    landed = [0.788200918259240, -1.71180954225949, -0.0243713338437363, -0.268770117871700]
+    np.testing.assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
+
+
+@pytest.mark.parametrize("mu", VANDERPOL)
+def test_van_der_pol(mu):
+    amplitude, period, multiplier = VANDERPOL[mu]
+    cycle = vanderpol(mu)
+    np.testing.assert_allclose(cycle.start.q[:, 0], [amplitude, 0.0], atol=1e-9)
+    np.testing.assert_allclose(cycle.period, period, atol=1e-9)
+    np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-7, atol=0)
+    assert not cycle.clocked and cycle.order == ()
+
+
+def test_van_der_pol_on_the_plane_through_a_guess_off_the_cycle():
+    _, period, multiplier = VANDERPOL[1.0]
+    cycle = vanderpol(1.0, (0.3, 2.0), section=None)
+    np.testing.assert_allclose(cycle.period, period, atol=1e-9)
+    np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-7, atol=0)
+
+
+@pytest.mark.parametrize("mu, guess", [(0.5, 1.9), (1.0, 2.0)])
+def test_unstable_cycles(mu, guess):
+    """In reversed time, mu -> -mu, the cycle is the same and its multiplier the reciprocal."""
+    amplitude, period, multiplier = VANDERPOL[mu]
+    cycle = vanderpol(-mu, (guess, 0.0))
+    np.testing.assert_allclose(cycle.start.q[0, 0], amplitude, atol=1e-9)
+    np.testing.assert_allclose(cycle.period, period, atol=1e-9)
+    np.testing.assert_allclose(cycle.multipliers * multiplier, [1.0], rtol=1e-8)
+    assert not cycle.stable
+
+
+def test_settling_on_an_unstable_cycle_fails():
+    with pytest.raises(hj.ComputationError, match="settling failed at t = .* left all bounds"):
+        vanderpol(-1.0, (2.1, 0.0), settle=60.0)
+
+
+@settings(max_examples=5, deadline=None)
+@given(amplitude=st.floats(0.1, 10.0))
+def test_a_conservative_system_has_a_family_of_cycles(amplitude):
+    with pytest.raises(hj.ComputationError, match="multiplier of exactly 1 .* form a family"):
+        vanderpol(0.0, (amplitude, 0.0))
+    cycle = vanderpol(0.0, (amplitude, 0.0), throw=False)
+    assert cycle.result == hj.Result.SINGULAR
+    np.testing.assert_allclose(cycle.start.q[0, 0], amplitude, rtol=1e-8)
+    np.testing.assert_allclose(cycle.period, 2 * np.pi, rtol=1e-9)
+
+
+def test_an_equilibrium_is_no_cycle():
+    """Below the unstable cycle of mu < 0 all spirals into the origin."""
+    with pytest.raises(hj.ComputationError, match="ended in an equilibrium"):
+        vanderpol(-0.5, (0.1, 0.0))
+    with pytest.raises(hj.ComputationError, match="starts at an equilibrium"):
+        vanderpol(-0.5, (0.0, 0.0))
+    with pytest.raises(hj.ComputationError, match=r"looking for the section \(x falling\) failed"):
+        vanderpol(1.0, section=hj.Crossing("x", "falling", value=10.0))
+
+
+def test_a_lossy_ball_has_no_cycle():
+    ball = hj.models.BouncingBall(restitution=0.7)
+    with pytest.raises(hj.ComputationError, match="no limit cycle of BouncingBall|accumulate"):
+        hj.find_limit_cycle(
+            ball, hj.Guess("fall", (1.0, 0.0)), section=hj.AtEvent("bounce"), settle=5.0
+        )
+
+
+def test_the_paddle_juggler():
+    cycle = hj.find_limit_cycle(Paddle(), hj.Guess("air", (0.1, 4.7), 0.1))
+    multiplier = 0.399920196836063 + 0.574511824214789j
+    np.testing.assert_allclose(cycle.multipliers, [multiplier, np.conj(multiplier)], atol=1e-9)
+    (impact,) = cycle.trajectory().events
+    np.testing.assert_allclose(impact.time, 1.0647337849670541, atol=1e-10)
+    np.testing.assert_allclose(list(impact.after.values()), [0.0593418341169377, 4.905], atol=1e-9)
+
+
+def test_scheduled_events_and_their_derivatives():
+    system = Switched(duty=0.3)
+    cycle = hj.find_limit_cycle(system)
+    grow = np.exp(0.5)  # from the middle of the stay in `off` to its end, backwards
+    np.testing.assert_allclose(cycle.start.q[0, 0], system.exact() * grow, rtol=1e-11)
+    np.testing.assert_allclose(cycle.multipliers, [np.exp(-1.0)], atol=1e-11)
+
+    def start(system):
+        return hj.find_limit_cycle(system, cycle).start.q[0, 0]
+
+    exact = jax.grad(lambda duty: Switched(duty=duty).exact())(0.3)
+    np.testing.assert_allclose(eqx.filter_grad(start)(system).duty, exact * grow, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"guess": hj.Guess("orbit", (2.0, 0.0))}, "there is no chart 'orbit'"),
+        ({"guess": hj.Guess("oscillation", (2.0,))}, "finite values for the 2 states x, v"),
+        ({"guess": hj.Guess("oscillation", (2.0, np.nan))}, "finite values for the 2 states"),
+        ({"guess": hj.Guess("oscillation", (2.0, 0.0), np.inf)}, "guess's time must be finite"),
+        ({"settle": -1.0}, "settle must be a finite time"),
+        ({"max_period": np.nan}, "max_period must be a finite time"),
+        ({"section": hj.AtEvent("bounce")}, "there is no event 'bounce'; events are none"),
+        ({"section": hj.Crossing("y", "falling")}, "there is no output 'y'"),
+        ({"section": hj.Crossing("v", "falling", charts=("c",))}, "there is no chart 'c'"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.find_limit_cycle(hj.models.VanDerPol(), **arguments)
+
+
+def test_more_bad_arguments():
+    with pytest.raises(hj.DefinitionError, match="BouncingBall has no guess of its own"):
+        hj.find_limit_cycle(hj.models.BouncingBall())
+    with pytest.raises(hj.DefinitionError, match="leave out `section`"):
+        hj.find_limit_cycle(hj.models.VerticalHopper(), section=hj.AtEvent("touchdown"))
+    with pytest.raises(hj.DefinitionError, match="parameter `M` of VerticalHopper is nan"):
+        hj.find_limit_cycle(hj.models.VerticalHopper(M=np.nan))
+    with pytest.raises(hj.DefinitionError, match="clock's period must be positive"):
+        hj.find_limit_cycle(hj.models.VerticalHopper(omega=-1.0))
+    with pytest.raises(hj.DefinitionError, match="needs a LimitCycle as its guess"):
+        eqx.filter_jit(lambda h: hj.find_limit_cycle(h).start.q)(hj.models.VerticalHopper())
