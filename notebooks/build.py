@@ -1,0 +1,45 @@
+"""Execute paper.py (jupytext's percent format) and write paper.ipynb with its outputs.
+
+pip install jupytext nbclient ipykernel && python notebooks/build.py
+"""
+
+import pathlib
+
+import jupytext
+import nbclient
+import nbformat
+
+
+HERE = pathlib.Path(__file__).parent
+SETUP = """
+import warnings
+with warnings.catch_warnings():  # of missing widgets, which this notebook does not use
+    warnings.simplefilter("ignore")
+    import tqdm.auto
+get_ipython().run_line_magic("matplotlib", "inline")
+get_ipython().run_line_magic("config", "InlineBackend.print_figure_kwargs = {'dpi': 75}")
+"""
+
+
+def build(source: pathlib.Path, target: pathlib.Path) -> None:
+    notebook = jupytext.read(source)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(SETUP))
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook.metadata = nbformat.from_dict({"kernelspec": kernel})
+    nbclient.NotebookClient(notebook, timeout=1200, record_timing=False).execute()
+    del notebook.cells[0]
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{number}"
+        cell.metadata = {}
+    codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for count, cell in enumerate(codes, 1):
+        cell.execution_count = count
+        for output in cell.outputs:
+            if "execution_count" in output:
+                output.execution_count = count
+    notebook.metadata = nbformat.from_dict({"kernelspec": kernel})
+    nbformat.write(notebook, target)
+
+
+if __name__ == "__main__":
+    build(HERE / "paper.py", HERE / "paper.ipynb")
