@@ -11,6 +11,7 @@ from matplotlib import pyplot
 
 ROOT = pathlib.Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CLAIMS = ROOT / "CLAIMS.md"
 NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
 
 
@@ -68,3 +69,8 @@ def test_there_is_one_test_command_for_ci_to_find():
     assert len(found) == 1
     script = ROOT / ".ci/run"
     assert script.stat().st_mode & 0o100 and "README.md" in script.read_text()
+
+
+def test_claims_name_tests_that_exist():
+    for path, name in re.findall(r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()):
+        assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
