@@ -21,6 +21,13 @@ from ..systems.structure import Structure
 from .cycle import LimitCycle
 
 
+# Crossings are counted over one period from this fraction of it on.
+_OFF = 0.1234567
+# A section is tangent to the cycle if its level changes slower than this fraction of its fastest
+# rate.
+_STEEP = 1e-4
+
+
 class PlacedSections(eqx.Module):
     """N sections of a family on a limit cycle.
 
@@ -112,9 +119,9 @@ def place_sections(cycle: LimitCycle, sections) -> PlacedSections:
                 f"the cycle has no point where {sections.start} (the anchor of section 0): "
                 f"{Result(int(result[0])).message}."
             )
-    placed = _place(cycle, sections, anchor, cycle.settings)
+    placed, first = _place(cycle, sections, anchor, cycle.settings)
     if not traced:
-        _check(placed)
+        _check(placed, int(first))
     return placed
 
 
@@ -134,7 +141,10 @@ def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
 
 
 @quick_jit
-def _place(cycle, sections, anchor: Lanes, settings: Settings) -> PlacedSections:
+def _place(
+    cycle, sections, anchor: Lanes, settings: Settings
+) -> tuple[PlacedSections, Int[Array, ""]]:
+    """The sections on the cycle, and the `Result` of the way to section 0."""
     system, period = cycle.system, cycle.period
     s = Structure(system)
     N = sections.count
@@ -180,9 +190,10 @@ def _place(cycle, sections, anchor: Lanes, settings: Settings) -> PlacedSections
     drop = jnp.where(flat, -1, jnp.argmax(share, axis=1))
     with_time = jnp.isinf(bound.time) & (system.period() is not None)
     dims = jnp.array(s.dims)[lanes.chart] + with_time - ~flat
-    return PlacedSections(
+    placed = PlacedSections(
         cycle, sections, bound, lanes, jnp.diff(visited.t), result[1:, 0], drop, dims, normal
     )
+    return placed, result[0, 0]
 
 
 def _normals(s: Structure, bound: Bound, lanes: Lanes) -> Float[Array, "N n"]:
@@ -232,18 +243,27 @@ def _frames(
     return embed, select
 
 
-def _check(placed: PlacedSections) -> None:
+def _check(placed: PlacedSections, first: int) -> None:
     """Raise for the first section that is missed, tangent, out of order, or crossed twice."""
     N = placed.count
     describe = placed.sections.describe
+    if first != Result.OK:
+        raise ComputationError(
+            f"{describe(0)} is not reached on the cycle: {Result(first).message}."
+        )
     for i, code in enumerate(np.asarray(placed.result)):
         if code != Result.OK:
             reason = Result(int(code)).message
             raise ComputationError(
                 f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: {reason}."
             )
-    counts = _crossings(placed)
+    counts, steepness = _crossings(placed)
     for i in range(N):
+        if steepness[i] < _STEEP:
+            raise ComputationError(
+                f"{describe(i)} is tangent to the cycle: its level changes there at "
+                f"{steepness[i]:.1g} of its fastest rate. Choose another level."
+            )
         if counts[i] > 1:
             raise ComputationError(
                 f"{describe(i)} is crossed {counts[i]} times in one period; a section must be "
@@ -266,23 +286,32 @@ def _check(placed: PlacedSections) -> None:
         )
 
 
-def _crossings(placed: PlacedSections) -> np.ndarray:
-    """How often one period of the cycle crosses each state-based section."""
-    counts = np.ones(placed.count, int)
+def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
+    """How often one period of the cycle crosses each section, and how steeply: the rate of a
+    level on its section as a fraction of its fastest rate on the cycle."""
+    event = np.asarray(placed.bound.event)
+    counts = np.array([placed.cycle.order.count(g) if g >= 0 else 1 for g in event])
+    steepness = np.ones(placed.count)
     if placed.bound.levels is None:
-        return counts
-    t, chart, q = placed.cycle.trajectory().dense(per_step=16)
-    level = np.asarray(_levels_along(placed, jnp.asarray(t), jnp.asarray(chart), jnp.asarray(q)))
+        return counts, steepness
+    t, chart, q = placed.cycle.trajectory(1.25).dense(per_step=16)
+    level, fastest, rate = (np.asarray(x) for x in _levels_along(placed, t, chart, q))
     same = (np.diff(t) > 0) & (np.diff(chart) == 0)
     falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & same
-    state_based = np.isinf(np.asarray(placed.bound.time)) & (np.asarray(placed.bound.event) < 0)
-    # A section through the start of the sampled period may be seen at both its ends or at none.
-    return np.where(state_based, np.maximum(falls.sum(axis=1), 1), counts)
+    # One period of them, from a time at which no section is likely to lie.
+    part = np.where(falls, level[:, :-1] / np.where(falls, level[:, :-1] - level[:, 1:], 1.0), 0.0)
+    when = (t[:-1] + part * np.diff(t) - t[0]) / float(placed.cycle.period)
+    falls &= (when > _OFF) & (when <= 1 + _OFF)
+    state_based = np.isinf(np.asarray(placed.bound.time)) & (event < 0)
+    counts = np.where(state_based, falls.sum(axis=1), counts)
+    np.divide(np.abs(rate), fastest, out=steepness, where=state_based)
+    return counts, steepness
 
 
 @quick_jit
 def _levels_along(placed: PlacedSections, t, chart, q):
-    """Levels of all sections along a trajectory, (N, p)."""
+    """Levels of all sections along a trajectory (N, p), their fastest rates (N,), and the rates
+    on the sections themselves (N,)."""
     s = Structure(placed.cycle.system)
     zeros, p = jnp.zeros((s.nu, t.shape[0])), t.shape[0]
     far = jnp.full(p, jnp.inf)
@@ -291,6 +320,11 @@ def _levels_along(placed: PlacedSections, t, chart, q):
         target = Target(
             far, jnp.full(p, i), jnp.full(p, -1), far, far, None, placed.bound.levels, Result.OK
         )
-        return watch(s, t, chart, q.T, zeros, target, jnp.ones(p, bool)).value[-1]
+        seen = watch(s, t, chart, q.T, zeros, target, jnp.ones(p, bool))
+        return seen.value[-1], jnp.max(jnp.abs(seen.rate[-1]))
 
-    return jax.lax.map(one, jnp.arange(placed.count))
+    level, fastest = jax.lax.map(one, jnp.arange(placed.count))
+    lanes = placed.lanes
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, placed.count)))
+    rate = placed.normal[:, 0] + jnp.sum(placed.normal[:, 1:] * f.T, axis=1)
+    return level, fastest, rate
