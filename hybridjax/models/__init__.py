@@ -1,3 +1,5 @@
+"""Ready-made hybrid systems, with parameters from the literature."""
+
 import lazy_loader
 
 
