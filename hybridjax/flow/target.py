@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -46,9 +47,25 @@ class Target(eqx.Module):
     """The code of a lane that does not arrive."""
 
 
-def until(time: Float[Array, " L"]) -> Target:
-    """The target of lanes that flow to a given time."""
+def toward(
+    time: Float[Array, " L"], event: int, limit: Float[Array, " L"], index: int = 0
+) -> Target:
+    """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
+    level that is filled in later), giving up at `limit`."""
     L = time.shape[0]
-    none = jnp.full(L, -1, jnp.int32)
-    far = jnp.full(L, jnp.inf)
-    return Target(time, none, none, jnp.nextafter(time, far), far, None, None, Result.EVENT_MISSED)
+    later = jnp.nextafter(jax.lax.stop_gradient(time), jnp.inf)
+    return Target(
+        time,
+        jnp.full(L, index, jnp.int32),
+        jnp.full(L, event, jnp.int32),
+        jnp.where(jnp.isfinite(time), later, limit),
+        jnp.full(L, jnp.inf),
+        None,
+        None,
+        Result.SECTION_MISSED,
+    )
+
+
+def until(time: Float[Array, " L"]) -> Target:
+    """The target of lanes that flow to given times."""
+    return toward(time, -1, time)

@@ -1,0 +1,202 @@
+"""The return map of a cycle and Newton's method on it.
+
+One turn is cut into pieces, whose Jacobians are found together with the pieces: their product is
+the Jacobian of the return map, and they themselves are the factors of the monodromy.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from .._core.compile import quick_jit
+from .._core.results import Result
+from ..flow.events import start_lanes
+from ..flow.lanes import Lanes
+from ..flow.move import move
+from ..flow.sections import AtEvent, ListLevels
+from ..flow.target import Target, toward
+from ..flow.watch import slopes
+from ..systems.structure import Structure
+from .jacobian import flow_jacobian
+
+
+# Pieces into which one turn is cut: their Jacobians are the factors of the monodromy.
+LEGS = 16
+# An autonomous turn flows freely for this fraction of the expected period, then to the section.
+_FREE = 0.75
+# J - I counts as singular below this fraction of its largest singular value.
+_SINGULAR = 1e-7
+
+
+@quick_jit
+def solve(system, start: Lanes, base, expected, settings, damped: bool, follow: bool):
+    """Newton on the return map, and what it saw in its last turn.
+
+    **Arguments:** `damped` takes the smaller steps of Levenberg and Marquardt; `follow` goes round
+    once more on the cycle found, so that what is seen has the derivatives of the cycle.
+    """
+    s = Structure(system)
+    n = s.d
+    valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
+    if damped:
+        solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
+    else:
+        # Along a direction in which J - I is singular, Newton does not move.
+        solver = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=lx.SVD(rcond=_SINGULAR))
+    solution = optx.root_find(
+        lambda q, args: _residual(q, *args, settings),
+        solver,
+        start.q[:, 0],
+        (system, start, base, expected),
+        has_aux=True,
+        max_steps=64 if damped else 32,
+        throw=False,
+    )
+    q, seen = solution.value, solution.aux
+    if follow:
+        _, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
+    period = expected if base is None else seen.period
+    factors = seen.factors
+    if base is not None:
+        factors = _across(s, seen.legs, factors)
+    monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
+    singular = jnp.linalg.svd(monodromy - jnp.diag(valid * 1.0), compute_uv=False)
+    smallest = jnp.min(jnp.where(jnp.arange(n) < valid.sum(), singular, jnp.inf))
+    good = jnp.isfinite(seen.distance) & (seen.distance <= 1e-8 * (1 + jnp.max(jnp.abs(q))))
+    code = jnp.where(seen.result == Result.OK, Result.NOT_CONVERGED, seen.result)
+    code = jnp.where(good, jnp.where(smallest < _SINGULAR, Result.SINGULAR, Result.OK), code)
+    if base is not None:
+        same = seen.legs.chart == start.chart
+        apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
+        still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
+        code = jnp.where(good & still, Result.EQUILIBRIUM, code)
+    begin = eqx.tree_at(lambda x: x.q, start, q[:, None])
+    steps = solution.stats["num_steps"]
+    return begin, period, factors, seen, steps, code.astype(jnp.int32)
+
+
+class Turn(eqx.Module):
+    """What Newton sees on one turn."""
+
+    legs: Lanes
+    factors: Float[Array, "K d d"]
+    codes: Int[Array, "K R"]
+    period: Float[Array, ""]
+    distance: Float[Array, ""]
+    result: Int[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def _residual(q, system, start, base, expected, settings):
+    """P(q) - q, and the `Turn`. The Jacobian is that of the turn's legs, computed with it."""
+    residual, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
+    return residual, seen
+
+
+@_residual.def_jvp
+def _residual_jvp(primals, tangents):
+    q, system, start, base, expected, settings = primals
+    residual, seen, jacobian = _turn_with_jacobian(*primals)
+    t_q, *t_rest = tangents
+    t_residual = jnp.zeros_like(q) if t_q is None else jacobian @ t_q
+    if jax.tree_util.tree_leaves(t_rest):
+        # Parameters: through the same turn, by the flow's own derivative.
+        def of_parameters(system, start, base, expected):
+            return _turn(q, system, start, base, expected, settings, _flow)[0]
+
+        _, more = eqx.filter_jvp(of_parameters, (system, start, base, expected), tuple(t_rest[:4]))
+        t_residual = t_residual + more
+    nothing = jax.tree_util.tree_map(lambda _: None, seen)
+    return (residual, seen), (t_residual, nothing)
+
+
+def _turn_with_jacobian(q, system, start, base, expected, settings):
+    residual, end, result, (legs, jacobians, codes) = _turn(
+        q, system, start, base, expected, settings, _flow_with_jacobian
+    )
+    n = q.shape[0]
+    factors = jacobians[:, 0, 1 : n + 1, 1 : n + 1]
+    valid = jnp.arange(n) < jnp.array(Structure(system).dims)[start.chart[0]]
+    monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
+    jacobian = jnp.where(valid[:, None], monodromy, 0.0) - jnp.eye(n)
+    legs = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), legs)
+    seen = Turn(
+        legs, factors, codes[..., 0], end.t[0] - start.t[0], jnp.max(jnp.abs(residual)), result
+    )
+    return residual, seen, jacobian
+
+
+def _flow(system, lanes, target, settings, h, result):
+    u = jnp.zeros((len(system.inputs), 1))
+    return move(system, lanes, u, target, settings, h, result), None
+
+
+def _flow_with_jacobian(system, lanes, target, settings, h, result):
+    jacobian, moved, tape = flow_jacobian(system, lanes, target, settings, h, result)
+    return moved, (lanes, jacobian, tape.code)
+
+
+def _turn(q, system, start: Lanes, base, expected, settings, flow):
+    """One turn from state q on the base section, leg by leg, each done by `flow`.
+
+    **Returns:** P(q) - q, the lane at the end, its result, and what `flow` returned besides.
+    """
+    s = Structure(system)
+    lanes = start_lanes(s, start.t, start.chart, q[:, None], expected)
+    if isinstance(base, AtEvent):
+        own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(base.name)
+        lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)
+    targets = _leg_targets(s, start.t[0], base, expected)
+    each, common = eqx.partition(targets, _per_lane(targets))
+
+    def leg(carry, target):
+        lanes, h, result = carry
+        target = jax.tree_util.tree_map(lambda x: x[None], target)
+        moved, extra = flow(system, lanes, eqx.combine(target, common), settings, h, result)
+        return (moved.lanes, moved.h, moved.result), extra
+
+    begin = (lanes, (0.1 * expected / LEGS)[None], jnp.zeros(1, jnp.int32))
+    (end, _, result), extra = jax.lax.scan(leg, begin, each)
+    valid = jnp.arange(s.d) < jnp.array(s.dims)[start.chart[0]]
+    same = (result[0] == Result.OK) & (end.chart[0] == start.chart[0])
+    residual = jnp.where(same, jnp.where(valid, end.q[:, 0], 0.0) - q, jnp.nan)
+    return residual, end, result[0], extra
+
+
+def _across(s: Structure, legs: Lanes, factors):
+    """The factors on the states modulo the direction of the flow.
+
+    Along the flow of an autonomous system nothing contracts. Taken out of every factor, that
+    direction cannot drown a strong contraction across it.
+    """
+    f = slopes(s, legs.t, legs.chart, legs.q, jnp.zeros((s.nu, legs.t.shape[0]))).T
+    f = f / jnp.linalg.norm(f, axis=1, keepdims=True)
+    project = jnp.eye(s.d) - f[:, :, None] * f[:, None, :]
+    return jnp.roll(project, -1, axis=0) @ factors @ project
+
+
+def _per_lane(targets):
+    """Mark the leaves of a `Target` that have one entry per lane."""
+    marks = jax.tree_util.tree_map(lambda _: False, targets)
+    fields = lambda x: (x.time, x.index, x.event, x.limit, x.hint)  # noqa: E731
+    return eqx.tree_at(fields, marks, (True,) * 5)
+
+
+def _leg_targets(s: Structure, t0, base, expected) -> Target:
+    """Targets of the pieces of one turn: K - 1 times, then the section the turn began on."""
+    k = jnp.arange(1, LEGS + 1)
+    if base is None:
+        return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+    time = jnp.where(k < LEGS, t0 + _FREE * expected * k / (LEGS - 1), jnp.inf)
+    target = toward(time, -1, t0 + 3 * expected)
+    last = k == LEGS
+    if isinstance(base, AtEvent):
+        event = jnp.where(last, s.transition_index(base.name), -1).astype(jnp.int32)
+        return dataclasses.replace(target, event=event)
+    index = jnp.where(last, 0, -1).astype(jnp.int32)
+    return dataclasses.replace(target, index=index, levels=ListLevels((base,)))
