@@ -1,5 +1,6 @@
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 
@@ -16,6 +17,21 @@ KINEMATIC = hj.KinematicPhase(
     32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
 )
 OUTPUTS = ("yM", "vM")
+
+
+class no_compilation:
+    """A context in which nothing may be compiled."""
+
+    def __enter__(self):
+        self.count = 0
+        jax.monitoring.register_event_duration_secs_listener(self.listen)
+
+    def listen(self, event, duration, **_):
+        self.count += "backend_compile" in event
+
+    def __exit__(self, *_):
+        jax.monitoring.unregister_event_duration_listener(self.listen)
+        assert not self.count, f"{self.count} programs were compiled"
 
 
 @pytest.fixture(scope="session")
