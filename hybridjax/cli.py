@@ -52,6 +52,8 @@ def _parser() -> argparse.ArgumentParser:
 def _reproduce(options) -> None:
     # XLA reports, at the level of errors, that cached programs name CPU features of its own.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # The matrices are small: more BLAS threads than one only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from .reproduce import Protocol, reproduce
 
     sizes = (options.experiments, options.cycles, options.keep)

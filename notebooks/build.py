@@ -12,10 +12,6 @@ import nbformat
 
 HERE = pathlib.Path(__file__).parent
 SETUP = """
-import warnings
-with warnings.catch_warnings():  # of missing widgets, which this notebook does not use
-    warnings.simplefilter("ignore")
-    import tqdm.auto
 get_ipython().run_line_magic("matplotlib", "inline")
 get_ipython().run_line_magic("config", "InlineBackend.print_figure_kwargs = {'dpi': 75}")
 """

@@ -42,7 +42,8 @@ def multisine(
     - `f_max`, `f_min`: the band in cycles per period, both ends included.
     - `amplitude`: of each cosine. `seed`: of the phases and the division.
     - `experiments`: by default the fewest possible. Any greater number gives weaker signals
-      with fewer cosines each.
+      with fewer cosines each, and so less distortion; with the fewest, every second-order
+      product falls on a line of the same experiment, so amplitudes must be small.
     - `half_integers`: `"skip"` leaves multiples of 1/2 out, as the paper does; `"two-phase"`
       measures them in two experiments each, with phases 90 degrees apart (0 and N/2 in one).
     - `second_order`: `"avoid"` divides the frequencies so that the products f_i + f_j and

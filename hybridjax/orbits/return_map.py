@@ -29,7 +29,7 @@ from .jacobian import flow_jacobian
 LEGS = 16
 # An autonomous turn flows freely for this fraction of the expected period, then to the section.
 _FREE = 0.75
-# J - I counts as singular below this fraction of its largest singular value.
+# J - I counts as singular if its smallest singular value is below this.
 _SINGULAR = 1e-7
 
 
