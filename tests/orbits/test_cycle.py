@@ -158,18 +158,24 @@ def test_the_paddle_juggler():
     np.testing.assert_allclose(list(impact.after.values()), [0.0593418341169377, 4.905], atol=1e-9)
 
 
-def test_scheduled_events_and_their_derivatives():
+def test_scheduled_events():
     system = Switched(duty=0.3)
     cycle = hj.find_limit_cycle(system)
     grow = np.exp(0.5)  # from the middle of the stay in `off` to its end, backwards
     np.testing.assert_allclose(cycle.start.q[0, 0], system.exact() * grow, rtol=1e-11)
     np.testing.assert_allclose(cycle.multipliers, [np.exp(-1.0)], atol=1e-11)
 
+
+@pytest.mark.slow
+def test_derivatives_of_scheduled_events():
+    system = Switched(duty=0.3)
+    cycle = hj.find_limit_cycle(system)
+
     def start(system):
         return hj.find_limit_cycle(system, cycle).start.q[0, 0]
 
     exact = jax.grad(lambda duty: Switched(duty=duty).exact())(0.3)
-    np.testing.assert_allclose(eqx.filter_grad(start)(system).duty, exact * grow, rtol=1e-9)
+    np.testing.assert_allclose(eqx.filter_grad(start)(system).duty, exact * np.exp(0.5), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
