@@ -36,6 +36,7 @@ from .report import OUTPUTS, summarize, table
 
 
 STATES = {"yM": r"$y_M$ (m)", "vM": r"$\dot y_M$ (m/s)"}
+SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
 DEVIATIONS = {"yM": r"$\delta y_M$ (m)", "vM": r"$\delta \dot y_M$ (m/s)"}
 
 
@@ -294,8 +295,8 @@ def _figures(out, cycle, families: Mapping[str, Family], perturbed):
     drawings |= {
         "fig3_harmonics": lambda: plot.harmonics(pairs, labels=DEVIATIONS),
         "fig4_bode": lambda: plot.bodes(pairs, fits=rational, labels=DEVIATIONS),
-        "multipliers": lambda: plot.multipliers(cycle, estimates, labels=DEVIATIONS),
-        "poles_zeros": lambda: plot.poles_zeros(rational, labels=DEVIATIONS),
+        "multipliers": lambda: plot.multipliers(cycle, estimates, labels=SYMBOLS),
+        "poles_zeros": lambda: plot.poles_zeros(rational, labels=SYMBOLS),
     }
     for name, draw in drawings.items():
         plot.save(draw(), out / name)
