@@ -164,6 +164,14 @@ def test_scheduled_events():
     grow = np.exp(0.5)  # from the middle of the stay in `off` to its end, backwards
     np.testing.assert_allclose(cycle.start.q[0, 0], system.exact() * grow, rtol=1e-11)
     np.testing.assert_allclose(cycle.multipliers, [np.exp(-1.0)], atol=1e-11)
+    # Sections at the very instants of the switches: the state after the switch, each just once.
+    placed = hj.place_sections(cycle, hj.ClockPhase(10))
+    on = np.arange(10) < 3
+    np.testing.assert_array_equal(placed.lanes.chart, np.where(on, 0, 1))
+    np.testing.assert_allclose(placed.lanes.q[0, 0], system.exact(), rtol=1e-11)
+    ldtp = hj.linearize(cycle, placed)
+    np.testing.assert_allclose(ldtp.A[:, 0, 0], np.exp(-0.1), rtol=1e-11)
+    np.testing.assert_allclose(ldtp.B[:, 0, 0], on * (1 - np.exp(-0.1)), atol=1e-12)
 
 
 @pytest.mark.slow
