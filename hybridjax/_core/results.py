@@ -36,7 +36,7 @@ _MESSAGES = {
     Result.GRAZING: "a guard or section was touched tangentially (grazing)",
     Result.ZENO: "events accumulate in finite time (Zeno)",
     Result.BLOW_UP: "the state left all bounds, or the field returned NaN or infinity",
-    Result.STEP_LIMIT: "the limit on steps was reached",
+    Result.STEP_LIMIT: "the limit on steps was reached; `Settings(max_steps=...)` raises it",
     Result.NOT_CONVERGED: "the iteration did not converge",
     Result.SINGULAR: "J - I is singular: the cycle is not isolated",
     Result.BAD_INPUT: "the start or the input is NaN or infinite",

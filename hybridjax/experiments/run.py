@@ -17,7 +17,7 @@ from ..flow.lanes import Lanes, by_lane, for_each_chart, only
 from ..flow.move import Settings, move
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import PlacedSections, place_sections
+from ..orbits.place import PlacedSections, as_placed
 from ..systems.output import Output
 from ..systems.structure import Structure
 from .data import ExperimentData
@@ -62,13 +62,15 @@ def run_experiments(
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for
     an unstable cycle, from which any experiment would run away.
     """
+    placed = as_placed(cycle, sections)
     require_x64(cycle)
     if settings is None:
-        settings = Settings(rtol=1e-9, atol=1e-10, max_steps=64)
+        settings = Settings(rtol=1e-9, atol=1e-10, max_steps=1024)
     system = cycle.system
-    placed = sections if isinstance(sections, PlacedSections) else place_sections(cycle, sections)
     s = Structure(system)
     z = s.resolve_outputs(outputs)
+    if batch < 1:
+        raise DefinitionError(f"batch is the number of experiments per call, not {batch}.")
     if start not in ("cycle", "periodic"):
         raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
     if not cycle.stable:
@@ -117,7 +119,7 @@ def run_experiments(
 def _inputs(design, N: int, nu: int, start: str, discard, periods):
     """Inputs (S, n, nu) as numpy, and the number of periods for estimation."""
     discard = (20 if start == "cycle" else 0) if discard is None else discard
-    if discard < 0:
+    if discard < 0 or discard != int(discard):
         raise DefinitionError(f"discard is the number of cycles before the window, not {discard}.")
     if isinstance(design, Design):
         if design.sections != N:
@@ -133,6 +135,8 @@ def _inputs(design, N: int, nu: int, start: str, discard, periods):
                 f"`periods` is for inputs given as an array; the design has {design.periods}."
             )
         return design.inputs(discard + design.periods), design.periods
+    if np.iscomplexobj(design):
+        raise DefinitionError("inputs must be real; these are complex.")
     u = np.asarray(design, float)
     if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
         raise DefinitionError(

@@ -16,7 +16,7 @@ from .watch import Watch, watch
 # time span at hand.
 ZERO = 1e-12
 # Times of a schedule are equal if they differ by less than this fraction of its period.
-_TIE = 1e-9
+_TIE = 1e-11
 # Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
 # A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno too.

@@ -26,6 +26,9 @@ IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = -4, -3, -2, -1
 
 # A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
 _SLOW = 1e-5
+# A step is too long for a watched function if halfway its cubic interpolant misses it by more than
+# this fraction of its size.
+_BEND = 0.02
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
 
@@ -90,6 +93,8 @@ class _Attempt(NamedTuple):
     """A step of every lane, before it is accepted."""
 
     q: Array
+    middle: Array
+    """The state halfway, by the cubic Hermite interpolant."""
     f: Array
     """The field at its end."""
     error: Array
@@ -188,7 +193,9 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
     chosen = chosen & lands
     fresh = active & ~approach.on & (attempt.error <= 1.0)
     crosses = (fresh & jnp.isfinite(first)) | overtaken
-    refine = fresh & ~crosses & crossing.near.any(axis=0)
+    bent = fresh & _bends(s, lanes, seen, end, attempt, u, target, fresh, step)
+    crosses = crosses & ~bent
+    refine = bent | (fresh & ~crosses & crossing.near.any(axis=0))
     touch = fresh & ~crosses & crossing.touch.any(axis=0)
     plain = fresh & ~crosses & ~refine
     accept = plain | lands
@@ -257,7 +264,7 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
 
 def _attempt(s, lanes, active, approach: _Approach, u, target, h, rtol, atol) -> _Attempt:
     zero = jnp.zeros_like(h)
-    empty = _Attempt(lanes.q, jnp.zeros_like(lanes.q), zero, zero, zero)
+    empty = _Attempt(lanes.q, lanes.q, jnp.zeros_like(lanes.q), zero, zero, zero)
 
     def work(a, here, out):
         n = s.dims[a]
@@ -268,6 +275,7 @@ def _attempt(s, lanes, active, approach: _Approach, u, target, h, rtol, atol) ->
         error = jnp.max(jnp.abs(step.error) / (atol + rtol * size), axis=0, initial=0.0)
         finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
         error = jnp.where(finite, error, jnp.inf)
+        middle = 0.5 * (q + step.q) + 0.125 * tau * (step.f0 - step.f1)
         end = Settled(zero, step.q, zero)
         if watched(s, a, target):
             which = jnp.where(here & approach.on, approach.which, -1)
@@ -279,6 +287,7 @@ def _attempt(s, lanes, active, approach: _Approach, u, target, h, rtol, atol) ->
             )
         return _Attempt(
             out.q.at[:n].set(jnp.where(here, end.q, out.q[:n])),
+            out.middle.at[:n].set(jnp.where(here, middle, out.middle[:n])),
             out.f.at[:n].set(jnp.where(here, step.f1, out.f[:n])),
             jnp.where(here, error, out.error),
             jnp.where(here, end.past, out.past),
@@ -292,6 +301,19 @@ def _no_approach(L: int) -> _Approach:
     none = jnp.zeros(L, jnp.int32)
     zero = jnp.zeros(L)
     return _Approach(jnp.zeros(L, bool), none, zero, zero, zero, none)
+
+
+def _bends(s, lanes, seen: Watch, end: Watch, attempt, u, target, mask, step):
+    """Whether some watched function is not resolved by its cubic interpolant over the step.
+
+    Step control looks at the states only; where those are simple, a guard may still turn many
+    times within a step.
+    """
+    t = lanes.t + 0.5 * step
+    true = watch(s, t, lanes.chart, attempt.middle, u, target, mask, attempt.f).value
+    cubic = 0.5 * (seen.value + end.value) + 0.125 * step * (seen.rate - end.rate)
+    size = jnp.abs(seen.value) + jnp.abs(end.value) + jnp.abs(true)
+    return (jnp.abs(true - cubic) > _BEND * size).any(axis=0)
 
 
 def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):

@@ -23,6 +23,8 @@ class Step(NamedTuple):
 
     q: Float[Array, "n L"]
     """State at t + h."""
+    f0: Float[Array, "n L"]
+    """Field at the start."""
     f1: Float[Array, "n L"]
     """Field at the end."""
     error: Float[Array, "n L"]
@@ -47,7 +49,7 @@ def rk_step(
     K, _ = jax.lax.scan(stage, jnp.zeros((n, *q.shape)), (A, C, np.arange(n)))
     end = q + h * jnp.tensordot(VERNER76.b_sol, K, 1)
     error = h * jnp.tensordot(VERNER76.b_error, K, 1)
-    return Step(end, field(t + h, end), error)
+    return Step(end, K[0], field(t + h, end), error)
 
 
 def midpoint_step(
@@ -56,8 +58,3 @@ def midpoint_step(
     """A very short step, with an error of order h^3: derivatives at h = 0 are right to order 2."""
     half = 0.5 * h
     return q + h * field(t + half, q + half * field(t, q))
-
-
-def _combine(coefficients, stages):
-    terms = [float(c) * k for c, k in zip(coefficients, stages, strict=False) if c != 0]
-    return sum(terms[1:], terms[0]) if terms else jnp.zeros_like(stages[0])

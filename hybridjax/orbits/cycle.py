@@ -23,6 +23,7 @@ from ..flow.trajectory import Trajectory, simulate
 from ..periodic.multipliers import product_eigenvalues
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
+from ..systems.transition import Scheduled
 from .return_map import solve
 
 
@@ -168,7 +169,8 @@ def find_limit_cycle(
     quantity or a symmetry).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
-    followed by implicit differentiation and nothing is raised.
+    followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
+    cycle that was not found raise an error of the linear solver.
     """
     settings = Settings(rtol=1e-12, atol=1e-12) if settings is None else settings
     traced = is_traced(system)
@@ -202,15 +204,46 @@ def find_limit_cycle(
         system, base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
         order, settings,
     )  # fmt: skip
+    if not traced and int(result) in (Result.OK, Result.SINGULAR):
+        _check_clock(cycle)
     if not traced and throw and (code := Result(int(result))) != Result.OK:
         raise ComputationError(_explain(cycle, code))
     return cycle
+
+
+def _check_clock(cycle: LimitCycle) -> None:
+    """Raise where the cycle of a clocked system is not what it seems to be."""
+    if not cycle.clocked:
+        return
+    s, system = Structure(cycle.system), cycle.system
+    a = int(cycle.start.chart[0])
+    t, q, u = cycle.start.t[0], cycle.start.q[: s.dims[a], 0], jnp.zeros(s.nu)
+    f = s.field(a, t, q, u)
+    later = s.field(a, t + cycle.period, q, u)
+    if not np.allclose(f, later, rtol=1e-6, atol=1e-9):
+        raise ComputationError(
+            f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "
+            f"that {type(system).__name__}.period() states: at t = {float(t):.6g} it is {f}, one "
+            f"period later {later}."
+        )
+    for g in s.guards(a):
+        guard = lambda t, q, g=g: s.guard(g, t, q, u)  # noqa: E731
+        value, rate = jax.jvp(guard, (t, q), (jnp.ones_like(t), f))
+        if float(rate) < 0 and abs(float(value)) <= 1e-9 * float(cycle.period) * -float(rate):
+            raise ComputationError(
+                f"the search begins exactly at the event '{s.transitions[g].name}', which may or "
+                "may not belong to the turn: give a guess at another time."
+            )
 
 
 def _prepare(system, guess, section, settle, max_period, settings):
     """Start state, base section and expected period, from a guess."""
     s = Structure(system)
     guess = system.guess() if guess is None else guess
+    if not isinstance(guess, Guess | None):
+        raise DefinitionError(
+            f"the guess is a Guess(chart, state) or a LimitCycle, not {type(guess).__name__}."
+        )
     if guess is None:
         raise DefinitionError(
             f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
@@ -229,6 +262,14 @@ def _prepare(system, guess, section, settle, max_period, settings):
     period = system.period()
     if period is not None and not (np.isfinite(period) and period > 0):
         raise DefinitionError(f"the clock's period must be positive; it is {period}.")
+    for transition in s.transitions:
+        if isinstance(transition.guard, Scheduled):
+            ratio = np.inf if period is None else float(period / transition.guard.period)
+            if not abs(ratio - round(min(ratio, 1e9))) < 1e-6:
+                raise DefinitionError(
+                    f"the schedule of '{transition.name}' must divide the clock's period, which is "
+                    f"{period}: otherwise no turn is like the last one."
+                )
     if period is not None and section is not None:
         raise DefinitionError(
             "a clocked system returns to itself after its clock's period: leave out `section` "

@@ -1,5 +1,6 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -7,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.compile import quick_jit
-from .._core.errors import DefinitionError
+from .._core.errors import ComputationError, DefinitionError
+from .._core.results import Result
 from .._core.tracing import is_traced
 from ..flow.lanes import by_lane, for_each_chart, only
 from ..periodic.ldtp import LDTP
@@ -15,7 +17,7 @@ from ..systems.output import Output
 from ..systems.structure import Structure
 from .cycle import LimitCycle
 from .jacobian import flow_jacobian
-from .place import PlacedSections, place_sections
+from .place import PATIENCE, PlacedSections, as_placed
 
 
 def linearize(
@@ -40,7 +42,7 @@ def linearize(
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or an input that does not exist; `ComputationError` as `place_sections`.
     """
-    placed = sections if isinstance(sections, PlacedSections) else place_sections(cycle, sections)
+    placed = as_placed(cycle, sections)
     s = Structure(cycle.system)
     traced = is_traced(placed)
     if outputs is None:
@@ -58,7 +60,12 @@ def linearize(
                 f"there is no input '{name}'; inputs are {', '.join(cycle.system.inputs)}."
             )
     columns = np.array([cycle.system.inputs.index(n) for n in names], int)
-    A, B = _section_jacobians(placed, cycle.settings)
+    A, B, result = _section_jacobians(placed, cycle.settings)
+    if not traced and np.any(result != Result.OK):
+        n = int(np.argmax(np.asarray(result) != Result.OK))
+        raise ComputationError(
+            f"the flow from section {n} to the next one failed: {Result(int(result[n])).message}."
+        )
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1 if traced else int(np.max(placed.dims))
     return LDTP(
@@ -74,17 +81,19 @@ def _as_tuple(names):
 
 @quick_jit
 def _section_jacobians(placed: PlacedSections, settings):
-    """A (N, c, c) and B (N, c, nu), padded."""
+    """A (N, c, c) and B (N, c, nu), padded, NaN where the flow failed; and its result codes."""
     N, n = placed.count, 1 + placed.lanes.q.shape[0]
     following = (jnp.arange(N) + 1) % N
     turns = jnp.where(following == 0, 1, 0)
     target = placed.target(following, placed.lanes.t, turns)
-    jacobian, _, _ = flow_jacobian(
+    settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+    jacobian, moved, _ = flow_jacobian(
         placed.cycle.system, placed.lanes, target, settings, 0.5 * placed.duration
     )
+    jacobian = jnp.where((moved.result == Result.OK)[:, None, None], jacobian, jnp.nan)
     embed, select = placed.frames()
     after = select[following]
-    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:], moved.result
 
 
 @quick_jit

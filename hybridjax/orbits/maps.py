@@ -13,7 +13,7 @@ from .._core.tracing import is_traced
 from ..flow.move import move
 from ..systems.structure import Structure
 from .cycle import LimitCycle
-from .place import PlacedSections, place_sections
+from .place import PlacedSections, as_placed
 
 
 class Arrival(NamedTuple):
@@ -82,7 +82,7 @@ def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
     For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
     range; `ComputationError` as `place_sections`.
     """
-    placed = sections if isinstance(sections, PlacedSections) else place_sections(cycle, sections)
+    placed = as_placed(cycle, sections)
     for k in (i, j):
         if not 0 <= k < placed.count:
             raise DefinitionError(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.compile import quick_jit
-from .._core.errors import ComputationError
+from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..flow.lanes import Lanes, by_lane, only
@@ -26,6 +26,10 @@ _OFF = 0.1234567
 # A section is tangent to the cycle if its level changes slower than this fraction of its fastest
 # rate.
 _STEEP = 1e-4
+
+
+# Steps that the flow from one section to the next may take.
+PATIENCE = 1024
 
 
 class PlacedSections(eqx.Module):
@@ -125,6 +129,34 @@ def place_sections(cycle: LimitCycle, sections) -> PlacedSections:
     return placed
 
 
+def as_placed(cycle: LimitCycle, sections) -> PlacedSections:
+    """`sections` placed on `cycle`: a family is placed, sections that were placed on it are kept.
+
+    **Raises:** `DefinitionError` for something that is not a cycle, or sections that were placed
+    on another one; otherwise as `place_sections`.
+    """
+    if not isinstance(cycle, LimitCycle):
+        raise DefinitionError(
+            f"expected a LimitCycle, got {type(cycle).__name__}: use find_limit_cycle first."
+        )
+    if not isinstance(sections, PlacedSections):
+        return place_sections(cycle, sections)
+    other = sections.cycle
+    mine, theirs = ((c.system, c.start, c.period) for c in (cycle, other))
+    if is_traced((mine, theirs)):
+        return place_sections(cycle, sections.sections)
+    if not eqx.tree_equal(mine, theirs):
+        raise DefinitionError(
+            "these sections were placed on another cycle: pass the family itself, e.g. "
+            "`placed.sections`, and it is placed on this one."
+        )
+    return sections
+
+
+def _patient(settings: Settings) -> Settings:
+    return dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+
+
 @quick_jit
 def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
     """The first point of the cycle, from its start on, where `crossing` happens."""
@@ -135,7 +167,9 @@ def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
         jnp.full(1, jnp.inf), one, one - 1, start.t + 1.5 * cycle.period, jnp.full(1, jnp.inf),
         None, ListLevels((crossing,)), Result.SECTION_MISSED,
     )  # fmt: skip
-    settings = dataclasses.replace(cycle.settings, max_steps=2048)
+    settings = dataclasses.replace(
+        cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
+    )
     moved = move(cycle.system, start, jnp.zeros((s.nu, 1)), target, settings)
     return moved.lanes, moved.result
 
@@ -148,7 +182,7 @@ def _place(
     system, period = cycle.system, cycle.period
     s = Structure(system)
     N = sections.count
-    settings = dataclasses.replace(settings, max_steps=2048)
+    settings = _patient(settings)
     u = jnp.zeros((s.nu, 1))
     f = slopes(s, anchor.t, anchor.chart, anchor.q, u)
     bound = sections.bind(s, period, anchor.chart[0], anchor.t[0], anchor.q[:, 0], f[:, 0])
@@ -257,6 +291,12 @@ def _check(placed: PlacedSections, first: int) -> None:
             raise ComputationError(
                 f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: {reason}."
             )
+    moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
+    if not placed.cycle.clocked and len(moving):
+        raise ComputationError(
+            f"{describe(int(moving[0]))} depends on time, which has no meaning on the cycle of an "
+            "autonomous system: use a function of the state, or ClockPhase."
+        )
     counts, steepness = _crossings(placed)
     for i in range(N):
         if steepness[i] < _STEEP:

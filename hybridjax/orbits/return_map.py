@@ -75,7 +75,7 @@ def solve(system, start: Lanes, base, expected, settings, damped: bool, follow: 
         apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
-    begin = eqx.tree_at(lambda x: x.q, start, q[:, None])
+    begin = _begin(s, q, start, base, expected)
     steps = solution.stats["num_steps"]
     return begin, period, factors, seen, steps, code.astype(jnp.int32)
 
@@ -147,10 +147,7 @@ def _turn(q, system, start: Lanes, base, expected, settings, flow):
     **Returns:** P(q) - q, the lane at the end, its result, and what `flow` returned besides.
     """
     s = Structure(system)
-    lanes = start_lanes(s, start.t, start.chart, q[:, None], expected)
-    if isinstance(base, AtEvent):
-        own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(base.name)
-        lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)
+    lanes = _begin(s, q, start, base, expected)
     targets = _leg_targets(s, start.t[0], base, expected)
     each, common = eqx.partition(targets, _per_lane(targets))
 
@@ -166,6 +163,15 @@ def _turn(q, system, start: Lanes, base, expected, settings, flow):
     same = (result[0] == Result.OK) & (end.chart[0] == start.chart[0])
     residual = jnp.where(same, jnp.where(valid, end.q[:, 0], 0.0) - q, jnp.nan)
     return residual, end, result[0], extra
+
+
+def _begin(s: Structure, q, start: Lanes, base, expected) -> Lanes:
+    """The lane at the beginning of a turn: right after an event, that event is not due again."""
+    lanes = start_lanes(s, start.t, start.chart, q[:, None], expected)
+    if isinstance(base, AtEvent):
+        own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(base.name)
+        lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)
+    return lanes
 
 
 def _across(s: Structure, legs: Lanes, factors):

@@ -161,7 +161,7 @@ def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isoc
         lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
     )
     stiffer = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(10.001, float))
-    hj.run_experiments(hopper_cycle, stiffer, design, OUTPUTS)
+    hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS)
     assert not compiled
 
 
