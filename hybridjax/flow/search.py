@@ -28,7 +28,7 @@ IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = -4, -3, -2, -1
 _SLOW = 1e-5
 # A step is too long for a watched function if halfway its cubic interpolant misses it by more than
 # this fraction of its size.
-_BEND = 0.02
+_BEND = 2e-3
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
 
@@ -238,7 +238,7 @@ def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
         jnp.where(crosses, 0, approach.tries + 1),
     )
     bad = ~jnp.isfinite(attempt.error)
-    factor = jnp.where(bad, 0.1, jnp.clip(0.9 * attempt.error ** (-1 / 7), 0.2, 5.0))
+    factor = jnp.where(bad, 0.1, jnp.clip(0.9 * attempt.error ** (-1 / 7), 0.2, 3.0))
     grown = jnp.where(step < h, jnp.maximum(h, step * factor), step * factor)
     too_long = active & ~state.approach.on & (attempt.error > 1.0)
     h = jnp.where(plain, grown, jnp.where(too_long, step * factor, h))

@@ -1,0 +1,79 @@
+"""Cycles and sections that are not what they seem to be are refused, never used."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import OUTPUTS
+from ..toys import Field
+
+
+class Kicked(hj.HybridSystem):
+    """x' = -x, and x grows by 1 each time the cosine falls, or at scheduled times."""
+
+    beat: float = 1.0
+    schedule: float = 0.0
+
+    def charts(self):
+        return {"a": Field(("x",), lambda t, q, u: (-q[0] + 0.0 * jnp.sin(t) + u[0],))}
+
+    def transitions(self):
+        guard = lambda t, q, u: jnp.cos(2 * jnp.pi * t)  # noqa: E731
+        if self.schedule:
+            guard = hj.Scheduled(self.schedule, 0.1)
+        return [hj.Transition("kick", "a", "a", guard, reset=lambda t, q, u: (q[0] + 1.0,))]
+
+    def period(self):
+        return self.beat
+
+
+class Forced(hj.HybridSystem):
+    def charts(self):
+        return {
+            "a": Field(("x",), lambda t, q, u: (-q[0] + jnp.sin(2 * jnp.pi * (t + 0.1) / 1.5),))
+        }
+
+    def period(self):
+        return 1.0
+
+
+def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
+    for use in (
+        lambda: hj.linearize(lossy_cycle, placed_isochrons),
+        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
+        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
+    ):
+        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+            use()
+
+
+def test_a_search_that_begins_at_an_event():
+    with pytest.raises(hj.ComputationError, match="begins exactly at the event 'kick'"):
+        hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.6,), 0.25))
+
+
+def test_a_schedule_that_does_not_fit_the_clock():
+    with pytest.raises(hj.DefinitionError, match="schedule of 'kick' must divide"):
+        hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
+
+
+def test_a_period_that_the_field_does_not_have():
+    with pytest.raises(hj.ComputationError, match="does not have the period 1"):
+        hj.find_limit_cycle(Forced(), hj.Guess("a", (0.0,)))
+
+
+def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
+    period = float(vanderpol_cycle.period)
+    moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
+    with pytest.raises(hj.ComputationError, match="depends on time"):
+        hj.place_sections(vanderpol_cycle, [moving])
+
+
+def test_events_before_the_search_do_not_count(hopper_cycle):
+    settled = hj.find_limit_cycle(
+        hj.models.VerticalHopper(), hj.Guess("stance", (2.0, 1.9), 0.5), settle=20.0
+    )
+    assert int(settled.start.events[0]) == 0
+    np.testing.assert_allclose(settled.start.q, hopper_cycle.start.q, atol=1e-11)
