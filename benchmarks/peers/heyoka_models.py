@@ -36,7 +36,7 @@ def hopper(m, M, k, b, l0, a, g, omega, retention) -> Model:
     fields = [
         (y, v),
         (v, (leg + u) / M - g),
-        (ym, vm),
+        (ym, flight * vm),
         (vm, flight * (-(leg + b * vm) / m - g)),
     ]
     guard = flight * ym + (1 - flight) * (leg + m * g)
