@@ -1,0 +1,169 @@
+"""Random systems through hybridjax and through scipy, compared."""
+
+import dataclasses
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hybridjax as hj
+from hybridjax._core.compile import quick_jit
+from hybridjax.flow.events import start_lanes
+from hybridjax.flow.move import Settings, record
+from hybridjax.flow.target import until
+from hybridjax.systems.structure import Structure
+from hybridjax.systems.system import Driven
+
+from . import scipy_loop
+from .drawing import STRUCTURES, draw
+from .scipy_loop import Event, Run
+from .structures import Plan, Random, Sample
+
+
+EVENTS = 6
+# Allowed difference in times and states, relative to 1 + their size ...
+TOLERANCE = 1e-8
+# ... and how far scipy at two tolerances may differ before a system counts as ill-conditioned.
+CONDITION = 1e-9
+# Accuracy of hybridjax, and the number of its steps.
+ACCURACY, STEPS = 1e-12, 1000
+# Systems in one compiled call.
+BATCH = 21
+
+
+@dataclasses.dataclass
+class Report:
+    """What became of the systems of one structure."""
+
+    name: str
+    systems: int = 0
+    events: int = 0
+    excluded: dict[str, list[int]] = dataclasses.field(default_factory=dict)
+    """Systems that are not compared, by reason."""
+    failures: dict[int, str] = dataclasses.field(default_factory=dict)
+    """What went wrong, by system."""
+    time_error: float = 0.0
+    """Largest difference of event times, relative to 1 + their size."""
+    state_error: float = 0.0
+    """Largest difference of states after events and at the end, relative to 1 + their size."""
+    scipy_seconds: float = 0.0
+    engine_seconds: float = 0.0
+
+    @property
+    def compared(self) -> int:
+        return self.systems - sum(len(numbers) for numbers in self.excluded.values())
+
+
+def shares(systems: int) -> dict[str, range]:
+    """The numbers of the systems of each structure when there are so many in total."""
+    names = list(STRUCTURES)
+    each, more = divmod(systems, len(names))
+    return {name: range(each + (k < more)) for k, name in enumerate(names)}
+
+
+def check(name: str, numbers, seed: int = 0) -> Report:
+    """Compare systems `numbers` of a structure."""
+    plan = STRUCTURES[name][0]
+    report = Report(name, len(numbers))
+    samples = [draw(name, k, seed) for k in numbers]
+    clock = time.perf_counter()
+    truths = [truth(plan, sample) for sample in samples]
+    report.scipy_seconds = time.perf_counter() - clock
+    clock = time.perf_counter()
+    found = engine(plan, samples, [stop(run, s) for run, s in zip(truths, samples, strict=True)])
+    report.engine_seconds = time.perf_counter() - clock
+    for k, run, (result, trial) in zip(numbers, truths, found, strict=True):
+        if run.excluded:
+            report.excluded.setdefault(run.excluded, []).append(k)
+            continue
+        report.events += len(run.events)
+        full = len(run.events) == EVENTS
+        if result != hj.Result.OK:
+            report.failures[k] = f"{result.name} at t = {trial.t:.9g}"
+        elif order(trial) != order(run):
+            report.failures[k] = f"events {order(trial)}, but {order(run)} by scipy"
+        else:
+            error = difference(trial, run, end=not full)
+            report.time_error = max(report.time_error, error[0])
+            report.state_error = max(report.state_error, error[1])
+            if not max(error) <= TOLERANCE:
+                report.failures[k] = "errors {:.1e} in time, {:.1e} in state".format(*error)
+    return report
+
+
+def truth(plan: Plan, sample: Sample) -> Run:
+    """The trajectory by scipy, with the reason why it is excluded, if it is."""
+    run = scipy_loop.run(plan, sample, EVENTS, 1e-13, 1e-14)
+    if run.excluded is None:
+        rough = scipy_loop.run(plan, sample, EVENTS, 1e-11, 1e-12)
+        full = len(run.events) == EVENTS
+        if order(rough) != order(run) or max(difference(rough, run, not full)) > CONDITION:
+            run.excluded = "ill-conditioned"
+    return run
+
+
+def stop(run: Run, sample: Sample) -> float:
+    """When hybridjax may stop: at the limit, or a little after the last event."""
+    return sample.start.limit if len(run.events) < EVENTS else run.t + 1e-3
+
+
+def order(run: Run) -> list[int]:
+    return [event.code for event in run.events]
+
+
+def difference(a: Run, b: Run, end: bool) -> tuple[float, float]:
+    """Largest differences of times and states, relative to 1 + their size."""
+
+    def relative(x, y):
+        return np.max(np.abs(x - y) / (1 + np.abs(y)))
+
+    pairs = list(zip(a.events, b.events, strict=True))
+    times = [relative(x.t, y.t) for x, y in pairs]
+    states = [relative(x.after, y.after) for x, y in pairs]
+    if end:
+        states.append(relative(a.q, b.q) if a.chart == b.chart else np.inf)
+    return max(times, default=0.0), max(states, default=0.0)
+
+
+def engine(plan: Plan, samples: list[Sample], ends: list[float]) -> list[tuple[hj.Result, Run]]:
+    """Results and trajectories by hybridjax, up to the wanted number of events.
+
+    The one place that knows how the flow is called.
+    """
+    out = []
+    for k in range(0, len(samples), BATCH):
+        piece = samples[k : k + BATCH]
+        fill = piece + piece[-1:] * (BATCH - len(piece))
+        stops = ends[k : k + BATCH] + ends[-1:] * (BATCH - len(piece))
+        many = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill)
+        moved = jax.tree_util.tree_map(np.asarray, _flow(plan, many, jnp.asarray(stops)))
+        for i in range(len(piece)):
+            result, count, events, t, chart, q = jax.tree_util.tree_map(lambda x, i=i: x[i], moved)
+            events = [
+                Event(float(at), int(code), int(b), after[: plan.dims[b]])
+                for at, code, b, after in zip(*events, strict=True)
+            ]
+            run = Run(events[:count], float(t), int(chart), q[: plan.dims[chart]])
+            out.append((hj.Result(int(result)), run))
+    return out
+
+
+@quick_jit
+def _flow(plan: Plan, many: Sample, ends):
+    def one(sample: Sample, end):
+        system = Random(plan, sample.charts, sample.arrows)
+        t, q, u, _ = sample.start
+        # `start_lanes` arms guards at zero input, so here it gets a system that adds the input.
+        s = Structure(Driven(system, lambda t: u))
+        q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
+        settings = Settings(rtol=ACCURACY, atol=ACCURACY, max_steps=STEPS)
+        lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q, end - t)
+        moved, tape = record(system, lanes, u[:, None], until(end[None]), settings)
+        happens = tape.code[:, 0] >= 0
+        (rows,) = jnp.nonzero(happens, size=EVENTS, fill_value=0)
+        events = [x[rows, ..., 0] for x in (tape.t, tape.code, tape.chart, tape.after)]
+        end = moved.lanes
+        return moved.result[0], happens.sum(), events, end.t[0], end.chart[0], end.q[:, 0]
+
+    return jax.vmap(one)(many, ends)

@@ -1,0 +1,317 @@
+"""Numbers for random hybrid systems: a few structures, and how the systems of each are drawn.
+
+All numbers are of order one, so that trajectories stay bounded and guards are met often.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .structures import Arrow, Plan, Sample, Start
+
+
+def still(n: int, /, **given) -> dict[str, Any]:
+    """Numbers of a chart that are all zero but for those given."""
+    zero = np.zeros(n)
+    flat = {"b": zero, "cube": zero, "a": zero, "w": 1.0, "p": 0.0, "B": np.zeros((n, 2))}
+    return flat | {"A": np.zeros((n, n)), "S": np.zeros((n, n)), "T": np.zeros((n, n))} | given
+
+
+def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]:
+    """Lightly damped oscillators in skew coordinates, forced, in half the systems non-linear."""
+    A = np.zeros((n, n))
+    for k in range(0, n - 1, 2):
+        w, z = rng.uniform(*rate), rng.uniform(*damping)
+        A[k : k + 2, k : k + 2] = [[-z, w], [-w, -z]]
+    if n % 2:
+        A[-1, -1] = -rng.uniform(0.2, 1.0)
+    basis = np.linalg.qr(rng.normal(size=(n, n)))[0] * rng.uniform(0.7, 1.4, n)
+    mild = float(rng.random() < 0.5)
+    return still(
+        n,
+        A=basis @ A @ np.linalg.inv(basis),
+        b=rng.normal(0.0, 0.1, n),
+        B=rng.normal(0.0, 0.2, (n, 2)),
+        cube=mild * rng.uniform(0.0, 0.05, n),
+        S=mild * rng.normal(0.0, 0.2 / max(n, 1), (n, n)),
+        T=mild * rng.normal(0.0, 0.2 / max(n, 1), (n, n)),
+        a=rng.normal(0.0, 0.5, n),
+        w=rng.uniform(0.5, 3.0),
+        p=rng.uniform(0.0, 2 * np.pi),
+    )
+
+
+def drifting(rng, n: int, direction: float) -> dict[str, Any]:
+    """The first state moves in one direction at a changing speed, and drives the others."""
+    x, rest = still(n), swinging(rng, n - 1)
+    for name in ("A", "S", "T"):
+        x[name][1:, 1:] = rest[name]
+    x["A"][0, 0] = -rng.uniform(0.0, 0.1)
+    x["A"][1:, 0] = rng.normal(0.0, 0.3, n - 1)
+    x["T"][0, 0] = rng.normal(0.0, 0.1)
+    return x | {
+        "b": np.append(direction * rng.uniform(0.7, 1.5), rest["b"]),
+        "B": rng.normal(0.0, 0.1, (n, 2)),
+        "cube": np.append(0.0, rest["cube"]),
+        "a": np.append(rng.normal(0.0, 0.3), rest["a"]),
+        "w": rest["w"],
+        "p": rest["p"],
+    }
+
+
+def arrow(rng, n: int, after: int, /, spread=0.3, **given) -> dict[str, Any]:
+    """A flat guard near zero, and a reset that turns and stretches the state and moves it."""
+    turn = np.linalg.qr(rng.normal(size=(max(n, after),) * 2))[0][:after, :n]
+    normal = rng.normal(size=n)
+    numbers = {
+        "n": normal / np.linalg.norm(normal),
+        "Q": np.zeros((n, n)),
+        "c": rng.uniform(-spread, spread),
+        "m": rng.normal(0.0, 0.1, 2),
+        "a": 0.0,
+        "w": 1.0,
+        "p": 0.0,
+        "k": rng.normal(size=n),
+        "k0": rng.normal(0.0, 0.5) + 0.3,
+        "R": turn * rng.uniform(0.8, 1.2),
+        "r": rng.normal(0.0, 0.4, after),
+        "V": rng.normal(0.0, 0.1, (after, 2)),
+        "period": 1.0,
+        "offset": 0.0,
+    }
+    return numbers | given
+
+
+def start(rng, n: int, limit=25.0, size=1.2) -> Start:
+    t = rng.uniform(0.0, 5.0)
+    return Start(t, rng.normal(0.0, size, n), rng.normal(size=2), t + limit)
+
+
+def unit(n: int, k: int = 0) -> np.ndarray:
+    return np.eye(n)[k]
+
+
+def wave(rng, size, rate) -> dict[str, Any]:
+    """A term of a guard that changes with time."""
+    return {"a": rng.uniform(*size), "w": rng.uniform(*rate), "p": rng.uniform(0.0, 2 * np.pi)}
+
+
+# Structures: a plan and a function that draws a system.
+
+
+def bounce(rng) -> Sample:
+    """A ball with drag; right after an impact its guard is zero."""
+    chart = still(
+        2,
+        A=np.array([[0.0, 1.0], [-rng.uniform(0.0, 0.3), -rng.uniform(0.0, 0.1)]]),
+        b=np.array([0.0, -rng.uniform(1.0, 4.0)]),
+        B=np.array([[0.0, 0.0], [0.1, 0.2]]),
+        cube=np.array([0.0, rng.uniform(0.0, 0.02)]),
+        a=np.array([0.0, rng.normal(0.0, 0.3)]),
+        w=rng.uniform(0.5, 3.0),
+    )
+    level = rng.uniform(-0.3, 0.3)
+    impact = arrow(
+        rng, 2, 2, n=unit(2), c=-level, m=np.zeros(2),
+        R=np.diag([1.0, -rng.uniform(0.75, 1.0)]), r=np.zeros(2), V=np.zeros((2, 2)),
+    )  # fmt: skip
+    begin = start(rng, 2)
+    return Sample([chart], [impact], begin._replace(q=level + np.abs(begin.q) + [0.1, 0.0]))
+
+
+def relay(rng) -> Sample:
+    """A thermostat that overshoots nothing: two charts of dimension 1."""
+    heat = still(
+        1, A=-rng.uniform(0.1, 0.5, (1, 1)), b=rng.uniform(1.0, 2.0, 1),
+        T=rng.normal(0.0, 0.2, (1, 1)), a=rng.normal(0.0, 0.3, 1), w=rng.uniform(0.5, 6.0),
+        B=rng.normal(0.0, 0.05, (1, 2)),
+    )  # fmt: skip
+    cool = heat | {"b": -rng.uniform(1.0, 2.0, 1), "S": rng.normal(0.0, 0.3, (1, 1))}
+    keep = {"n": np.ones(1), "R": np.eye(1), "r": np.zeros(1), "V": np.zeros((1, 2))}
+    off = arrow(rng, 1, 1, **keep | {"c": -rng.uniform(0.5, 1.0)})
+    on = arrow(rng, 1, 1, **keep | {"c": rng.uniform(0.5, 1.0)})
+    begin = start(rng, 1)
+    return Sample([heat, cool], [off, on], begin._replace(q=rng.uniform(-0.5, 0.5, 1)))
+
+
+def kicks(rng) -> Sample:
+    """An oscillator that three guards kick, one of them only where it is enabled.
+
+    Some kicks are along the guard, which then is zero up to rounding after the event.
+    """
+    arrows = [arrow(rng, 3, 3, m=np.zeros(2), V=np.zeros((3, 2))) for _ in range(3)]
+    for x in arrows:
+        if rng.random() < 0.5:
+            x |= {"R": np.eye(3), "r": x["r"] - x["n"] * (x["n"] @ x["r"])}
+    return Sample([swinging(rng, 3)], arrows, start(rng, 3))
+
+
+def dips(rng) -> Sample:
+    """Guards that are negative in a thin layer only: they dip and return within a step."""
+
+    def layer():
+        normal = rng.normal(size=2)
+        normal, level = normal / np.linalg.norm(normal), rng.uniform(-0.6, 0.6)
+        width = 10 ** rng.uniform(-2.5, -0.5)  # (n.q - level)^2 - width^2
+        return {
+            "n": -2 * level * normal, "Q": 2 * np.outer(normal, normal),
+            "c": level**2 - width**2, "m": np.zeros(2),
+        }  # fmt: skip
+
+    arrows = [arrow(rng, 2, 2, **layer()) for _ in range(2)]
+    return Sample([swinging(rng, 2)], arrows, start(rng, 2))
+
+
+def hop(rng) -> Sample:
+    """Two oscillators, of which one stops at touchdown and starts again at liftoff, in half of
+    the systems where touchdown's guard is zero."""
+    air, ground = swinging(rng, 4), swinging(rng, 2)
+    land = arrow(rng, 4, 2, n=unit(4, 2), R=np.eye(4)[:2], r=rng.normal(0.0, 0.1, 2))
+    land |= {"c": 0.0, "m": np.zeros(2)}
+    lift = arrow(rng, 2, 4, R=np.eye(4)[:, :2], V=np.zeros((4, 2)))
+    if rng.random() < 0.5:  # start right on the guard of touchdown
+        lift["r"][2] = 0.0
+    return Sample([air, ground], [land, lift], start(rng, 4))
+
+
+def ladder(rng) -> Sample:
+    """Three charts in turn, of dimensions 1, 3 and 5."""
+    charts = [drifting(rng, 1, 1.0), drifting(rng, 3, -1.0), drifting(rng, 5, 1.0)]
+    arrows = []
+    for n, after, level in ((1, 3, 1.0), (3, 5, -1.0), (5, 1, 1.0)):
+        back = np.zeros((after, n))
+        back[0, 0] = rng.uniform(-0.5, 0.5)
+        back[1:, :] = rng.normal(0.0, 0.5, (after - 1, n))
+        c = -level * rng.uniform(0.5, 1.5)
+        arrows.append(arrow(rng, n, after, n=unit(n), c=c, R=back, r=rng.normal(0.0, 0.3, after)))
+    return Sample(charts, arrows, start(rng, 1, size=0.3))
+
+
+def fork(rng) -> Sample:
+    """Whichever guard comes first decides on the next chart, of dimension 3 or 2."""
+    charts = [swinging(rng, 2), swinging(rng, 3), swinging(rng, 2)]
+    ends = [(2, 3), (2, 2), (3, 2), (2, 2)]
+    return Sample(charts, [arrow(rng, *n) for n in ends], start(rng, 2))
+
+
+def switch(rng) -> Sample:
+    """Switched by a clock, with a guard in between."""
+    period = rng.uniform(1.0, 3.0)
+    offset = rng.uniform(0.0, period)
+    keep = {"R": np.eye(2), "r": np.zeros(2), "V": np.zeros((2, 2))}
+    arrows = [
+        arrow(rng, 2, 2, period=period, offset=offset, **keep),
+        arrow(rng, 2, 2, period=period, offset=offset + rng.uniform(0.2, 0.8) * period, **keep),
+        arrow(rng, 2, 2),
+    ]
+    return Sample([swinging(rng, 2), swinging(rng, 2)], arrows, start(rng, 2))
+
+
+def table(rng) -> Sample:
+    """A guard that moves faster than the state."""
+    arrows = [arrow(rng, 3, 3, **wave(rng, (0.1, 0.6), (3.0, 20.0))) for _ in range(2)]
+    return Sample([swinging(rng, 3)], arrows, start(rng, 3))
+
+
+def ellipse(rng) -> Sample:
+    """A pendulum that leaves an ellipse or enters another one."""
+    frequency = rng.uniform(0.8, 2.0)
+    chart = still(
+        2,
+        A=np.array([[0.0, 1.0], [0.0, -rng.uniform(0.0, 0.1)]]),
+        S=np.array([[0.0, 0.0], [-(frequency**2), 0.0]]),
+        B=np.array([[0.0, 0.0], [0.1, 0.1]]),
+        a=np.array([0.0, rng.uniform(0.2, 0.8)]),
+        w=frequency * rng.uniform(0.6, 1.2),
+        p=rng.uniform(0.0, 2 * np.pi),
+    )
+
+    def border(size):
+        shape = rng.normal(0.0, 0.3, (2, 2)) + np.eye(2)
+        return {"Q": shape @ shape.T, "n": rng.normal(0.0, 0.1, 2), "c": -rng.uniform(*size)}
+
+    out = arrow(rng, 2, 2, **border((0.8, 1.6)))
+    out |= {"R": rng.uniform(0.3, 0.8) * np.eye(2), "r": rng.normal(0.0, 0.1, 2)}
+    into = arrow(rng, 2, 2, **border((0.05, 0.3)))
+    return Sample([chart], [out, into], start(rng, 2, size=0.7))
+
+
+def crowd(rng) -> Sample:
+    """Five dimensions and four guards of all kinds."""
+    curved = 0.3 * rng.normal(size=(5, 5))
+    arrows = [
+        arrow(rng, 5, 5),
+        arrow(rng, 5, 5, Q=curved + curved.T),
+        arrow(rng, 5, 5, **wave(rng, (0.1, 0.5), (1.0, 5.0))),
+        arrow(rng, 5, 5, spread=1.0),
+    ]
+    return Sample([swinging(rng, 5)], arrows, start(rng, 5))
+
+
+def tour(rng) -> Sample:
+    """Three charts of dimensions 5, 1 and 4, a clock, and a guard of every kind."""
+    charts = [swinging(rng, 5), drifting(rng, 1, -1.0), swinging(rng, 4)]
+    period = rng.uniform(2.0, 5.0)
+    arrows = [
+        arrow(rng, 5, 1, R=rng.normal(0.0, 0.2, (1, 5)), r=np.ones(1)),
+        arrow(rng, 5, 4, **wave(rng, (0.1, 0.5), (1.0, 5.0))),
+        arrow(rng, 1, 4, n=np.ones(1), c=rng.uniform(0.0, 1.0)),
+        arrow(rng, 4, 5),
+        arrow(rng, 4, 4, period=period, offset=rng.uniform(0.0, period)),
+    ]
+    return Sample(charts, arrows, start(rng, 5))
+
+
+def _one(*arrows, dims) -> Plan:
+    return Plan(dims, tuple(Arrow(*a) for a in arrows))
+
+
+STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {
+    "bounce": (_one((0, 0, "falling"), dims=(2,)), bounce),
+    "relay": (_one((0, 1, "rising"), (1, 0, "falling"), dims=(1, 1)), relay),
+    "kicks": (
+        _one((0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), dims=(3,)),
+        kicks,
+    ),
+    "dips": (_one((0, 0, "falling"), (0, 0, "falling", True), dims=(2,)), dips),
+    "hop": (_one((0, 1, "falling"), (1, 0, "rising"), dims=(4, 2)), hop),
+    "ladder": (
+        _one((0, 1, "rising"), (1, 2, "falling"), (2, 0, "rising"), dims=(1, 3, 5)),
+        ladder,
+    ),
+    "fork": (
+        _one(
+            (0, 1, "falling"), (0, 2, "rising"), (1, 0, "falling"), (2, 0, "rising"),
+            dims=(2, 3, 2),
+        ),
+        fork,
+    ),
+    "switch": (
+        _one((0, 1, "scheduled"), (1, 0, "scheduled"), (0, 0, "falling"), dims=(2, 2)),
+        switch,
+    ),
+    "table": (_one((0, 0, "falling"), (0, 0, "rising"), dims=(3,)), table),
+    "ellipse": (_one((0, 0, "rising"), (0, 0, "falling"), dims=(2,)), ellipse),
+    "crowd": (
+        _one(
+            (0, 0, "falling"), (0, 0, "rising"), (0, 0, "falling", True), (0, 0, "rising", True),
+            dims=(5,),
+        ),
+        crowd,
+    ),
+    "tour": (
+        _one(
+            (0, 1, "falling"), (0, 2, "rising"), (1, 2, "falling"), (2, 0, "rising", True),
+            (2, 2, "scheduled"),
+            dims=(5, 1, 4),
+        ),
+        tour,
+    ),
+}  # fmt: skip
+
+
+def draw(name: str, number: int, seed: int = 0) -> Sample:
+    """System `number` of a structure."""
+    place = list(STRUCTURES).index(name)
+    return STRUCTURES[name][1](np.random.default_rng([seed, place, number]))

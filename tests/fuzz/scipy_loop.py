@@ -1,0 +1,176 @@
+"""The independent truth: an event loop over scipy's DOP853, in plain numpy.
+
+scipy sees only sign changes between the ends of steps, so guards are sampled densely on each
+step's dense output here, and every minimum between samples is looked at. A guard is armed once
+it has left zero on the side from which it crosses.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.integrate import DOP853
+from scipy.optimize import brentq, minimize_scalar
+
+from .structures import Plan, Sample
+
+
+# Guards are sampled at this many points of each step.
+SAMPLES = 64
+# A guard has left zero if it is this far from it.
+LEFT = 1e-11
+# Events, or an event and what would have been one, closer than this are too close.
+CLOSE = 1e-6
+# A guard that crosses more slowly than this fraction of its largest rate is grazed.
+SLOW = 1e-3
+
+
+@dataclasses.dataclass
+class Event:
+    """An event: its time, its transition, the chart and the state after it."""
+
+    t: float
+    code: int
+    chart: int
+    after: np.ndarray
+
+
+@dataclasses.dataclass
+class Run:
+    """A trajectory: its events, where it ended, and if it is one, why it is a border case."""
+
+    events: list[Event]
+    t: float
+    chart: int
+    q: np.ndarray
+    excluded: str | None = None
+
+
+def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Run:
+    """Follow a system until it has had some number of events, or to its time limit."""
+    t, q, u, limit = sample.start
+    found, chart, excluded = [], 0, None
+    while len(found) < events and t < limit:
+        stay = _Stay(plan, sample, chart, t, np.asarray(q, float), u)
+        t, q, code, reason = stay.follow(limit, rtol, atol)
+        excluded = excluded or reason
+        if code is None:
+            break
+        x = sample.arrows[code]
+        q, chart = x["R"] @ q + x["r"] + x["V"] @ u, plan.arrows[code].target
+        if found and t - found[-1].t < CLOSE:
+            excluded = excluded or "events too close"
+        found.append(Event(t, code, chart, q))
+    return Run(found, t, chart, q, excluded)
+
+
+class _Stay:
+    """A stay in one chart, from its entry to the next event."""
+
+    def __init__(self, plan: Plan, sample: Sample, chart: int, t: float, q, u):
+        self.t, self.q, self.u = t, q, u
+        self.x, self.arrows, self.plan = sample.charts[chart], sample.arrows, plan
+        out = [g for g, arrow in enumerate(plan.arrows) if arrow.source == chart]
+        self.clocks = [g for g in out if plan.arrows[g].kind == "scheduled"]
+        self.guards = [g for g in out if plan.arrows[g].kind != "scheduled"]
+        self.armed = {g: self.guard(g, t, q) > LEFT for g in self.guards}
+        self.fastest = dict.fromkeys(self.guards, 0.0)
+        self.excluded = None
+
+    def field(self, t, q):
+        x = self.x
+        smooth = x["A"] @ q + x["b"] + x["B"] @ self.u - x["cube"] * q**3
+        bounded = x["S"] @ np.sin(q) + x["T"] @ np.tanh(q)
+        return smooth + bounded + x["a"] * np.sin(x["w"] * t + x["p"])
+
+    def guard(self, g, t, q):
+        """Guard g at one state, or at states (n, m), signed so that it falls at its event."""
+        x = self.arrows[g]
+        flat = x["n"] @ q + x["c"] + x["m"] @ self.u + x["a"] * np.sin(x["w"] * t + x["p"])
+        value = flat + 0.5 * np.sum(q * (x["Q"] @ q), axis=0)
+        return value if self.plan.arrows[g].kind == "falling" else -value
+
+    def rate(self, g, t, q):
+        """Time derivative of `guard` at one state."""
+        x = self.arrows[g]
+        slope = x["n"] + 0.5 * (x["Q"] + x["Q"].T) @ q
+        rate = slope @ self.field(t, q) + x["a"] * x["w"] * np.cos(x["w"] * t + x["p"])
+        return rate if self.plan.arrows[g].kind == "falling" else -rate
+
+    def enabled(self, g, q):
+        x = self.arrows[g]
+        return not self.plan.arrows[g].gated or x["k"] @ q + x["k0"] > 0
+
+    def tick(self):
+        """The next scheduled event: time, transition."""
+        times = []
+        for g in self.clocks:
+            period, offset = self.arrows[g]["period"], self.arrows[g]["offset"]
+            k = np.floor((self.t - offset) / period + 1e-9) + 1
+            times.append((offset + k * period, g))
+        return min(times, default=(np.inf, None))
+
+    def follow(self, limit, rtol, atol):
+        """Time, state, transition (None at the limit) and reason of exclusion at the next event."""
+        due, clock = self.tick()
+        end = min(limit, due)
+        solver = DOP853(self.field, self.t, self.q, end, rtol=rtol, atol=atol)
+        while solver.status == "running":
+            message = solver.step()
+            assert solver.status != "failed", message
+            hit = self.first(solver.t_old, solver.t, solver.dense_output())
+            if hit is not None:
+                t, q, g = hit
+                self.look(t, q, g, min(due, limit))
+                return t, q, g, self.excluded
+        self.look(end, solver.y, None, np.inf)
+        return end, solver.y, clock if due < limit else None, self.excluded
+
+    def first(self, a, b, dense):
+        """The first event in a step: time, state, transition."""
+        t = np.linspace(a, b, SAMPLES + 1)
+        q = dense(t)
+        crossings = sorted(c for g in self.guards for c in self.crossings(g, t, q, dense))
+        for k, (time, g) in enumerate(crossings):
+            state = dense(time)
+            if self.enabled(g, state):
+                if any(later - time < CLOSE for later, _ in crossings[k + 1 :]):
+                    self.excluded = "events too close"
+                return time, state, g
+        return None
+
+    def crossings(self, g, t, q, dense):
+        """All falls of a guard through zero in a step."""
+
+        def value(time):
+            return self.guard(g, time, dense(time))
+
+        v = self.guard(g, t, q)
+        dips = np.flatnonzero((v[1:-1] > 0) & (v[1:-1] <= v[:-2]) & (v[1:-1] <= v[2:])) + 1
+        for k in dips[::-1]:
+            span = t[k - 1], t[k + 1]
+            low = minimize_scalar(value, bounds=span, method="bounded", options={"xatol": 1e-12})
+            if low.fun < 0 and low.x != t[k]:
+                place = k if low.x < t[k] else k + 1
+                t, v = np.insert(t, place, low.x), np.insert(v, place, low.fun)
+        rates = np.abs(np.diff(v) / np.diff(t))
+        self.fastest[g] = max(self.fastest[g], rates.max())
+        found = []
+        for k in range(1, len(t)):
+            self.armed[g] |= v[k - 1] > LEFT
+            if self.armed[g] and v[k] <= 0:
+                lo = t[k - 1]
+                found.append((brentq(value, lo, t[k], xtol=1e-15) if v[k - 1] > 0 else lo, g))
+                self.armed[g] = False
+        self.armed[g] |= v[-1] > LEFT
+        return found
+
+    def look(self, t, q, fired, known):
+        """Whether an event is a border case."""
+        for g in self.guards:
+            value, rate = self.guard(g, t, q), self.rate(g, t, q)
+            if g != fired and self.armed[g] and abs(value) < CLOSE * abs(rate):
+                self.excluded = "events too close"
+            if g == fired and -rate < SLOW * self.fastest[g]:
+                self.excluded = "grazing"
+        if known - t < CLOSE:
+            self.excluded = "events too close"

@@ -1,0 +1,63 @@
+"""Failures that random systems brought to light, each reduced to the smallest system."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.flow.events import start_lanes
+from hybridjax.flow.move import Settings, move
+from hybridjax.flow.target import until
+from hybridjax.systems.structure import Structure
+
+from ..toys import Field
+
+
+class Threshold(hj.HybridSystem):
+    """x' = -1, with an event where x + u falls through zero: the input moves the guard."""
+
+    def charts(self):
+        return {"line": Field(("x",), lambda t, q, u: (-1.0,))}
+
+    def transitions(self):
+        return (hj.Transition("fall", "line", "line", lambda t, q, u: q[0] + u[0]),)
+
+
+ZERO_INPUT = "guards are armed at zero input, not at the input of the trajectory"
+NEW_INPUT = "an input that changes between pieces of flow moves guards, but does not arm them anew"
+
+
+@pytest.mark.xfail(strict=True, reason=ZERO_INPUT)
+def test_a_guard_that_the_input_makes_negative_is_not_armed():
+    run = hj.simulate(Threshold(), "line", (0.5,), 1.0, input=-1.0, throw=False)
+    assert run.result == hj.Result.OK and not run.events
+
+
+@pytest.mark.xfail(strict=True, reason=ZERO_INPUT)
+def test_a_guard_that_the_input_makes_positive_is_armed():
+    run = hj.simulate(Threshold(), "line", (-1.0,), 1.0, input=1.001)
+    np.testing.assert_allclose([event.time for event in run.events], [0.001], atol=1e-14)
+
+
+def two_pieces(x, first, second):
+    """One second at one input, and one at another."""
+    system = Threshold()
+    lanes = start_lanes(
+        Structure(system), jnp.zeros(1), jnp.zeros(1, int), jnp.full((1, 1), x), jnp.asarray(1.0)
+    )
+    h = None
+    for end, u in ((1.0, first), (2.0, second)):
+        moved = move(system, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), Settings(), h)
+        lanes, h = moved.lanes, moved.h
+    return hj.Result(int(moved.result[0])), int(lanes.events[0])
+
+
+@pytest.mark.xfail(strict=True, reason=NEW_INPUT)
+def test_a_guard_that_a_new_input_makes_positive_is_armed():
+    assert two_pieces(-0.5, 0.0, 1.6) == (hj.Result.OK, 1)
+
+
+@pytest.mark.xfail(strict=True, reason=NEW_INPUT)
+def test_a_guard_that_a_new_input_makes_negative_is_no_failure():
+    """Whether this is an event, at the instant of the step, is another question."""
+    assert two_pieces(2.0, 0.0, -1.5)[0] == hj.Result.OK
