@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from job import Job
 
-from .errors import Unavailable
-from .heyoka_peer import hy
+from .heyoka_peer import compile_anew, hy
 
 
 class Ready(NamedTuple):
@@ -23,8 +22,7 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
 
     **Raises:** `Unavailable` without heyoka.
     """
-    if hy is None:
-        raise Unavailable("not installed")
+    compile_anew()
     from . import heyoka_models as models
 
     model = models.make(job)
@@ -39,13 +37,16 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
         saltation = _saltation(guard, after, model, variables)
 
         def change(ta, sign, lane):
-            t, state, pars = ta.time[lane], ta.state[:, lane], ta.pars[:, lane].copy()
-            D = state[4:].reshape(4, 6)
-            dt, through = saltation(state[:4], D, pars, t)
-            state[:4] = model.jump(j, t, state[:4], pars[models.SWITCH], np.cos)
+            t, state = ta.time[lane], ta.state[:4, lane].copy()
+            pars, D = ta.pars[:, lane].copy(), ta.state[4:, lane].reshape(4, 6)
+            dt, through = (
+                x[..., 0] for x in saltation(state[:, None], D[..., None], pars[:, None], t)
+            )
+            state = np.array(model.jump(j, t, state, pars[models.SWITCH], np.cos))
             pars[1 + j] = ta.pars[1 + j, lane] = 1 - pars[1 + j]
-            away = fields(state[:4].copy(), pars=pars[: fields.nparams], time=t)
-            state[4:] = (through - np.outer(away, dt)).ravel()
+            away = fields(state, pars=pars[: fields.nparams], time=t)
+            ta.state[:4, lane] = state
+            ta.state[4:, lane] = (through - np.outer(away, dt)).ravel()
             return True
 
         return change
@@ -74,8 +75,8 @@ def setup(job: Job, tol: float = 1e-12) -> Ready:
 
 
 def _saltation(guard, after, model, variables):
-    """A function (state, D (4, 6), pars, t) -> the derivatives dt (6,) of the time of the
-    crossing, and those of the state that `after` gives there."""
+    """A function (state (4, L), D (4, 6, L), pars, t (L,)) -> the derivatives dt (6, L) of the
+    times of the crossings, and those of the states that `after` gives there."""
     # heyoka differentiates by variables only.
     clock = hy.expression("clock")
     symbols = (*variables, clock)
@@ -85,12 +86,12 @@ def _saltation(guard, after, model, variables):
     f = hy.cfunc(matrix + rates, symbols)
 
     def saltation(state, D, pars, t):
-        out = f(np.append(state, t), pars=pars[: f.nparams])
-        (g, *after), field = out[:25].reshape(5, 5), out[25:]
+        out = f(np.vstack([state, t]), pars=np.ascontiguousarray(pars[: f.nparams]))
+        (g, *after), field = out[:25].reshape(5, 5, -1), out[25:]
         after = np.array(after)
-        dt = -(g[:4] @ D) / (g[:4] @ field + g[4])
-        D = D + np.outer(field, dt)
-        return dt, after[:, :4] @ D + np.outer(after[:, 4], dt)
+        dt = -np.einsum("il,icl->cl", g[:4], D) / (np.einsum("il,il->l", g[:4], field) + g[4])
+        D = D + field[:, None] * dt
+        return dt, np.einsum("jil,icl->jcl", after[:, :4], D) + after[:, 4:] * dt
 
     return saltation
 
@@ -102,9 +103,7 @@ def run(job: Job, ready: Ready) -> np.ndarray:
     ta.state[:], ta.pars[:] = ready.state, ready.pars
     ta.set_time(job.times)
     ta.reset_cooldowns()
-    out = np.zeros((N, 5, 6))
     longest = job.durations.copy() if job.clocked else np.full(N, 2 * job.durations.max())
-    left = np.arange(N)
     for _ in range(20):
         ta.step(longest)
         if job.clocked:
@@ -112,17 +111,14 @@ def run(job: Job, ready: Ready) -> np.ndarray:
             left = np.flatnonzero(longest)
         else:
             off = np.einsum("cl,cl->l", ta.pars[3:5], ta.state[:2]) + ta.pars[5]
-            here = left[np.abs(off[left]) < 1e-11]
-            for i in here:
-                state, pars = ta.state[:4, i], ta.pars[:, i].copy()
-                D = ta.state[4:, i].reshape(4, 6)
-                out[i, 0], out[i, 1:] = ready.section(state, D, pars, ta.time[i])
-            longest[here] = 0.0
+            longest[np.abs(off) < 1e-11] = 0.0
             left = np.flatnonzero(longest)
         if not len(left):
             break
     else:
         raise RuntimeError(f"sections {left + 1} are not reached")
-    if job.clocked:
-        out[:, 1:] = np.moveaxis(ta.state[4:].reshape(4, 6, N), 2, 0)
-    return out
+    D = ta.state[4:].reshape(4, 6, N)
+    dt = np.zeros((6, N))
+    if not job.clocked:
+        dt, D = ready.section(ta.state[:4], D, ta.pars, ta.time)
+    return np.moveaxis(np.concatenate([dt[None], D]), 2, 0)

@@ -30,13 +30,23 @@ class Ready(NamedTuple):
     guards: int
 
 
-def setup(job: Job, tol: float = 1e-7, batch: int = 1) -> Ready:
-    """Compile an integrator for the job's model: scalar, or for `batch` lanes.
+def compile_anew() -> None:
+    """See to it that compiled code of earlier calls and processes is not used again.
 
     **Raises:** `Unavailable` without heyoka.
     """
     if hy is None:
         raise Unavailable("not installed")
+    hy.llvm_state.set_diskcache_enabled(False)
+    hy.llvm_state.clear_memcache()
+
+
+def setup(job: Job, tol: float = 1e-7, batch: int = 1) -> Ready:
+    """Compile an integrator for the job's model: scalar, or for `batch` lanes.
+
+    **Raises:** `Unavailable` without heyoka.
+    """
+    compile_anew()
     from . import heyoka_models as models
 
     model = models.make(job)
