@@ -27,6 +27,8 @@ class ExperimentData(eqx.Module):
       `u[:, i]` acts. NaN from the failure on where an experiment failed.
     - `result`: (S,) codes of `Result`. `failed_at`: (S,) the sample at which an experiment
       failed, -1 where it did not.
+    - `error`: (S,) estimates of the largest error of a simulation, relative to the sizes of the
+      states on the cycle, or None if not known.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
     - `inputs`, `outputs`: names. `family`: name of the section family, for labels.
@@ -36,6 +38,7 @@ class ExperimentData(eqx.Module):
     y: Float[np.ndarray, "S n ny"]
     result: Int[np.ndarray, " S"]
     failed_at: Int[np.ndarray, " S"]
+    error: Float[np.ndarray, " S"] | None
     cycle_outputs: Float[np.ndarray, "N ny"] | None
     sections: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
@@ -54,6 +57,7 @@ class ExperimentData(eqx.Module):
         outputs: str | Sequence[str] | None = None,
         result: Any = None,
         failed_at: Any = None,
+        error: Any = None,
         cycle_outputs: Any = None,
         family: str = "",
     ):
@@ -73,6 +77,7 @@ class ExperimentData(eqx.Module):
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
         self.failed_at = np.full(S, -1) if failed_at is None else np.asarray(failed_at, int)
+        self.error = None if error is None else np.asarray(error, float)
         self.cycle_outputs = (
             None if cycle_outputs is None else _real("cycle_outputs", cycle_outputs)
         )
@@ -97,8 +102,11 @@ class ExperimentData(eqx.Module):
                 f"the window of P = {P} periods is longer than the record, {n // N} periods of "
                 f"{N} sections."
             )
-        if self.result.shape != (S,) or self.failed_at.shape != (S,):
-            raise DefinitionError(f"result and failed_at must have one entry for each of {S}.")
+        each = (self.result, self.failed_at) + (() if self.error is None else (self.error,))
+        if any(x.shape != (S,) for x in each):
+            raise DefinitionError(
+                f"result, failed_at and error must have one entry for each of {S} experiments."
+            )
         if self.cycle_outputs is not None and self.cycle_outputs.shape != (N, ny):
             raise DefinitionError(
                 f"cycle_outputs must have the shape (sections, outputs) = ({N}, {ny}), not "

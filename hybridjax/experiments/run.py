@@ -1,9 +1,8 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,16 +11,17 @@ from tqdm import tqdm
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
-from .._core.results import Result, update_result
-from ..flow.lanes import Lanes, by_lane, for_each_chart, only
-from ..flow.move import Settings, move
+from .._core.results import Result
+from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import PlacedSections, as_placed
+from ..orbits.place import PATIENCE, PlacedSections, as_placed
+from ..orbits.plan import make_plan
 from ..systems.output import Output
 from ..systems.structure import Structure
 from .data import ExperimentData
 from .design import Design
+from .respond import observe, respond
 
 
 def run_experiments(
@@ -35,7 +35,8 @@ def run_experiments(
     periods: int | None = None,
     batch: int = 256,
     progress: bool = False,
-    settings: Settings | None = None,
+    accuracy: float = 1e-9,
+    scale: Mapping[str, float] | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
@@ -55,7 +56,9 @@ def run_experiments(
         default 20 from the cycle (the paper's) and 0 from the periodic start.
     - `batch`: experiments per compiled call; more need more memory.
     - `progress`: show a progress bar over the batches.
-    - `settings`: accuracy of the flow; by default rtol 1e-9, atol 1e-10.
+    - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
+        every section, relative to `scale`. `data.error` is each experiment's own estimate.
+    - `scale`: sizes of states by name (of time as `t`); by default the largest on the cycle.
 
     **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
 
@@ -64,11 +67,11 @@ def run_experiments(
     """
     placed = as_placed(cycle, sections)
     require_x64(cycle)
-    if settings is None:
-        settings = Settings(rtol=1e-9, atol=1e-10, max_steps=1024)
     system = cycle.system
     s = Structure(system)
     z = s.resolve_outputs(outputs)
+    if not 1e-13 <= accuracy <= 1e-2:
+        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
     if batch < 1:
         raise DefinitionError(f"batch is the number of experiments per call, not {batch}.")
     if start not in ("cycle", "periodic"):
@@ -85,14 +88,16 @@ def run_experiments(
     if start == "periodic":
         q = q + _periodic_start(cycle, placed, u, periods)
     size = min(batch, u.shape[0])
-    y, result, failed_at = [], [], []
+    scales = _scales(placed, scale)
+    settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
+    plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
+    parts = []
     for k in tqdm(range(0, u.shape[0], size), disable=not progress, desc="experiments"):
         rows = np.arange(k, k + size) % u.shape[0]  # the last batch is filled up with repetitions
-        out = _run(placed, q[:, rows], jnp.asarray(u[rows]), tuple(z.items), settings)
+        part = _respond(placed, plan, q[:, rows], jnp.asarray(u[rows]), tuple(z.items), settings)
         keep = min(size, u.shape[0] - k)
-        for whole, part in zip((y, result, failed_at), out, strict=True):
-            whole.append(np.asarray(part)[:keep])
-    y, result, failed_at = (np.concatenate(x) for x in (y, result, failed_at))
+        parts.append([np.asarray(x)[:keep] for x in part])
+    y, result, failed_at, error = (np.concatenate(x) for x in zip(*parts, strict=True))
     base = np.asarray(_on_cycle(placed, tuple(z.items)))
     good = np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)
     if not good.all():
@@ -111,6 +116,7 @@ def run_experiments(
         outputs=z.names,
         result=result,
         failed_at=failed_at,
+        error=error,
         cycle_outputs=base,
         family=placed.sections.label,
     )
@@ -173,64 +179,32 @@ def _periodic_start(cycle, placed, u, periods) -> Float[np.ndarray, "n S"]:
     return embed @ np.stack([np.asarray(ldtp.periodic_state(w, periods)) for w in window], axis=1)
 
 
-@eqx.filter_jit
-def _run(placed: PlacedSections, q0, u, outputs, settings):
-    """Records (S, n, ny), result codes (S,), and the samples of failure (S,) or -1."""
-    system = placed.cycle.system
-    s = Structure(system)
-    z = s.resolve_outputs(outputs)
-    N, S, period = placed.count, u.shape[0], placed.cycle.period
-    order = jnp.array(placed.cycle.order, jnp.int32)
-    first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
-    lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
-    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (q0[0], q0[1:]))
+_respond = eqx.filter_jit(respond)
 
-    def section(carry, xs):
-        lanes, h, result, failed_at = carry
-        n, u = xs
-        i = n % N
-        y = _observe(s, z, lanes, u)
-        y = jnp.where(result == Result.OK, y, jnp.nan)
-        following = jnp.full(S, (i + 1) % N)
-        turns = (following == 0).astype(jnp.int32)
-        target = placed.target(following, lanes.t, turns)
-        hint = jnp.where(jnp.isinf(target.time), placed.duration[i], jnp.inf)
-        target = eqx.tree_at(
-            lambda x: (x.hint, x.order), target, (hint, order), is_leaf=lambda x: x is None
+
+def _scales(placed: PlacedSections, scale: Mapping[str, float] | None) -> np.ndarray:
+    """Scales (N, 1 + d) of time and states at the sections: the largest size on the cycle."""
+    s = Structure(placed.cycle.system)
+    chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
+    given = dict(scale or {})
+    out = np.ones((placed.count, 1 + s.d))
+    out[:, 0] = given.pop("t", float(placed.cycle.period))
+    for name in s.state_names():
+        places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
+        size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
+        size = given.pop(name, size if size > 0 else 1.0)
+        for a, k in places:
+            out[chart == a, 1 + k] = size
+    if given or not np.all(out > 0) or not np.all(np.isfinite(out)):
+        raise DefinitionError(
+            "`scale` gives positive sizes of states, by name, and of time, as t; states are "
+            f"{', '.join(s.state_names())}. Got {scale}."
         )
-        moved = move(system, lanes, u, target, settings, h, result)
-        # An event may change places with a section, but none may be left out or come in addition.
-        due = placed.lanes.events[(i + 1) % N] + (n + 1) // N * order.shape[0]
-        result = update_result(
-            moved.result, jnp.abs(moved.lanes.events - due) > 1, Result.EVENT_ORDER
-        )
-        # Time is counted within one period, so that every cycle is computed alike.
-        t = moved.lanes.t - turns * period
-        lanes = eqx.tree_at(lambda x: x.t, moved.lanes, t)
-        failed_at = jnp.where((failed_at < 0) & (result != Result.OK), n, failed_at)
-        return (lanes, moved.h, result, failed_at), y
-
-    h = jnp.full(S, 0.5 * period / N)
-    begin = (lanes, h, jnp.zeros(S, jnp.int32), jnp.full(S, -1))
-    xs = (jnp.arange(u.shape[1]), jnp.transpose(u, (1, 2, 0)))
-    (_, _, result, failed_at), y = jax.lax.scan(section, begin, xs)
-    return jnp.transpose(y, (2, 0, 1)), result, failed_at
-
-
-def _observe(s: Structure, z, lanes: Lanes, u) -> Float[Array, "ny L"]:
-    L = lanes.t.shape[0]
-
-    def work(a, here, out):
-        point = only(here, lanes.t), only(here, lanes.q[: s.dims[a]]), only(here, u)
-        values = by_lane(lambda t, q, u: z(a, t, q, u))(*point)
-        return jnp.where(here, values, out)
-
-    nothing = jnp.full((len(z.names), L), jnp.nan)
-    return for_each_chart(s, lanes.chart, jnp.ones(L, bool), work, nothing)
+    return out
 
 
 @quick_jit
 def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
     s = Structure(placed.cycle.system)
     u = jnp.zeros((s.nu, placed.count))
-    return _observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
+    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T

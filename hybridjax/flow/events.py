@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .lanes import Lanes, by_lane, only
+from .lanes import Lanes, only
 from .target import until
 from .watch import Watch, watch
 
@@ -82,7 +82,7 @@ def apply_resets(
         def work(carry, g=g, n=n, b=b, here=here):
             q, chart = carry
             arguments = only(here, t), only(here, q[:n]), only(here, u)
-            new = by_lane(lambda t, q, u: s.reset(g, t, q, u))(*arguments)
+            new = s.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))(*arguments)
             new = jnp.zeros_like(q).at[: s.dims[b]].set(new)
             return jnp.where(here, new, q), jnp.where(here, b, chart)
 
@@ -98,7 +98,7 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
             here = which == g
             n = s.dims[s.chart_index(transition.source)]
             arguments = only(here, t), only(here, q[:n]), only(here, u)
-            holds = by_lane(lambda t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
+            holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
             out = jnp.where(here, holds, out)
     return out
 

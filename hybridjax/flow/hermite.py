@@ -84,5 +84,22 @@ def first_crossing(
     return Crossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
 
 
+def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
+    """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
+    rise = v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
+    s = jnp.ones_like(v1)
+    for _ in range(4):
+        value = v0 + s * (d0 + s * (b + s * c))
+        s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
+    return s
+
+
+def control_points(v0, v1, d0, d1) -> tuple[jax.Array, ...]:
+    """The cubic's Bernstein coefficients: it stays between the smallest and the largest of them."""
+    return v0, v0 + d0 / 3, v1 - d1 / 3, v1
+
+
 def _divide(a, b):
     return jnp.where(b == 0, jnp.inf, a / jnp.where(b == 0, 1.0, b))

@@ -25,11 +25,6 @@ class Lanes(eqx.Module):
     in a row that shrank, and their sum."""
 
 
-def by_lane(function: Callable) -> Callable:
-    """Vectorise a function of single states over the lanes on the last axis."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1)
-
-
 def for_each_chart(
     s: Structure, chart: Int[Array, " L"], mask: Bool[Array, " L"], work: Callable, out
 ):

@@ -1,16 +1,21 @@
 """Flow of many lanes to their targets, differentiable in forward and reverse mode."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.lanewise import shared
 from .._core.results import Result
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from .batching import vmap_to_lanes
 from .lanes import Lanes
 from .replay import replay
-from .search import Tape, initial_step, search
+from .search import Found, Stride, initial_step, search, stride
+from .tape import Tape
 from .target import Target
 
 
@@ -35,6 +40,8 @@ class Moved(eqx.Module):
     lanes: Lanes
     h: Float[Array, " L"]
     """Step size to go on with."""
+    error: Float[Array, " L"]
+    """Sum of the steps' error estimates, relative to the tolerance."""
     result: Int[Array, " L"]
     """`Result` codes. A lane that failed stands where it failed."""
 
@@ -45,7 +52,7 @@ def move(
     u: Float[Array, "nu L"],
     target: Target,
     settings: Settings,
-    h: Float[Array, " L"] | None = None,
+    setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
 ) -> Moved:
     """Flow every lane to its target under a constant input.
@@ -53,9 +60,11 @@ def move(
     Lanes fail one by one, with a code each; nothing is raised. Times and states have exact
     derivatives (first and second, through crossings too) with respect to everything that is a
     floating-point array: states, times, inputs, parameters, the target.
+
+    `setout` is the first step, or a `Stride`.
     """
-    h, result = _defaults(system, lanes, u, target, settings, h, result)
-    return _move(system, lanes, u, target, h, result, settings)
+    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
+    return _move(system, lanes, u, target, setout, result, settings)
 
 
 def record(
@@ -64,19 +73,14 @@ def record(
     u: Float[Array, "nu L"],
     target: Target,
     settings: Settings,
-    h: Float[Array, " L"] | None = None,
+    setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
 ) -> tuple[Moved, Tape]:
     """As `move`, with a record of every step, and without derivatives."""
-    arguments = (
-        system,
-        lanes,
-        u,
-        target,
-        *_defaults(system, lanes, u, target, settings, h, result),
-    )
+    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
+    arguments = system, lanes, u, target, setout, result
     found = _search(*(_constant(x) for x in arguments), settings, True)
-    return Moved(found.lanes, found.h, found.result), found.tape
+    return _moved(found), found.tape
 
 
 def follow(
@@ -86,12 +90,14 @@ def follow(
     return replay(Structure(system), lanes, u, target, tape.h, tape.code)
 
 
-def _defaults(system, lanes, u, target, settings, h, result):
-    if h is None:
-        h = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings.rtol)
+def _defaults(system, lanes, u, target, settings, setout, result):
+    if setout is None:
+        setout = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings.rtol)
+    if not isinstance(setout, Stride):
+        setout = stride(setout)
     if result is None:
         result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
-    return jax.lax.stop_gradient(h), result
+    return _constant(setout), result
 
 
 def _constant(tree):
@@ -100,14 +106,25 @@ def _constant(tree):
     )
 
 
+def _moved(found: Found) -> Moved:
+    return Moved(found.lanes, found.h, found.error, found.result)
+
+
 @eqx.filter_jit
-def _search(system, lanes, u, target, h, result, settings, tape):
+def _search(system, lanes, u, target, setout, result, settings, tape: bool) -> Found:
+    bare = dataclasses.replace(target, levels=None)
+    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, tape))
+    return run((system, target.levels, settings), (lanes, u, bare, setout, result))
+
+
+def _run(system, levels, settings, lanes, u, target, setout, result, tape) -> Found:
+    settings = shared(settings)
     return search(
         Structure(system),
         lanes,
         u,
-        target,
-        h=h,
+        dataclasses.replace(target, levels=levels),
+        stride=setout,
         result=result,
         rtol=settings.rtol,
         atol=settings.atol,
@@ -117,15 +134,14 @@ def _search(system, lanes, u, target, h, result, settings, tape):
 
 
 @eqx.filter_custom_jvp
-def _move(system, lanes, u, target, h, result, settings):
-    found = _search(system, lanes, u, target, h, result, settings, False)
-    return Moved(found.lanes, found.h, found.result)
+def _move(system, lanes, u, target, setout, result, settings):
+    return _moved(_search(system, lanes, u, target, setout, result, settings, False))
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
-    system, lanes, u, target, h, result, settings = primals
-    moved, tape = record(system, lanes, u, target, settings, h, result)
+    system, lanes, u, target, setout, result, settings = primals
+    moved, tape = record(system, lanes, u, target, settings, setout, result)
 
     def ends(system, t, q, u, target):
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))

@@ -13,8 +13,8 @@ from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import apply_resets, scheduled_time
 from .lanes import Lanes, for_each_chart, only
-from .search import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .step import rk_step
+from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .target import Target
 from .watch import chart_field, settle, watched
 
@@ -59,10 +59,11 @@ def _advance(s, t, q, chart, moves, u, target, h, which):
         t0, q0, u0 = only(here, t), only(here, q[:n]), only(here, u)
         h0, index = only(here, h), only(here, target.index)
         crossing = jnp.where(here, which, -1)
-        q1, t1 = rk_step(chart_field(s, a, u0), t0, q0, h0).q, t0 + h0
+        step = rk_step(chart_field(s, a, u0), t0, q0, h0)
+        q1, t1 = step.q, t0 + h0
 
         def land():
-            settled = settle(s, a, target, t1, q1, u0, index, crossing)
+            settled = settle(s, a, target, t1, q1, step.f1, u0, index, crossing)
             return t1 + settled.past, settled.q
 
         if watched(s, a, target):

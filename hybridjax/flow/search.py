@@ -2,6 +2,9 @@
 
 This is the part that decides: step sizes, which event comes first, when to give up. It is not
 differentiated; what it decides is written down as a `Tape`, which `replay` follows.
+
+In each iteration every lane takes a step of its own. As long as no watched function comes near to
+a zero in any lane, little has to be kept (`_calmly`); the rest is done only where it is needed.
 """
 
 from typing import NamedTuple
@@ -13,41 +16,37 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
+from ..systems.transition import Scheduled
+from .attempt import Aim, Attempt, attempt
 from .events import ZERO, apply_resets, enabled, keep_pace, next_schedule, rearm
 from .hermite import first_crossing
 from .lanes import Lanes, for_each_chart, only
-from .step import rk_step
+from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape, blank_tape, write_row
 from .target import Target
-from .watch import Settled, Watch, chart_field, settle, watch, watched
+from .watch import Watch, chart_field, watch
 
 
-# Codes on a tape. Codes >= 0 name the transition that fires at the end of a move.
-IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = -4, -3, -2, -1
-
-# A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
-_SLOW = 1e-5
-# A step is too long for a watched function if halfway its cubic interpolant misses it by more than
-# this fraction of its size.
-_BEND = 2e-3
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
+# Attempts to land on a crossing before the step in which it was seen is halved.
+_TRIES = 8
 
 
-class Tape(NamedTuple):
-    """What was done, one row per iteration and one column per lane."""
+class Stride(NamedTuple):
+    """How lanes set out: what is known beforehand about their way."""
 
-    h: Float[Array, "R L"]
-    """Length of the move."""
-    code: Int[Array, "R L"]
-    """How it ended: IDLE (no move), MOVE, ARRIVE_TIME, ARRIVE_LEVEL, or a transition's index."""
-    t: Float[Array, "R L"]
-    """Time at the end of the move."""
-    before: Float[Array, "R d L"]
-    """State at the end of the move, before a reset."""
-    after: Float[Array, "R d L"]
-    """State after the reset."""
-    chart: Int[Array, "R L"]
-    """Chart after the reset."""
+    h: Float[Array, " L"]
+    """The first step."""
+    lead: Float[Array, " L"]
+    """Expected time to the target's level as a multiple of Newton's guess at the start; 0 if it is
+    not known."""
+    slack: Float[Array, " L"]
+    """A step's error estimate may be this many times the tolerance."""
+
+
+def stride(h: Float[Array, " L"]) -> Stride:
+    """Set out with steps h, and no further knowledge."""
+    return Stride(h, jnp.zeros_like(h), jnp.ones_like(h))
 
 
 class Found(NamedTuple):
@@ -56,6 +55,8 @@ class Found(NamedTuple):
     lanes: Lanes
     h: Float[Array, " L"]
     """The step size to go on with."""
+    error: Float[Array, " L"]
+    """Sum of the steps' error estimates, relative to the tolerance."""
     result: Int[Array, " L"]
     tape: Tape | None
 
@@ -70,8 +71,6 @@ class _Approach(NamedTuple):
     """Where the crossing is thought to be, as a time from where the lane is."""
     reach: Float[Array, " L"]
     """Length of the step in which it was seen."""
-    rate: Float[Array, " L"]
-    """The largest rate of that function at the step's ends."""
     tries: Int[Array, " L"]
 
 
@@ -83,25 +82,22 @@ class _State(NamedTuple):
     """Whether the target's level would end the flow at its next falling zero."""
     approach: _Approach
     h: Array
+    error: Array
     result: Array
     arrived: Array
     i: Array
     tape: Tape | None
 
 
-class _Attempt(NamedTuple):
-    """A step of every lane, before it is accepted."""
+class _Way(NamedTuple):
+    """The known times ahead of each lane, and what it does about them."""
 
-    q: Array
-    middle: Array
-    """The state halfway, by the cubic Hermite interpolant."""
-    f: Array
-    """The field at its end."""
-    error: Array
-    past: Array
-    """Time from its end to the zero of the function that an approaching lane crosses."""
-    first: Array
-    """The first of the two corrections that `past` is made of."""
+    known: Array
+    """The next known time."""
+    schedule: Array
+    """The transition that is due then; -1 if the target ends there first."""
+    last: Array
+    """Whether this step ends there."""
 
 
 def search(
@@ -110,10 +106,10 @@ def search(
     u: Float[Array, "nu L"],
     target: Target,
     *,
-    h: Float[Array, " L"],
+    stride: Stride,
     result: Int[Array, " L"],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
+    rtol: Float[Array, "*#L"],
+    atol: Float[Array, "*#L"],
     max_steps: int,
     tape: bool,
 ) -> Found:
@@ -126,16 +122,18 @@ def search(
     result = update_result(result, ~finite, Result.BAD_INPUT)
     span = target.limit - lanes.t
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
+    none = jnp.zeros(L, jnp.int32)
     state = _State(
         lanes,
         seen,
         _aims(seen, span),
-        _no_approach(L),
-        jnp.minimum(h, 1.05 * target.hint),
+        _Approach(jnp.zeros(L, bool), none, jnp.zeros(L), jnp.zeros(L), none),
+        stride.h,
+        jnp.zeros(L),
         result,
         jnp.zeros(L, bool),
         jnp.zeros((), jnp.int32),
-        _blank_tape(max_steps, lanes) if tape else None,
+        blank_tape(max_steps, lanes) if tape else None,
     )
 
     def active(state):
@@ -145,175 +143,193 @@ def search(
         return (state.i < max_steps) & active(state).any()
 
     def body(state):
-        return _iterate(s, state, active(state), u, target, span, rtol, atol)
+        return _iterate(s, state, active(state), u, target, stride, span, rtol, atol)
 
     state = jax.lax.while_loop(cond, body, state)
     result = update_result(state.result, active(state), Result.STEP_LIMIT)
-    return Found(state.lanes, state.h, result, state.tape)
+    return Found(state.lanes, state.h, state.error, result, state.tape)
 
 
-def _iterate(s, state, active, u, target, span, rtol, atol) -> _State:
-    lanes, seen, h, result = state.lanes, state.seen, state.h, state.result
-    approach = state.approach
-    G = len(s.transitions)
+def _iterate(s, state: _State, active, u, target, stride: Stride, span, rtol, atol) -> _State:
+    aim, way = _take_aim(s, state, active, target, stride)
+    ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
+    new = attempt(s, state.lanes, state.seen, ready, active, aim, u, target, rtol, atol, span)
+    calm = new.calm & (new.error <= stride.slack) & ~state.approach.on
+    calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
+    if _has_schedules(s):
+        calm = calm & ~(way.last & (way.schedule >= 0))
+    arguments = (state, active, aim, way, new, u, target, stride, span)
+    return jax.lax.cond(
+        (calm | ~active).all(), lambda: _calmly(*arguments), lambda: _eventfully(s, *arguments)
+    )
 
-    # 1. Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    scheduled, schedule = next_schedule(s, lanes.t, lanes.chart, target.time)
-    known = jnp.minimum(target.time, scheduled)
+
+def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _Way]:
+    """Where to each lane goes next."""
+    lanes, approach = state.lanes, state.approach
+    # Known times: the step is cut so that it ends on them exactly, in equal pieces.
+    known, schedule = target.time, jnp.full_like(lanes.chart, -1)
+    if _has_schedules(s):
+        scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
+        known = jnp.minimum(target.time, scheduled)
+        schedule = jnp.where(scheduled <= target.time, which, -1)
     rest = jnp.maximum(known - lanes.t, 0.0)
-    pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / h, 2.0) - 1e-9)
-    last = pieces <= 1
-    step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), h)
-    step = jnp.where(active, jnp.where(approach.on, approach.tau, step), 0.0)
-
-    # 2. A step of every lane. Approaching lanes go to their crossing: Newton by full steps until
-    # the two corrections of `settle` are exact to rounding.
-    attempt = _attempt(s, lanes, active, approach, u, target, step, rtol, atol)
-    enough = 1e-6 * approach.reach + 1e-13 * span
-    tau = approach.tau + attempt.past
-    inside = (tau >= -enough) & (tau <= approach.reach + enough)
-    lands = active & approach.on & (jnp.abs(attempt.first) <= enough) & inside
-    closer = active & approach.on & ~lands & (approach.tries < 8)
-    lost = active & approach.on & ~lands & ~closer
-    moved = jnp.where(lands, tau, step)
-
-    # 3. What is at the end of the step, and what was crossed on the way.
-    t = jnp.where(last & ~approach.on, jnp.where(active, known, lanes.t), lanes.t + moved)
-    end = watch(s, t, lanes.chart, attempt.q, u, target, active, attempt.f)
+    pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / state.h, 2.0) - 1e-9)
+    last = (pieces <= 1) & ~approach.on
+    step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), state.h)
+    which = jnp.where(approach.on, approach.which, -1)
+    # A zero that Newton's guess places within the first step is aimed at, where the way is known.
+    value, rate = state.seen
     ready = jnp.concatenate([lanes.armed, state.aimed[None]])
-    crossing = first_crossing(seen.value, end.value, step * seen.rate, step * end.rate, ready)
+    guess = value / jnp.where(rate < 0, -rate, jnp.inf)
+    guess = guess.at[-1].multiply(jnp.where(state.i == 0, stride.lead, 1.0))
+    level = jnp.arange(len(value))[:, None] == len(s.transitions)
+    sure = ready & (guess > 0) & (guess <= step) & (level | (state.i == 0))
+    guess = jnp.where(sure & ~approach.on & (stride.lead > 0), guess, jnp.inf)
+    nearest = jnp.min(guess, axis=0)
+    homing = jnp.isfinite(nearest)
+    step = jnp.where(homing, nearest, step)
+    which = jnp.where(homing, jnp.argmin(guess, axis=0).astype(jnp.int32), which)
+    last = last & ~homing
+    step = jnp.where(active, jnp.where(approach.on, approach.tau, step), 0.0)
+    return Aim(which, step, jnp.where(approach.on, approach.reach, step)), _Way(
+        known, schedule, last & active
+    )
+
+
+def _calmly(state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span):
+    """Nothing happened to any lane, except perhaps that it arrived."""
+    lanes = state.lanes
+    level, on_time = active & new.lands, way.last
+    moved = aim.step + jnp.where(level, new.past, 0.0)
+    t = jnp.where(way.last, way.known, lanes.t + moved)
+    arrived = level | on_time
+    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, lanes.pace.at[0].add(moved))
+    h = jnp.where(active, _next_step(state.h, aim.step, new.error / stride.slack), state.h)
+    late = active & ~arrived & (t >= target.limit)
+    tape = state.tape
+    if tape is not None:
+        code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
+        code = jnp.where(active, code, IDLE)
+        tape = write_row(tape, state.i, moved, code, t, new.q, new.q, lanes.chart)
+    return _State(
+        lanes,
+        _merge(active, new.seen, state.seen),
+        state.aimed,
+        state.approach,
+        h,
+        state.error + jnp.where(active, new.error, 0.0),
+        update_result(state.result, late, target.missed),
+        state.arrived | arrived,
+        state.i + 1,
+        tape,
+    )
+
+
+def _eventfully(
+    s, state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span
+) -> _State:
+    """Find out what happened to each lane, and let it happen."""
+    lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
+    G = len(s.transitions)
+    near = new.error <= stride.slack
+
+    # 1. Which approaches succeed.
+    tau = approach.tau + new.past
+    enough = 1e-6 * approach.reach + 1e-13 * span
+    inside = (tau >= -enough) & (tau <= approach.reach + enough)
+    lands = active & new.lands & jnp.where(approach.on, inside, near)
+    closer = active & approach.on & ~lands & (approach.tries < _TRIES)
+    lost = active & approach.on & ~lands & ~closer
+    moved = aim.step + jnp.where(new.lands, new.past, 0.0)
+    t = jnp.where(way.last, way.known, jnp.where(active, lanes.t + moved, lanes.t))
+
+    # 2. What was crossed on the way.
+    ready = jnp.concatenate([lanes.armed, state.aimed[None]])
+    crossing = first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
     zero = ZERO * span * jnp.abs(end.rate)
-    chosen = lands & (jnp.arange(G + 1)[:, None] == approach.which)
-    # Where a lane lands, another function may have fallen before: then that one comes first.
-    s_first = jnp.where(chosen | (lands & (end.value >= -zero)), jnp.inf, crossing.s)
+    chosen = lands & (jnp.arange(G + 1)[:, None] == aim.which)
+    # On the way to a crossing that was seen before, only what has fallen by its end can be new.
+    old = lands & jnp.where(approach.on, end.value >= -zero, jnp.abs(end.value) <= zero)
+    s_first = jnp.where(chosen | old, jnp.inf, crossing.s)
     which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
     first = jnp.min(s_first, axis=0)
-    overtaken = lands & jnp.isfinite(first)
-    lands = lands & ~overtaken
+    fresh = active & ~approach.on & near
+    bent = fresh & new.bent
+    crosses = ((fresh | lands) & jnp.isfinite(first)) & ~bent
+    refine = bent | (fresh & ~crosses & (crossing.near & ~chosen).any(axis=0))
+    touch = fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0)
+    lands = lands & ~crosses & ~refine
     chosen = chosen & lands
-    fresh = active & ~approach.on & (attempt.error <= 1.0)
-    crosses = (fresh & jnp.isfinite(first)) | overtaken
-    bent = fresh & _bends(s, lanes, seen, end, attempt, u, target, fresh, step)
-    crosses = crosses & ~bent
-    refine = bent | (fresh & ~crosses & crossing.near.any(axis=0))
-    touch = fresh & ~crosses & crossing.touch.any(axis=0)
-    plain = fresh & ~crosses & ~refine
+    plain = fresh & ~crosses & ~refine & ~lands
     accept = plain | lands
 
-    # 4. What happens there.
+    # 3. What happens there.
     clear = end.value > zero
     ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
-    guard = lands & (approach.which < G)
-    fires = guard & enabled(s, t, attempt.q, u, approach.which)
-    by_clock = plain & last & (scheduled <= target.time)
-    fired = jnp.where(fires, approach.which, jnp.where(by_clock, schedule, -1))
-    level = lands & (approach.which == G)
-    on_time = plain & last & ~by_clock
+    guard = lands & (aim.which < G)
+    fires = guard & enabled(s, t, new.q, u, aim.which)
+    by_clock = plain & way.last & (way.schedule >= 0)
+    fired = jnp.where(fires, aim.which, jnp.where(by_clock, way.schedule, -1))
+    level = lands & (aim.which == G)
+    on_time = plain & way.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    slow = lands & (jnp.abs(_row(end.rate, approach.which)) < _SLOW * approach.rate)
-
+    slow = lands & new.slow
     pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.order, lanes.events, fired)
     falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
-    new = Lanes(
+    after = Lanes(
         jnp.where(accept, t, lanes.t),
         lanes.chart,
-        jnp.where(accept, attempt.q, lanes.q),
+        jnp.where(accept, new.q, lanes.q),
         ready[:-1],
         lanes.events + (fired >= 0),
         pace,
     )
     seen = _merge(accept, end, seen)
-    new, seen, aimed = _reset(s, new, seen, ready[-1], fired, u, target, together, span)
+    after, seen, aimed = _reset(s, after, seen, ready[-1], fired, u, target, together, span)
 
-    # 5. The next step, and reasons to stop.
-    fastest = jnp.maximum(jnp.abs(_row(state.seen.rate, which)), jnp.abs(_row(end.rate, which)))
+    # 4. The next step, and reasons to stop.
     approach = _Approach(
         crosses | closer,
         jnp.where(crosses, which, approach.which),
-        jnp.where(crosses, first * step, jnp.clip(tau, 0.0, approach.reach)),
-        jnp.where(crosses, step, approach.reach),
-        jnp.where(crosses, fastest, approach.rate),
+        jnp.where(crosses, first * moved, jnp.clip(tau, 0.0, approach.reach)),
+        jnp.where(crosses, moved, approach.reach),
         jnp.where(crosses, 0, approach.tries + 1),
     )
-    bad = ~jnp.isfinite(attempt.error)
-    factor = jnp.where(bad, 0.1, jnp.clip(0.9 * attempt.error ** (-1 / 7), 0.2, 3.0))
-    grown = jnp.where(step < h, jnp.maximum(h, step * factor), step * factor)
-    too_long = active & ~state.approach.on & (attempt.error > 1.0)
-    h = jnp.where(plain, grown, jnp.where(too_long, step * factor, h))
-    h = jnp.where(refine, 0.5 * step, jnp.where(lost, 0.5 * state.approach.reach, h))
+    adapted = _next_step(state.h, aim.step, new.error / stride.slack)
+    too_long = active & ~state.approach.on & ~near
+    h = jnp.where(plain | too_long, adapted, state.h)
+    h = jnp.where(fired >= 0, jnp.maximum(h, stride.h), h)
+    h = jnp.where(refine, 0.5 * aim.step, jnp.where(lost, 0.5 * aim.reach, h))
     stuck = (too_long | refine | lost) & (h < _TINY * span)
     graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
-    result = update_result(result, graze, Result.GRAZING)
+    result = update_result(state.result, graze, Result.GRAZING)
     result = update_result(result, stuck, Result.BLOW_UP)
     result = update_result(result, zeno, Result.ZENO)
     result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)
-    result = update_result(result, active & ~arrived & (new.t >= target.limit), target.missed)
+    result = update_result(result, active & ~arrived & (after.t >= target.limit), target.missed)
 
     tape = state.tape
     if tape is not None:
         code = jnp.where(accept, MOVE, IDLE)
         code = jnp.where(on_time, ARRIVE_TIME, code)
         code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
-        row = (moved, code.astype(jnp.int32), t, attempt.q, new.q, new.chart)
-        tape = Tape(*(x.at[state.i].set(y) for x, y in zip(tape, row, strict=True)))
+        tape = write_row(tape, state.i, moved, code, t, new.q, after.q, after.chart)
+    error = state.error + jnp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
-    return _State(new, seen, aimed, approach, h, result, arrived, state.i + 1, tape)
+    return _State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1, tape)
 
 
-def _attempt(s, lanes, active, approach: _Approach, u, target, h, rtol, atol) -> _Attempt:
-    zero = jnp.zeros_like(h)
-    empty = _Attempt(lanes.q, lanes.q, jnp.zeros_like(lanes.q), zero, zero, zero)
+def _next_step(h, step, error):
+    """The step after one of length `step` with this error, where h was allowed.
 
-    def work(a, here, out):
-        n = s.dims[a]
-        t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
-        tau = jnp.where(here, h, 0.0)
-        step = rk_step(chart_field(s, a, uu), t, q, tau)
-        size = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
-        error = jnp.max(jnp.abs(step.error) / (atol + rtol * size), axis=0, initial=0.0)
-        finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
-        error = jnp.where(finite, error, jnp.inf)
-        middle = 0.5 * (q + step.q) + 0.125 * tau * (step.f0 - step.f1)
-        end = Settled(zero, step.q, zero)
-        if watched(s, a, target):
-            which = jnp.where(here & approach.on, approach.which, -1)
-            index = only(here, target.index)
-            end = jax.lax.cond(
-                (which >= 0).any(),
-                lambda: settle(s, a, target, t + tau, step.q, uu, index, which),
-                lambda: end,
-            )
-        return _Attempt(
-            out.q.at[:n].set(jnp.where(here, end.q, out.q[:n])),
-            out.middle.at[:n].set(jnp.where(here, middle, out.middle[:n])),
-            out.f.at[:n].set(jnp.where(here, step.f1, out.f[:n])),
-            jnp.where(here, error, out.error),
-            jnp.where(here, end.past, out.past),
-            jnp.where(here, end.first, out.first),
-        )
-
-    return for_each_chart(s, lanes.chart, active, work, empty)
-
-
-def _no_approach(L: int) -> _Approach:
-    none = jnp.zeros(L, jnp.int32)
-    zero = jnp.zeros(L)
-    return _Approach(jnp.zeros(L, bool), none, zero, zero, zero, none)
-
-
-def _bends(s, lanes, seen: Watch, end: Watch, attempt, u, target, mask, step):
-    """Whether some watched function is not resolved by its cubic interpolant over the step.
-
-    Step control looks at the states only; where those are simple, a guard may still turn many
-    times within a step.
+    The estimate is of order 7; three square roots are cheaper than that power, and nearly it.
     """
-    t = lanes.t + 0.5 * step
-    true = watch(s, t, lanes.chart, attempt.middle, u, target, mask, attempt.f).value
-    cubic = 0.5 * (seen.value + end.value) + 0.125 * step * (seen.rate - end.rate)
-    size = jnp.abs(seen.value) + jnp.abs(end.value) + jnp.abs(true)
-    return (jnp.abs(true - cubic) > _BEND * size).any(axis=0)
+    factor = jnp.clip(0.9 / jnp.sqrt(jnp.sqrt(jnp.sqrt(error))), 0.2, 3.0)
+    factor = jnp.where(jnp.isfinite(error), factor, 0.1)
+    return jnp.where((step < h) & (error <= 1), jnp.maximum(h, step * factor), step * factor)
 
 
 def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):
@@ -339,29 +355,17 @@ def _merge(mask, new: Watch, old: Watch) -> Watch:
     return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
 
 
-def _row(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
-    return jnp.take_along_axis(x, which[None], axis=0)[0]
+def _has_schedules(s: Structure) -> bool:
+    return any(isinstance(tr.guard, Scheduled) for tr in s.transitions)
 
 
 def _expected(order, events, fired):
     """Whether the next event of each lane is the one that the limit cycle has."""
     if order is None:
         return jnp.ones(fired.shape, bool)
-    if order.shape[0] == 0:
+    if not order:
         return jnp.zeros(fired.shape, bool)
-    return order[events % order.shape[0]] == fired
-
-
-def _blank_tape(rows: int, lanes: Lanes) -> Tape:
-    d, L = lanes.q.shape
-    return Tape(
-        jnp.zeros((rows, L)),
-        jnp.full((rows, L), IDLE, jnp.int32),
-        jnp.zeros((rows, L)),
-        jnp.zeros((rows, d, L)),
-        jnp.zeros((rows, d, L)),
-        jnp.zeros((rows, L), jnp.int32),
-    )
+    return jnp.array(order)[events % len(order)] == fired
 
 
 def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol):

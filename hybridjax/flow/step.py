@@ -8,14 +8,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .tableau import VERNER76
 
 
 LaneField = Callable[[jax.Array, jax.Array], jax.Array]
+
+_ROWS = ((), *(row.tolist() for row in VERNER76.a_lower))
+_NODES = (0.0, *VERNER76.c.tolist())
 
 
 class Step(NamedTuple):
@@ -35,26 +36,34 @@ def rk_step(
     field: LaneField, t: Float[Array, " L"], q: Float[Array, "n L"], h: Float[Array, " L"]
 ) -> Step:
     """One step of Verner's 7(6) pair from (t, q) over h."""
-    n = VERNER76.num_stages
-    A = np.zeros((n, n))
-    for k, row in enumerate(VERNER76.a_lower):
-        A[k + 1, : k + 1] = row
-    C = np.concatenate([[0.0], VERNER76.c])
-
-    def stage(K, xs):
-        row, c, k = xs
-        point = q + h * jnp.tensordot(row, K, 1)
-        return K.at[k].set(field(t + c * h, point)), None
-
-    K, _ = jax.lax.scan(stage, jnp.zeros((n, *q.shape)), (A, C, np.arange(n)))
-    end = q + h * jnp.tensordot(VERNER76.b_sol, K, 1)
-    error = h * jnp.tensordot(VERNER76.b_error, K, 1)
-    return Step(end, K[0], field(t + h, end), error)
+    K: list[jax.Array] = []
+    for row, c in zip(_ROWS, _NODES, strict=True):
+        K.append(field(t + c * h, q + h * _combine(row, K)))
+    end = q + h * _combine(VERNER76.b_sol.tolist(), K)
+    return Step(end, K[0], field(t + h, end), h * _combine(VERNER76.b_error.tolist(), K))
 
 
-def midpoint_step(
-    field: LaneField, t: Float[Array, " L"], q: Float[Array, "n L"], h: Float[Array, " L"]
-) -> Float[Array, "n L"]:
-    """A very short step, with an error of order h^3: derivatives at h = 0 are right to order 2."""
+def _combine(weights, K):
+    """Sum of weights times stages. Written out, it is compiled into one loop with the stage."""
+    return sum((w * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0)
+
+
+def short_step(
+    field: LaneField,
+    t: Float[Array, " L"],
+    q: Float[Array, "n L"],
+    f: Float[Array, "n L"],
+    h: Float[Array, " L"],
+) -> tuple[Float[Array, "n L"], Float[Array, "n L"]]:
+    """A short step of the classical method of order 4, given the field f at its start.
+
+    Its derivatives at h = 0 are right to order 4.
+
+    **Returns:** the state at t + h, and its distance from the midpoint rule's, of order h^3.
+    """
     half = 0.5 * h
-    return q + h * field(t + half, q + half * field(t, q))
+    k2 = field(t + half, q + half * f)
+    k3 = field(t + half, q + half * k2)
+    k4 = field(t + h, q + h * k3)
+    slope = (f + 2 * k2 + 2 * k3 + k4) / 6
+    return q + h * slope, h * (slope - k2)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.lanewise import PerLane
 from .._core.results import Result
 from ..systems.structure import Structure
 
@@ -37,12 +38,10 @@ class Target(eqx.Module):
     """End right after the transition of this index; -1 for none."""
     limit: Float[Array, " L"]
     """Give up at this time."""
-    hint: Float[Array, " L"]
-    """Expected duration, a first guess of the step; infinity for none."""
-    order: Int[Array, " E"] | None
+    order: tuple[int, ...] | None = eqx.field(static=True)
     """Transitions expected on one turn of the limit cycle, counted from the first event after
     the start; `None` if any order will do."""
-    levels: AbstractLevels | None
+    levels: AbstractLevels | PerLane | None
     missed: Result = eqx.field(static=True)
     """The code of a lane that does not arrive."""
 
@@ -62,7 +61,6 @@ def toward(
         jnp.full(L, index, jnp.int32),
         jnp.full(L, event, jnp.int32),
         jnp.where(jnp.isfinite(time), later, limit),
-        jnp.full(L, jnp.inf),
         None,
         None,
         Result.SECTION_MISSED,

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.lanewise import shared
 from ..systems.structure import Structure
-from .lanes import by_lane, for_each_chart, only
-from .step import LaneField, midpoint_step
+from .lanes import for_each_chart, only
+from .step import LaneField, short_step
 from .target import Target
 
 
@@ -23,7 +24,8 @@ class Watch(NamedTuple):
 
 def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
     """Field of chart a over lanes."""
-    return lambda t, q: by_lane(lambda t, q, u: s.field(a, t, q, u))(t, q, u)
+    field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u))
+    return lambda t, q: field(t, q, u)
 
 
 def slopes(s: Structure, t, chart, q, u) -> Float[Array, "d L"]:
@@ -37,27 +39,24 @@ def slopes(s: Structure, t, chart, q, u) -> Float[Array, "d L"]:
     return for_each_chart(s, chart, jnp.ones(t.shape, bool), work, jnp.zeros_like(q))
 
 
-def watched(s: Structure, a: int, target: Target):
-    """The watched functions of chart a: pairs (row, function(t, q, u, index))."""
-    functions = [(g, lambda t, q, u, i, g=g: s.guard(g, t, q, u)) for g in s.guards(a)]
-    if target.levels is not None and target.levels.present(s, a):
-        levels = target.levels
-        functions.append((len(s.transitions), lambda t, q, u, i: levels.level(s, a, i, t, q)))
-    return functions
+def watched(s: Structure, a: int, target: Target) -> list[int]:
+    """Rows of the watched functions of chart a: its guards, and the target's level."""
+    level = target.levels is not None and shared(target.levels).present(s, a)
+    return s.guards(a) + [len(s.transitions)] * level
 
 
-def values(s: Structure, a: int, target: Target, t, q, u, index, f):
-    """Rows, values and rates of chart a's watched functions over lanes; f is the field there."""
-    functions = watched(s, a, target)
+def values(s: Structure, a: int, target: Target, t, q, u, index, f) -> Watch:
+    """Chart a's watched functions over lanes, in the order of `watched`; f is the field there."""
 
-    def one(t, q, u, i, f):
+    def one(s, levels, t, q, u, i, f):
         def all_of_them(t, q):
-            return jnp.stack([function(t, q, u, i) for _, function in functions])
+            guards = [s.guard(g, t, q, u) for g in s.guards(a)]
+            level = len(watched(s, a, target)) > len(guards)
+            return jnp.stack(guards + ([levels.level(s, a, i, t, q)] if level else []))
 
         return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
 
-    value, rate = by_lane(one)(t, q, u, index, f)
-    return jnp.array([row for row, _ in functions]), value, rate
+    return Watch(*s.by_lane(one, target.levels)(t, q, u, index, f))
 
 
 def watch(
@@ -68,55 +67,79 @@ def watch(
     u: Float[Array, "nu L"],
     target: Target,
     mask: Bool[Array, " L"],
-    f: Float[Array, "d L"] | None = None,
 ) -> Watch:
-    """All watched functions at the lanes of `mask`. Without the field f, it is computed."""
-    shape = (len(s.transitions) + 1, t.shape[0])
-    nothing = Watch(jnp.ones(shape), jnp.zeros(shape))
+    """All watched functions at the lanes of `mask`."""
 
     def work(a, here, out):
-        if not watched(s, a, target):
+        rows = watched(s, a, target)
+        if not rows:
             return out
         n = s.dims[a]
         point = only(here, t), only(here, q[:n])
         uu, index = only(here, u), only(here, target.index)
-        slope = chart_field(s, a, uu)(*point) if f is None else only(here, f[:n])
-        rows, value, rate = values(s, a, target, *point, uu, index, slope)
-        return Watch(
-            out.value.at[rows].set(jnp.where(here, value, out.value[rows])),
-            out.rate.at[rows].set(jnp.where(here, rate, out.rate[rows])),
-        )
+        f = chart_field(s, a, uu)(*point)
+        return write(out, rows, here, values(s, a, target, *point, uu, index, f))
 
-    return for_each_chart(s, chart, mask, work, nothing)
+    return for_each_chart(s, chart, mask, work, nothing(s, t.shape[0]))
+
+
+def nothing(s: Structure, L: int) -> Watch:
+    """A `Watch` whose rows mean nothing."""
+    shape = (len(s.transitions) + 1, L)
+    return Watch(jnp.ones(shape), jnp.zeros(shape))
+
+
+def take(seen: Watch, rows: list[int]) -> Watch:
+    """Some rows of a `Watch`."""
+    return Watch(*(jnp.stack([x[row] for row in rows]) for x in seen))
+
+
+def write(out: Watch, rows: list[int], here: Bool[Array, " L"], new: Watch) -> Watch:
+    """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
+    place = {row: k for k, row in enumerate(rows)}
+    return Watch(
+        *(
+            jnp.stack(
+                [jnp.where(here, y[place[r]], x[r]) if r in place else x[r] for r in range(len(x))]
+            )
+            for x, y in zip(out, new, strict=True)
+        )
+    )
 
 
 class Settled(NamedTuple):
     """Lanes moved onto the zero of the function that they cross."""
 
     past: Float[Array, " L"]
-    """Time from the end of the step to the zero."""
+    """Time from the start to the zero."""
     q: Float[Array, "n L"]
-    first: Float[Array, " L"]
-    """The first of the two corrections that `past` is made of."""
+    f: Float[Array, "n L"]
+    """The field there."""
+    last: Float[Array, " L"]
+    """The part of `past` that the second of two corrections added."""
+    error: Float[Array, "n L"]
+    """A bound on the error of the first correction: the distance between two methods."""
 
 
-def settle(s: Structure, a: int, target: Target, t, q, u, index, which) -> Settled:
-    """Two Newton steps onto the zero of watched function `which` (-1: stay), in chart a.
+def settle(s: Structure, a: int, target: Target, t, q, f, u, index, which, first=None) -> Settled:
+    """Two corrections onto the zero of watched function `which` (-1: stay), in chart a.
 
-    From the crossing itself (up to rounding) they change nothing, but carry the derivatives of
-    the crossing's time and state exactly, to second order: this is the saltation formula.
+    f is the field at (t, q). The first correction is a short step of known length, or if `first`
+    is not given, of Newton's; the second is a Newton step. From the crossing itself (up to
+    rounding) they change nothing, but carry the derivatives of the crossing's time and state
+    exactly, to second order: this is the saltation formula.
     """
     field = chart_field(s, a, u)
+    chosen = jnp.array(watched(s, a, target))[:, None] == which
 
-    def correction(t, q):
-        f = field(t, q)
-        rows, value, rate = values(s, a, target, t, q, u, index, f)
-        chosen = rows[:, None] == which
+    def newton(t, q, f):
+        value, rate = values(s, a, target, t, q, u, index, f)
         value = jnp.sum(jnp.where(chosen, value, 0.0), axis=0)
         rate = jnp.sum(jnp.where(chosen, rate, 0.0), axis=0)
-        return -value / jnp.where(rate == 0, 1.0, rate), f
+        return -value / jnp.where(rate == 0, 1.0, rate)
 
-    first, _ = correction(t, q)
-    q = midpoint_step(field, t, q, first)
-    second, f = correction(t + first, q)
-    return Settled(first + second, q + second * f, first)
+    first = newton(t, q, f) if first is None else first
+    q, error = short_step(field, t, q, f, first)
+    f = field(t + first, q)
+    last = newton(t + first, q, f)
+    return Settled(first + last, q + last * f, f, last, error)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from ..flow.lanes import Lanes
 from ..flow.move import Moved, Settings, follow, record
-from ..flow.search import Tape
+from ..flow.tape import Tape
 from ..flow.target import Target
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem

@@ -9,9 +9,10 @@ import numpy as np
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
+from .._core.lanewise import by_lane
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..flow.lanes import by_lane, for_each_chart, only
+from ..flow.lanes import for_each_chart, only
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Structure

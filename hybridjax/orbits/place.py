@@ -10,9 +10,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
+from .._core.lanewise import by_lane
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..flow.lanes import Lanes, by_lane, only
+from ..flow.lanes import Lanes, only
 from ..flow.move import Settings, move
 from ..flow.sections import AbstractSections, Bound, Crossing, ListLevels, as_sections
 from ..flow.target import Target
@@ -94,7 +95,6 @@ class PlacedSections(eqx.Module):
             i,
             self.bound.event[i],
             jnp.maximum(arrival, t) + 0.5 * self.cycle.period,
-            jnp.full(t.shape, jnp.inf),
             None,
             self.bound.levels,
             Result.SECTION_MISSED,
@@ -164,7 +164,7 @@ def find_on_cycle(cycle: LimitCycle, crossing: Crossing) -> tuple[Lanes, Array]:
     start = cycle.start
     one = jnp.zeros(1, jnp.int32)
     target = Target(
-        jnp.full(1, jnp.inf), one, one - 1, start.t + 1.5 * cycle.period, jnp.full(1, jnp.inf),
+        jnp.full(1, jnp.inf), one, one - 1, start.t + 1.5 * cycle.period,
         None, ListLevels((crossing,)), Result.SECTION_MISSED,
     )  # fmt: skip
     settings = dataclasses.replace(
@@ -200,7 +200,6 @@ def _place(
             i[None],
             bound.event[i][None],
             lanes.t + 1.5 * period,
-            jnp.full(1, jnp.inf),
             None,
             bound.levels,
             Result.SECTION_MISSED,
@@ -358,7 +357,7 @@ def _levels_along(placed: PlacedSections, t, chart, q):
 
     def one(i):
         target = Target(
-            far, jnp.full(p, i), jnp.full(p, -1), far, far, None, placed.bound.levels, Result.OK
+            far, jnp.full(p, i), jnp.full(p, -1), far, None, placed.bound.levels, Result.OK
         )
         seen = watch(s, t, chart, q.T, zeros, target, jnp.ones(p, bool))
         return seen.value[-1], jnp.max(jnp.abs(seen.rate[-1]))

@@ -189,8 +189,8 @@ def _across(s: Structure, legs: Lanes, factors):
 def _per_lane(targets):
     """Mark the leaves of a `Target` that have one entry per lane."""
     marks = jax.tree_util.tree_map(lambda _: False, targets)
-    fields = lambda x: (x.time, x.index, x.event, x.limit, x.hint)  # noqa: E731
-    return eqx.tree_at(fields, marks, (True,) * 5)
+    fields = lambda x: (x.time, x.index, x.event, x.limit)  # noqa: E731
+    return eqx.tree_at(fields, marks, (True,) * 4)
 
 
 def _leg_targets(s: Structure, t0, base, expected) -> Target:

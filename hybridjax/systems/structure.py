@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.errors import DefinitionError
+from .._core.lanewise import PerLane, by_lane, shared
 from .._core.tracing import is_traced
 from .chart import Chart
 from .output import Output
@@ -30,8 +31,9 @@ def as_vector(value: Any) -> jax.Array:
 class Structure:
     """Charts and transitions of `system` by index. Built anew inside every trace: it is cheap."""
 
-    def __init__(self, system: HybridSystem):
-        self.system = system
+    def __init__(self, system: HybridSystem | PerLane):
+        self.source = system
+        self.system = system = shared(system)
         self.drive = system.drive if isinstance(system, Driven) else None
         self.charts: list[Chart] = list(system.charts().values())
         self.names: tuple[str, ...] = tuple(system.charts())
@@ -39,6 +41,15 @@ class Structure:
         self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
         self.d = max(self.dims)
         self.nu = len(system.inputs)
+
+    def by_lane(self, function: Callable, *trees: Any) -> Callable:
+        """Vectorise `function(structure, *trees, *arguments)` over the lanes on the last axis of
+        `arguments`. Lanes may have parameters of their own (see `PerLane`)."""
+        if not isinstance(self.source, PerLane):
+            return by_lane(lambda *rest: function(self, *rest), *trees)
+        return by_lane(
+            lambda system, *rest: function(Structure(system), *rest), self.source, *trees
+        )
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:

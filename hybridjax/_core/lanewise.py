@@ -1,0 +1,56 @@
+"""Functions of single states, brought to many lanes at once.
+
+Lanes stand on the last axis of an array. What all lanes share (a system's parameters, say) is
+passed as it is; where each lane has its own, it is marked by `PerLane`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from .elementary import vectorised
+
+
+# From this number of lanes on, trigonometric functions are computed for several at once.
+_MANY = 8
+
+
+class PerLane(eqx.Module):
+    """A pytree, some of whose arrays have one entry for each lane, on their last axis."""
+
+    tree: Any
+    own: tuple[bool, ...] = eqx.field(static=True)
+    """Which of the tree's arrays, in the order of its leaves."""
+
+    def axes(self) -> Any:
+        """Where the lanes are, in the form that `jax.vmap` takes: -1 or None for each array."""
+        arrays = eqx.filter(self.tree, eqx.is_array)
+        structure = jax.tree_util.tree_structure(arrays)
+        return structure.unflatten([-1 if own else None for own in self.own])
+
+
+def shared(tree: Any) -> Any:
+    """The tree itself, of what may be marked as `PerLane`."""
+    return tree.tree if isinstance(tree, PerLane) else tree
+
+
+def by_lane(function: Callable, *trees: Any) -> Callable:
+    """Vectorise `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
+
+    Of a tree that is a `PerLane`, each lane gets its own part.
+    """
+    arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
+    axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
+
+    def one(arrays, *arguments):
+        return function(*eqx.combine(arrays, rest), *arguments)
+
+    def call(*arguments):
+        in_axes = (axes, *[-1] * len(arguments))
+        many = arguments[0].shape[-1] >= _MANY
+        work = vectorised(one) if many else one
+        return jax.vmap(work, in_axes=in_axes, out_axes=-1)(arrays, *arguments)
+
+    return call

@@ -1,0 +1,109 @@
+"""The response of a hybrid system around its limit cycle to inputs: many experiments, compiled."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._core.results import Result, update_result
+from ..flow.lanes import Lanes, for_each_chart, only
+from ..flow.move import Settings, move
+from ..orbits.place import PlacedSections
+from ..orbits.plan import Plan
+from ..systems.output import Output
+from ..systems.structure import Outputs, Structure
+
+
+class Response(NamedTuple):
+    """What becomes of S experiments of n samples."""
+
+    y: Float[Array, "S n ny"]
+    """Outputs at the sections, before the new input acts; NaN after a failure."""
+    result: Int[Array, " S"]
+    failed_at: Int[Array, " S"]
+    """The sample at which an experiment failed, or -1."""
+    error: Float[Array, " S"]
+    """Estimate of the largest error of (t, q) at any section, relative to the states' scales."""
+
+
+def respond(
+    placed: PlacedSections,
+    plan: Plan,
+    start: Float[Array, "1+d S"],
+    u: Float[Array, "S n nu"],
+    outputs: Sequence[str | Output],
+    settings: Settings,
+) -> Response:
+    """Flow S experiments from section 0 through n sections under inputs held between them.
+
+    `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse
+    mode stores the states at the sections, and computes what lies between them again.
+    """
+    system, cycle = placed.cycle.system, placed.cycle
+    s = Structure(system)
+    z = s.resolve_outputs(outputs)
+    N, (S, n, _) = placed.count, u.shape
+    one_turn = len(cycle.order)
+    first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
+    lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
+    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
+
+    @jax.checkpoint
+    def section(carry, xs):
+        lanes, result, failed_at, sums = carry
+        k, u = xs
+        i, j = k % N, (k + 1) % N
+        y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
+        turns = (j == 0).astype(jnp.int32)
+        target = placed.target(jnp.full(S, j), lanes.t, jnp.full(S, turns))
+        target = dataclasses.replace(target, order=cycle.order)
+        moved = move(system, lanes, u, target, settings, plan.stride(i, S), result)
+        # An event may change places with a section, but none may be left out or come in addition.
+        due = placed.lanes.events[j] + turns * one_turn
+        wrong = jnp.abs(moved.lanes.events - due) > 1
+        result = update_result(moved.result, wrong, Result.EVENT_ORDER)
+        # Times and events are counted within one turn, so that every turn is computed alike.
+        lanes = eqx.tree_at(
+            lambda x: (x.t, x.events),
+            moved.lanes,
+            (moved.lanes.t - turns * cycle.period, moved.lanes.events - turns * one_turn),
+        )
+        failed_at = jnp.where((failed_at < 0) & (result != Result.OK), k, failed_at)
+        share = jax.lax.stop_gradient(moved.error) / plan.estimate[i] * plan.impact[i]
+        sums = _add_up(sums, jnp.where(result == Result.OK, share, 0.0), turns)
+        return (lanes, result, failed_at, sums), y
+
+    begin = (lanes, jnp.zeros(S, jnp.int32), jnp.full(S, -1), jnp.zeros((2, S)))
+    xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
+    (_, result, failed_at, sums), y = jax.lax.scan(section, begin, xs)
+    error = jnp.maximum(sums[0], sums[1]) + ROUNDING
+    return Response(jnp.transpose(y, (2, 0, 1)), result, failed_at, error)
+
+
+# Error that rounding alone may leave, relative to the states' scales.
+ROUNDING = 1e-13
+
+
+def _add_up(sums, share, turns):
+    """The sum of error shares over this turn, and the largest such sum of any turn before."""
+    this, worst = sums[0] + share, sums[1]
+    return jnp.stack(
+        [jnp.where(turns == 1, 0.0, this), jnp.where(turns == 1, jnp.maximum(worst, this), worst)]
+    )
+
+
+def observe(s: Structure, z: Outputs, lanes: Lanes, u) -> Float[Array, "ny L"]:
+    """Outputs of every lane, NaN where its chart does not define them."""
+    L = lanes.t.shape[0]
+
+    def work(a, here, out):
+        point = only(here, lanes.t), only(here, lanes.q[: s.dims[a]]), only(here, u)
+        values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
+        return jnp.where(here, values, out)
+
+    nothing = jnp.full((len(z.names), L), jnp.nan)
+    return for_each_chart(s, lanes.chart, jnp.ones(L, bool), work, nothing)

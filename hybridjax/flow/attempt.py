@@ -1,0 +1,176 @@
+"""One step of every lane, before it is accepted: where it leads, and how far it can be trusted."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..systems.structure import Structure
+from .hermite import NEAR, control_points, root_near_end
+from .lanes import Lanes, for_each_chart, only
+from .step import Step, rk_step
+from .target import Target
+from .watch import Watch, chart_field, nothing, settle, take, values, watched, write
+
+
+# A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
+_SLOW = 1e-5
+# A step is too long for a watched function if halfway its cubic interpolant misses it by more than
+# this fraction of its size.
+_BEND = 2e-3
+# A lane lands if its crossing is nearer to the end of the step than this fraction of its length,
+_SHORT = 0.25
+# and if the last correction is at most this fraction of it.
+_FINE = 1e-6
+
+
+class Aim(NamedTuple):
+    """What lanes go for."""
+
+    which: Int[Array, " L"]
+    """The watched function on whose zero they mean to land; -1 for none."""
+    step: Float[Array, " L"]
+    """How far they go."""
+    reach: Float[Array, " L"]
+    """Length of the step in which that zero is thought to be."""
+
+
+class Attempt(NamedTuple):
+    """A step of every lane."""
+
+    q: Float[Array, "d L"]
+    """The state at its end: on the zero that the lane aims at, if it lands."""
+    seen: Watch
+    """The watched functions there."""
+    error: Float[Array, " L"]
+    """Estimate of the step's error, relative to the tolerance."""
+    past: Float[Array, " L"]
+    """Time from the end of the step aimed for to the zero, as far as is known."""
+    lands: Bool[Array, " L"]
+    slow: Bool[Array, " L"]
+    """The zero is crossed at a vanishing speed."""
+    bent: Bool[Array, " L"]
+    """A watched function is not resolved by its cubic interpolant over the step.
+
+    Step control looks at the states only; where those are simple, a guard may still turn many
+    times within a step."""
+    calm: Bool[Array, " L"]
+    """No watched function comes near to a zero, save the one that the lane lands on."""
+
+
+class _Home(NamedTuple):
+    q: Array
+    f: Array
+    past: Array
+    lands: Array
+    rough: Array
+
+
+def attempt(
+    s: Structure,
+    lanes: Lanes,
+    seen: Watch,
+    ready: Bool[Array, "W L"],
+    mask: Bool[Array, " L"],
+    aim: Aim,
+    u: Float[Array, "nu L"],
+    target: Target,
+    rtol: Float[Array, "*#L"],
+    atol: Float[Array, "*#L"],
+    span: Float[Array, " L"],
+) -> Attempt:
+    """Let the lanes of `mask` step, and land those that come close to the zero they aim at."""
+    L = lanes.t.shape[0]
+    zero, no, yes = jnp.zeros(L), jnp.zeros(L, bool), jnp.ones(L, bool)
+    empty = Attempt(lanes.q, nothing(s, L), zero, zero, no, no, no, yes)
+
+    def work(a, here, out):
+        n = s.dims[a]
+        t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
+        tau = jnp.where(here, aim.step, 0.0)
+        some = here.any()
+        step = jax.lax.cond(
+            some, lambda: rk_step(chart_field(s, a, uu), t, q, tau), lambda: Step(q, q, q, q)
+        )
+        tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
+        error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
+        finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
+        error = jnp.where(finite, error, jnp.inf)
+        if not watched(s, a, target):
+            end = jnp.where(here, step.q, out.q[:n])
+            return out._replace(q=out.q.at[:n].set(end), error=jnp.where(here, error, out.error))
+
+        rows = watched(s, a, target)
+        before = take(seen, rows)
+        index, which = only(here, target.index), jnp.where(here, aim.which, -1)
+        go = t, uu, index, tau, aim.reach, span
+        home = jax.lax.cond(
+            (which >= 0).any(),
+            lambda: _go_home(s, a, target, rows, before, which, step, tolerance, *go),
+            lambda: _Home(step.q, step.f1, zero, no, zero),
+        )
+        moved = tau + jnp.where(home.lands, home.past, 0.0)
+        value, rate = jax.lax.cond(
+            some,
+            lambda: values(s, a, target, t + moved, home.q, uu, index, home.f),
+            lambda: before,
+        )
+        ends = before[0], value, moved * before[1], moved * rate
+
+        middle = 0.5 * (q + home.q) + 0.125 * moved * (step.f0 - home.f)
+        true, _ = values(s, a, target, t + 0.5 * moved, middle, uu, index, home.f)
+        cubic = 0.5 * (ends[0] + ends[1]) + 0.125 * (ends[2] - ends[3])
+        size = jnp.abs(ends[0]) + jnp.abs(ends[1]) + jnp.abs(true)
+        bent = (jnp.abs(true - cubic) > _BEND * size).any(axis=0)
+
+        points = control_points(*ends)
+        low = jnp.minimum(jnp.minimum(points[0], points[1]), jnp.minimum(points[2], points[3]))
+        high = jnp.maximum(jnp.maximum(points[0], points[1]), jnp.maximum(points[2], points[3]))
+        scale = jnp.maximum(jnp.abs(ends[0]), jnp.abs(ends[1]))
+        own = (jnp.array(rows)[:, None] == which) & home.lands
+        armed = jnp.stack([ready[row] for row in rows])
+        far = jnp.where(armed, low > NEAR * scale, high <= 0)
+        fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
+        slow = (own & (jnp.abs(ends[3]) < _SLOW * fastest)).any(axis=0)
+        return Attempt(
+            out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
+            write(out.seen, rows, here, Watch(value, rate)),
+            jnp.where(here, error + home.rough, out.error),
+            jnp.where(here, home.past, out.past),
+            jnp.where(here, home.lands, out.lands),
+            jnp.where(here, slow, out.slow),
+            jnp.where(here, bent, out.bent),
+            jnp.where(here, (far | own).all(axis=0) & ~bent & ~slow, out.calm),
+        )
+
+    return for_each_chart(s, lanes.chart, mask, work, empty)
+
+
+def _go_home(
+    s, a, target, rows, before, which, step: Step, tolerance, t, u, index, tau, reach, span
+) -> _Home:
+    """From the end of a step onto the zero of `which`, on either side of it."""
+    value, rate = values(s, a, target, t + tau, step.q, u, index, step.f1)
+    chosen = jnp.array(rows)[:, None] == which
+    ends = [
+        jnp.sum(jnp.where(chosen, x, 0.0), axis=0)
+        for x in (before[0], value, tau * before[1], tau * rate, rate)
+    ]
+    by_cubic = tau * (root_near_end(*ends[:4]) - 1)
+    by_newton = -ends[1] / jnp.where(ends[4] == 0, 1.0, ends[4])
+    first = jnp.where(tau > 1e-3 * reach, by_cubic, by_newton)
+    near = (which >= 0) & (jnp.abs(first) <= reach)
+    first = jnp.where(near, first, 0.0)
+    end = settle(s, a, target, t + tau, step.q, step.f1, u, index, which, first)
+    share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
+    rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
+    fine = jnp.abs(end.last) <= _FINE * reach + 1e-13 * span
+    lands = near & fine & (share <= _SHORT) & (jnp.abs(rough) <= 1.0)
+    return _Home(
+        jnp.where(lands, end.q, step.q),
+        jnp.where(lands, end.f, step.f1),
+        jnp.where(near, end.past, by_newton),
+        lands,
+        jnp.where(lands, jnp.abs(rough), 0.0),
+    )

@@ -1,0 +1,164 @@
+"""What the limit cycle teaches about the way from each section to the next.
+
+A plan serves prediction, step lengths and error estimates, not control flow: lanes that go another
+way than the cycle are integrated just as well, only perhaps in more steps.
+"""
+
+import dataclasses
+import functools as ft
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._core.compile import quick_jit
+from ..flow.move import Settings, move
+from ..flow.search import Stride
+from ..flow.watch import watch
+from ..systems.structure import Structure
+from .place import PATIENCE, PlacedSections
+
+
+# Numbers of steps that are tried for each section.
+_PIECES = (1, 2, 3, 4, 6, 8)
+# The reference, and the differences that give the sensitivities.
+_TIGHT, _NUDGE = 1e-13, 1e-6
+# Room for the way to a level, which takes longer in some lanes than on the cycle.
+_ROOM = 1.25
+# A step may have this many times its error estimate on the cycle, where the accuracy allows it.
+_SLACK = 10.0
+# Turns over which errors are followed; the rest is a geometric series.
+_TURNS = 8
+# Errors per section that are taken for granted, relative to the states' scales.
+_ROUNDING = 1e-15
+
+
+class Plan(eqx.Module):
+    """How to go from section k to the next, for k = 0..N-1.
+
+    **Fields:**
+
+    - `h`: first step; `lead`, `slack`: see `flow.search.Stride`.
+    - `estimate`: sum of the steps' embedded error estimates on the cycle, relative to the
+        tolerance.
+    - `impact`: the true error of such steps, relative to the states' scales: the largest that it
+        ever leads to at a later section, summed over all turns as if each made the same error.
+    """
+
+    h: Float[Array, " N"]
+    lead: Float[Array, " N"]
+    slack: Float[Array, " N"]
+    estimate: Float[Array, " N"]
+    impact: Float[Array, " N"]
+
+    def stride(self, k, lanes: int) -> Stride:
+        """How `lanes` lanes set out from section k."""
+        fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
+        return Stride(fill(self.h), fill(self.lead), fill(self.slack))
+
+
+@quick_jit
+def make_plan(
+    placed: PlacedSections,
+    settings: Settings,
+    accuracy: Float[Array, ""],
+    scale: Float[Array, "N n"],
+) -> Plan:
+    """Find the fewest steps between sections that keep the accuracy asked for.
+
+    All candidates, the reference and the perturbed flows are lanes of one call.
+
+    **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
+    """
+    N, n = scale.shape
+    K = len(_PIECES)
+    tight = dataclasses.replace(
+        settings,
+        rtol=jnp.asarray(_TIGHT),
+        atol=settings.atol * _TIGHT / settings.rtol,
+        max_steps=max(settings.max_steps, PATIENCE),
+    )
+    section = jnp.arange(N)
+    following = (section + 1) % N
+    turns = (following == 0).astype(jnp.int32)
+    lead = _lead(placed, following, turns)
+    by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
+    longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
+
+    # Lanes in blocks of N: K candidates, the reference, and one for each coordinate of (t, q).
+    many = K + 1 + n
+    lanes = jax.tree_util.tree_map(lambda x: jnp.tile(x, many), placed.lanes)
+    nudge = _NUDGE * scale.T[:, None, :] * jnp.eye(n)[:, :, None]
+    nudge = jnp.concatenate([jnp.zeros((n, K + 1, N)), nudge], axis=1).reshape(n, many * N)
+    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (lanes.t + nudge[0], lanes.q + nudge[1:]))
+    free = jnp.repeat(jnp.arange(many) < K, N)
+    divide = jnp.repeat(jnp.array([*_PIECES, *[2] * (1 + n)]), N)
+    start = Stride(
+        jnp.tile(longest, many) / divide, jnp.tile(lead, many), jnp.where(free, jnp.inf, 1.0)
+    )
+    target = placed.target(jnp.tile(following, many), lanes.t, jnp.tile(turns, many))
+    u = jnp.zeros((len(placed.cycle.system.inputs), many * N))
+    moved = move(placed.cycle.system, lanes, u, target, tight, start)
+    ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q]).reshape(n, many, N)
+    ends = jnp.where((moved.result == 0).reshape(many, N), ends, jnp.nan)
+
+    exact = ends[:, K]
+    J = jnp.transpose((ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1)) / scale[:, None, :]
+    J = J.at[:, :, 0].set(jnp.where(placed.time_is_state[:, None], J[:, :, 0], 0.0))
+    J = jnp.nan_to_num(J)
+    error = jnp.transpose(ends[:, :K] - exact[:, None], (1, 2, 0))
+    if not placed.cycle.clocked:
+        error = error.at[..., 0].set(0.0)
+    impact = jnp.maximum(_impact(J, error, scale), _ROUNDING)
+    estimate = moved.error.reshape(many, N)[:K] * (_TIGHT / settings.rtol)
+    estimate = jnp.maximum(estimate, 1e-6)
+
+    # The largest share of the accuracy for each section that keeps their sum.
+    shares = accuracy * 0.5 ** jnp.arange(0, 4 + N.bit_length())
+    best = jax.vmap(ft.partial(_fewest, impact))(shares)
+    total = jnp.sum(impact[best, section], axis=1)
+    k = jnp.where((total <= accuracy).any(), jnp.argmax(total <= accuracy), len(shares) - 1)
+    best, slack = best[k], jnp.clip(accuracy / total[k], 1e-6, _SLACK)
+    impact, estimate = impact[best, section], estimate[best, section]
+    return Plan(longest / jnp.array(_PIECES)[best], lead, slack * estimate, estimate, impact)
+
+
+def _fewest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
+    """The first candidate of each section whose impact is at most `share`, or the best one."""
+    enough = impact <= share
+    best = jnp.argmin(jnp.where(jnp.isnan(impact), jnp.inf, impact), axis=0)
+    return jnp.where(enough.any(axis=0), jnp.argmax(enough, axis=0), best)
+
+
+def _lead(placed: PlacedSections, following, turns):
+    """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
+    s, lanes = Structure(placed.cycle.system), placed.lanes
+    N = placed.count
+    target = placed.target(following, lanes.t, turns)
+    everywhere = jnp.ones(N, bool)
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)), target, everywhere)
+    value, rate = seen.value[-1], seen.rate[-1]
+    falls = (value > 0) & (rate < 0)
+    lead = placed.duration * jnp.where(falls, -rate / jnp.where(falls, value, 1.0), 0.0)
+    return jnp.where((lead > 0.3) & (lead < 3.0), lead, 1.0)
+
+
+def _impact(J, error, scale) -> Float[Array, "K N"]:
+    """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
+    N = scale.shape[0]
+
+    def follow(carry, m):
+        error, worst = carry
+        at = (jnp.arange(N) + 1 + m) % N
+        worst = jnp.maximum(worst, jnp.max(jnp.abs(error) / scale[at], axis=-1))
+        return (jnp.einsum("kij,ckj->cki", J[at], error), worst), None
+
+    def turn(error, _):
+        none = jnp.zeros(error.shape[:2])
+        (error, worst), _ = jax.lax.scan(follow, (error, none), jnp.arange(N))
+        return error, worst
+
+    _, worst = jax.lax.scan(turn, error, None, length=_TURNS)
+    ratio = jnp.clip(worst[-1] / jnp.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
+    return jnp.sum(worst, axis=0) + worst[-1] * ratio / (1 - ratio)
