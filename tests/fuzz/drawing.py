@@ -97,6 +97,18 @@ def wave(rng, size, rate) -> dict[str, Any]:
     return {"a": rng.uniform(*size), "w": rng.uniform(*rate), "p": rng.uniform(0.0, 2 * np.pi)}
 
 
+def beside(rng, x, sign: float) -> dict[str, Any]:
+    """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
+    gap, bend = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5), rng.normal(0.0, 3.0)
+    n, c = x["n"], x["c"]  # sign * (n.q + c + gap + bend * (n.q + c)^2)
+    return {
+        "n": sign * (1 + 2 * bend * c) * n,
+        "Q": sign * 2 * bend * np.outer(n, n),
+        "c": sign * (c + gap + bend * c**2),
+        "m": np.zeros(2),
+    }
+
+
 # Structures: a plan and a function that draws a system.
 
 
@@ -189,10 +201,11 @@ def ladder(rng) -> Sample:
 
 
 def fork(rng) -> Sample:
-    """Whichever guard comes first decides on the next chart, of dimension 3 or 2."""
+    """Whichever of two guards comes first, one close to the other, decides on the next chart."""
     charts = [swinging(rng, 2), swinging(rng, 3), swinging(rng, 2)]
-    ends = [(2, 3), (2, 2), (3, 2), (2, 2)]
-    return Sample(charts, [arrow(rng, *n) for n in ends], start(rng, 2))
+    arrows = [arrow(rng, *n, m=np.zeros(2)) for n in ((2, 3), (2, 2), (3, 2), (2, 2))]
+    arrows[1] |= beside(rng, arrows[0], -1.0)
+    return Sample(charts, arrows, start(rng, 2))
 
 
 def switch(rng) -> Sample:
@@ -238,15 +251,18 @@ def ellipse(rng) -> Sample:
 
 
 def crowd(rng) -> Sample:
-    """Five dimensions and four guards of all kinds."""
+    """Five dimensions and four guards of all kinds, in slow motion: many crossings in one step."""
+    chart = swinging(rng, 5, rate=(0.1, 0.5))
+    chart |= {"w": rng.uniform(0.05, 0.4), "S": 0.3 * chart["S"], "T": 0.3 * chart["T"]}
     curved = 0.3 * rng.normal(size=(5, 5))
     arrows = [
+        arrow(rng, 5, 5, m=np.zeros(2)),
+        arrow(rng, 5, 5, Q=curved + curved.T, **wave(rng, (0.0, 0.3), (1.0, 5.0))),
         arrow(rng, 5, 5),
-        arrow(rng, 5, 5, Q=curved + curved.T),
-        arrow(rng, 5, 5, **wave(rng, (0.1, 0.5), (1.0, 5.0))),
-        arrow(rng, 5, 5, spread=1.0),
+        arrow(rng, 5, 5, spread=1.0, **wave(rng, (0.1, 0.5), (1.0, 5.0))),
     ]
-    return Sample([swinging(rng, 5)], arrows, start(rng, 5))
+    arrows[2] |= beside(rng, arrows[0], 1.0)
+    return Sample([chart], arrows, start(rng, 5, limit=60.0))
 
 
 def tour(rng) -> Sample:
