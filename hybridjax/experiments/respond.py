@@ -33,12 +33,13 @@ class Response(NamedTuple):
 def respond(
     placed: PlacedSections,
     plan: Plan,
-    start: Float[Array, "1+d S"],
+    start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
     outputs: Sequence[str | Output],
     settings: Settings,
 ) -> Response:
-    """Flow S experiments from section 0 through n sections under inputs held between them.
+    """Flow S experiments from section 0 through n sections under inputs held between them, n a
+    multiple of N.
 
     `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse
     mode stores the states at the sections, and computes what lies between them again.
@@ -54,7 +55,7 @@ def respond(
 
     @jax.checkpoint
     def section(carry, xs):
-        lanes, result, failed_at, sums = carry
+        lanes, result = carry
         k, u = xs
         i, j = k % N, (k + 1) % N
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
@@ -72,28 +73,21 @@ def respond(
             moved.lanes,
             (moved.lanes.t - turns * cycle.period, moved.lanes.events - turns * one_turn),
         )
-        failed_at = jnp.where((failed_at < 0) & (result != Result.OK), k, failed_at)
-        share = jax.lax.stop_gradient(moved.error) / plan.estimate[i] * plan.impact[i]
-        sums = _add_up(sums, jnp.where(result == Result.OK, share, 0.0), turns)
-        return (lanes, result, failed_at, sums), y
+        share = jnp.where(result == Result.OK, moved.error * plan.weight[i], jnp.nan)
+        return (lanes, result), (y, jax.lax.stop_gradient(share))
 
-    begin = (lanes, jnp.zeros(S, jnp.int32), jnp.full(S, -1), jnp.zeros((2, S)))
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
-    (_, result, failed_at, sums), y = jax.lax.scan(section, begin, xs)
-    error = jnp.maximum(sums[0], sums[1]) + ROUNDING
+    begin = (lanes, jnp.zeros(S, jnp.int32))
+    (_, result), (y, shares) = jax.lax.scan(section, begin, xs)
+    failed = jnp.isnan(shares)
+    failed_at = jnp.where(failed.any(axis=0), jnp.argmax(failed, axis=0), -1)
+    turns = jnp.nan_to_num(shares).reshape(n // N, N, S)
+    error = ROUNDING + jnp.max(jnp.sum(turns, axis=1), axis=0)
     return Response(jnp.transpose(y, (2, 0, 1)), result, failed_at, error)
 
 
 # Error that rounding alone may leave, relative to the states' scales.
 ROUNDING = 1e-13
-
-
-def _add_up(sums, share, turns):
-    """The sum of error shares over this turn, and the largest such sum of any turn before."""
-    this, worst = sums[0] + share, sums[1]
-    return jnp.stack(
-        [jnp.where(turns == 1, 0.0, this), jnp.where(turns == 1, jnp.maximum(worst, this), worst)]
-    )
 
 
 def observe(s: Structure, z: Outputs, lanes: Lanes, u) -> Float[Array, "ny L"]:

@@ -15,13 +15,13 @@ from .watch import Watch, chart_field, nothing, settle, take, values, watched, w
 
 
 # A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
-_SLOW = 1e-5
+SLOW = 1e-5
 # A step is too long for a watched function if halfway its cubic interpolant misses it by more than
 # this fraction of its size.
 _BEND = 2e-3
 # A lane lands if its crossing is nearer to the end of the step than this fraction of its length,
 _SHORT = 0.25
-# and if the last correction is at most this fraction of it.
+# and if the last correction is at most this fraction of the way from the step's start.
 _FINE = 1e-6
 
 
@@ -79,6 +79,7 @@ def attempt(
     rtol: Float[Array, "*#L"],
     atol: Float[Array, "*#L"],
     span: Float[Array, " L"],
+    unroll: bool,
 ) -> Attempt:
     """Let the lanes of `mask` step, and land those that come close to the zero they aim at."""
     L = lanes.t.shape[0]
@@ -91,7 +92,9 @@ def attempt(
         tau = jnp.where(here, aim.step, 0.0)
         some = here.any()
         step = jax.lax.cond(
-            some, lambda: rk_step(chart_field(s, a, uu), t, q, tau), lambda: Step(q, q, q, q)
+            some,
+            lambda: rk_step(chart_field(s, a, uu), t, q, tau, unroll),
+            lambda: Step(q, q, q, q),
         )
         tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
@@ -132,7 +135,7 @@ def attempt(
         armed = jnp.stack([ready[row] for row in rows])
         far = jnp.where(armed, low > NEAR * scale, high <= 0)
         fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
-        slow = (own & (jnp.abs(ends[3]) < _SLOW * fastest)).any(axis=0)
+        slow = (own & (jnp.abs(ends[3]) < SLOW * fastest)).any(axis=0)
         return Attempt(
             out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
             write(out.seen, rows, here, Watch(value, rate)),
@@ -165,7 +168,7 @@ def _go_home(
     end = settle(s, a, target, t + tau, step.q, step.f1, u, index, which, first)
     share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
     rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
-    fine = jnp.abs(end.last) <= _FINE * reach + 1e-13 * span
+    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + 1e-14 * span
     lands = near & fine & (share <= _SHORT) & (jnp.abs(rough) <= 1.0)
     return _Home(
         jnp.where(lands, end.q, step.q),

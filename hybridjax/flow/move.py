@@ -61,10 +61,11 @@ def move(
     derivatives (first and second, through crossings too) with respect to everything that is a
     floating-point array: states, times, inputs, parameters, the target.
 
-    `setout` is the first step, or a `Stride`.
+    `setout` is the first step, or a `Stride`: then one step is thought to be enough for most.
     """
+    glide = isinstance(setout, Stride)
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings)
+    return _move(system, lanes, u, target, setout, result, settings, glide)
 
 
 def record(
@@ -79,7 +80,7 @@ def record(
     """As `move`, with a record of every step, and without derivatives."""
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     arguments = system, lanes, u, target, setout, result
-    found = _search(*(_constant(x) for x in arguments), settings, True)
+    found = _search(*(_constant(x) for x in arguments), settings, True, False)
     return _moved(found), found.tape
 
 
@@ -111,13 +112,13 @@ def _moved(found: Found) -> Moved:
 
 
 @eqx.filter_jit
-def _search(system, lanes, u, target, setout, result, settings, tape: bool) -> Found:
+def _search(system, lanes, u, target, setout, result, settings, tape: bool, glide: bool) -> Found:
     bare = dataclasses.replace(target, levels=None)
-    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, tape))
+    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, tape, glide))
     return run((system, target.levels, settings), (lanes, u, bare, setout, result))
 
 
-def _run(system, levels, settings, lanes, u, target, setout, result, tape) -> Found:
+def _run(system, levels, settings, lanes, u, target, setout, result, tape, glide) -> Found:
     settings = shared(settings)
     return search(
         Structure(system),
@@ -130,17 +131,18 @@ def _run(system, levels, settings, lanes, u, target, setout, result, tape) -> Fo
         atol=settings.atol,
         max_steps=settings.max_steps,
         tape=tape,
+        glide=glide,
     )
 
 
 @eqx.filter_custom_jvp
-def _move(system, lanes, u, target, setout, result, settings):
-    return _moved(_search(system, lanes, u, target, setout, result, settings, False))
+def _move(system, lanes, u, target, setout, result, settings, glide):
+    return _moved(_search(system, lanes, u, target, setout, result, settings, False, glide))
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
-    system, lanes, u, target, setout, result, settings = primals
+    system, lanes, u, target, setout, result, settings, _ = primals
     moved, tape = record(system, lanes, u, target, settings, setout, result)
 
     def ends(system, t, q, u, target):

@@ -19,6 +19,9 @@ from .target import Target
 from .watch import chart_field, settle, watched
 
 
+_BLOCK = 8
+
+
 def replay(
     s: Structure,
     lanes: Lanes,
@@ -46,7 +49,16 @@ def replay(
 
         return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
 
-    (t, q, _), _ = jax.lax.scan(row, (lanes.t, lanes.q, lanes.chart), (h, code))
+    def block(carry, rows):
+        follow = lambda carry: jax.lax.scan(row, carry, rows)[0]  # noqa: E731
+        return jax.lax.cond((rows[1] != IDLE).any(), follow, lambda carry: carry, carry), None
+
+    # Most tapes are empty but for their beginning: empty blocks of rows are skipped.
+    rows, L = h.shape
+    fill = ((0, -rows % _BLOCK), (0, 0))
+    h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
+    code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    (t, q, _), _ = jax.lax.scan(block, (lanes.t, lanes.q, lanes.chart), (h, code))
     return t, q
 
 

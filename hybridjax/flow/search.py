@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .attempt import Aim, Attempt, attempt
+from .attempt import SLOW, Aim, Attempt, attempt
 from .events import ZERO, apply_resets, enabled, keep_pace, next_schedule, rearm
 from .hermite import first_crossing
 from .lanes import Lanes, for_each_chart, only
@@ -71,6 +71,8 @@ class _Approach(NamedTuple):
     """Where the crossing is thought to be, as a time from where the lane is."""
     reach: Float[Array, " L"]
     """Length of the step in which it was seen."""
+    rate: Float[Array, " L"]
+    """The largest rate of that function at the ends of that step."""
     tries: Int[Array, " L"]
 
 
@@ -95,7 +97,7 @@ class _Way(NamedTuple):
     known: Array
     """The next known time."""
     schedule: Array
-    """The transition that is due then; -1 if the target ends there first."""
+    """The transition that is due at the end of this step; -1 for none."""
     last: Array
     """Whether this step ends there."""
 
@@ -112,10 +114,12 @@ def search(
     atol: Float[Array, "*#L"],
     max_steps: int,
     tape: bool,
+    glide: bool,
 ) -> Found:
     """Flow every lane to its target, or to a result code that says why not.
 
-    Lanes whose `result` is not OK at the start stay where they are.
+    Lanes whose `result` is not OK at the start stay where they are. With `glide`, one step of all
+    lanes is tried first: if it brings all of them home, nothing else is done.
     """
     L = lanes.t.shape[0]
     finite = jnp.isfinite(lanes.t) & jnp.isfinite(lanes.q).all(axis=0) & jnp.isfinite(u).all(axis=0)
@@ -127,7 +131,7 @@ def search(
         lanes,
         seen,
         _aims(seen, span),
-        _Approach(jnp.zeros(L, bool), none, jnp.zeros(L), jnp.zeros(L), none),
+        _Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
         stride.h,
         jnp.zeros(L),
         result,
@@ -139,29 +143,41 @@ def search(
     def active(state):
         return ~state.arrived & (state.result == Result.OK)
 
-    def cond(state):
-        return (state.i < max_steps) & active(state).any()
+    def attempted(state, unroll=False):
+        """An attempt in all active lanes, and which of them it leaves calm."""
+        aim, way = _take_aim(s, state, active(state), target, stride)
+        ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
+        here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
+        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll)
+        calm = new.calm & (new.error <= stride.slack) & ~state.approach.on & (way.schedule < 0)
+        calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
+        return calm, (state, active(state), aim, way, new, u, target, stride, span)
 
     def body(state):
-        return _iterate(s, state, active(state), u, target, stride, span, rtol, atol)
+        calm, arguments = attempted(state)
+        return jax.lax.cond(
+            (calm | ~active(state)).all(),
+            lambda: _calmly(*arguments),
+            lambda: _eventfully(s, *arguments),
+        )
 
-    state = jax.lax.while_loop(cond, body, state)
-    result = update_result(state.result, active(state), Result.STEP_LIMIT)
-    return Found(state.lanes, state.h, state.error, result, state.tape)
+    def all_the_way():
+        def going(state):
+            return (state.i < max_steps) & active(state).any()
 
+        end = jax.lax.while_loop(going, body, state)
+        result = update_result(end.result, active(end), Result.STEP_LIMIT)
+        return Found(end.lanes, end.h, end.error, result, end.tape)
 
-def _iterate(s, state: _State, active, u, target, stride: Stride, span, rtol, atol) -> _State:
-    aim, way = _take_aim(s, state, active, target, stride)
-    ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
-    new = attempt(s, state.lanes, state.seen, ready, active, aim, u, target, rtol, atol, span)
-    calm = new.calm & (new.error <= stride.slack) & ~state.approach.on
-    calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
-    if _has_schedules(s):
-        calm = calm & ~(way.last & (way.schedule >= 0))
-    arguments = (state, active, aim, way, new, u, target, stride, span)
-    return jax.lax.cond(
-        (calm | ~active).all(), lambda: _calmly(*arguments), lambda: _eventfully(s, *arguments)
-    )
+    def in_one_step(arguments):
+        end = _calmly(*arguments)
+        return Found(end.lanes, end.h, end.error, end.result, end.tape)
+
+    if not glide:
+        return all_the_way()
+    calm, arguments = attempted(state, unroll=True)
+    home = calm & (arguments[4].lands | arguments[3].last)
+    return jax.lax.cond((home | ~active(state)).all(), lambda: in_one_step(arguments), all_the_way)
 
 
 def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _Way]:
@@ -191,10 +207,10 @@ def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _W
     step = jnp.where(homing, nearest, step)
     which = jnp.where(homing, jnp.argmin(guess, axis=0).astype(jnp.int32), which)
     last = last & ~homing
+    last = last & active
     step = jnp.where(active, jnp.where(approach.on, approach.tau, step), 0.0)
-    return Aim(which, step, jnp.where(approach.on, approach.reach, step)), _Way(
-        known, schedule, last & active
-    )
+    reach = jnp.where(approach.on, approach.reach, step)
+    return Aim(which, step, reach), _Way(known, jnp.where(last, schedule, -1), last)
 
 
 def _calmly(state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span):
@@ -269,12 +285,13 @@ def _eventfully(
     ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
     guard = lands & (aim.which < G)
     fires = guard & enabled(s, t, new.q, u, aim.which)
-    by_clock = plain & way.last & (way.schedule >= 0)
+    by_clock = plain & (way.schedule >= 0)
     fired = jnp.where(fires, aim.which, jnp.where(by_clock, way.schedule, -1))
     level = lands & (aim.which == G)
     on_time = plain & way.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    slow = lands & new.slow
+    speed = jnp.abs(_row(end.rate, jnp.maximum(aim.which, 0)))
+    slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
     pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.order, lanes.events, fired)
     falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
@@ -291,11 +308,13 @@ def _eventfully(
     after, seen, aimed = _reset(s, after, seen, ready[-1], fired, u, target, together, span)
 
     # 4. The next step, and reasons to stop.
+    fastest = jnp.maximum(jnp.abs(_row(state.seen.rate, which)), jnp.abs(_row(end.rate, which)))
     approach = _Approach(
         crosses | closer,
         jnp.where(crosses, which, approach.which),
         jnp.where(crosses, first * moved, jnp.clip(tau, 0.0, approach.reach)),
         jnp.where(crosses, moved, approach.reach),
+        jnp.where(crosses, fastest, approach.rate),
         jnp.where(crosses, 0, approach.tries + 1),
     )
     adapted = _next_step(state.h, aim.step, new.error / stride.slack)
@@ -353,6 +372,10 @@ def _aims(seen: Watch, span):
 
 def _merge(mask, new: Watch, old: Watch) -> Watch:
     return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
+
+
+def _row(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
+    return jnp.take_along_axis(x, which[None], axis=0)[0]
 
 
 def _has_schedules(s: Structure) -> bool:

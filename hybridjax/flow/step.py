@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .tableau import VERNER76
@@ -15,8 +17,11 @@ from .tableau import VERNER76
 
 LaneField = Callable[[jax.Array, jax.Array], jax.Array]
 
-_ROWS = ((), *(row.tolist() for row in VERNER76.a_lower))
-_NODES = (0.0, *VERNER76.c.tolist())
+_STAGES = VERNER76.num_stages
+_A = np.zeros((_STAGES, _STAGES))
+for _k, _row in enumerate(VERNER76.a_lower):
+    _A[_k + 1, : _k + 1] = _row
+_C = np.concatenate([[0.0], VERNER76.c])
 
 
 class Step(NamedTuple):
@@ -33,19 +38,45 @@ class Step(NamedTuple):
 
 
 def rk_step(
-    field: LaneField, t: Float[Array, " L"], q: Float[Array, "n L"], h: Float[Array, " L"]
+    field: LaneField,
+    t: Float[Array, " L"],
+    q: Float[Array, "n L"],
+    h: Float[Array, " L"],
+    unroll: bool = False,
 ) -> Step:
-    """One step of Verner's 7(6) pair from (t, q) over h."""
+    """One step of Verner's 7(6) pair from (t, q) over h.
+
+    With `unroll`, the stages are written out: faster, and slower to compile.
+    """
+    stages = _written_out if unroll else _in_a_loop
+    K = stages(field, t, q, h)
+    if unroll:
+        end, error = (_combine(w, K) for w in (VERNER76.b_sol, VERNER76.b_error))
+    else:
+        end, error = (jnp.tensordot(w, K, 1) for w in (VERNER76.b_sol, VERNER76.b_error))
+    end = q + h * end
+    return Step(end, K[0], field(t + h, end), h * error)
+
+
+def _in_a_loop(field, t, q, h) -> Float[Array, "stages n L"]:
+    def stage(K, xs):
+        row, c, k = xs
+        return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
+
+    begin = jnp.zeros((_STAGES, *q.shape), q.dtype)
+    return jax.lax.scan(stage, begin, (_A, _C, np.arange(_STAGES)))[0]
+
+
+def _written_out(field, t, q, h) -> list[Float[Array, "n L"]]:
     K: list[jax.Array] = []
-    for row, c in zip(_ROWS, _NODES, strict=True):
+    for row, c in zip(_A, _C, strict=True):
         K.append(field(t + c * h, q + h * _combine(row, K)))
-    end = q + h * _combine(VERNER76.b_sol.tolist(), K)
-    return Step(end, K[0], field(t + h, end), h * _combine(VERNER76.b_error.tolist(), K))
+    return K
 
 
 def _combine(weights, K):
     """Sum of weights times stages. Written out, it is compiled into one loop with the stage."""
-    return sum((w * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0)
+    return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0)
 
 
 def short_step(

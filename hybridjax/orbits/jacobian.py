@@ -1,10 +1,13 @@
 """Jacobians of the flow between targets, for many lanes in one call."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..flow.batching import vmap_to_lanes
 from ..flow.lanes import Lanes
 from ..flow.move import Moved, Settings, follow, record
 from ..flow.tape import Tape
@@ -29,20 +32,44 @@ def flow_jacobian(
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
+    zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
+    moved, tape = record(system, lanes, zero, target, settings, h, result)
+    columns, end = _push(system, lanes, target, tape)
+    moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
+    return columns.transpose(2, 1, 0), moved, tape
+
+
+def _columns(system, lanes, target, tape):
+    """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
     s = Structure(system)
     L, d = lanes.t.shape[0], s.d
     n = 1 + d + s.nu
-    zero = jnp.zeros((s.nu, L))
-    moved, tape = record(system, lanes, zero, target, settings, h, result)
 
     def flow(x):
         start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
         t, q = follow(system, start, x[1 + d :], target, tape)
         return jnp.concatenate([t[None], q])
 
-    x = jnp.concatenate([lanes.t[None], lanes.q, zero])
+    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
     tangents = jnp.broadcast_to(jnp.eye(n)[:, :, None], (n, n, L))
     push = jax.vmap(lambda tangent: jax.jvp(flow, (x,), (tangent,)), out_axes=(None, 0))
     end, columns = push(tangents)
-    moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
-    return columns.transpose(2, 1, 0), moved, tape
+    return columns, end
+
+
+@eqx.filter_custom_jvp
+def _push(system, lanes, target, tape):
+    """`_columns`, with the axes that `jax.vmap` maps as more lanes."""
+    bare = dataclasses.replace(target, levels=None)
+
+    def run(common, lane):
+        system, levels = common
+        lanes, target, tape = lane
+        return _columns(system, lanes, dataclasses.replace(target, levels=levels), tape)
+
+    return vmap_to_lanes(run)((system, target.levels), (lanes, bare, tape))
+
+
+@_push.def_jvp
+def _push_jvp(primals, tangents):
+    return eqx.filter_jvp(_columns, primals, tangents)
