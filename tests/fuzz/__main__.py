@@ -5,7 +5,7 @@ import sys
 
 import hybridjax as hj
 
-from .campaign import Report, check, shares
+from .campaign import ACCURACY, Report, check, shares
 
 
 ROW = "{:10} {:>7} {:>8} {:>7} {:>8} {:>9.1e} {:>9.1e} {:>8} {:>7.1f} {:>7.1f}"
@@ -35,6 +35,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--systems", type=int, default=1000, help="how many, over all structures")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--accuracy", type=float, default=ACCURACY, help="tolerances of hybridjax")
     parser.add_argument("--only", help="one structure, or one system of it: dips or dips:17")
     arguments = parser.parse_args()
     hj.enable_x64()
@@ -46,7 +47,7 @@ def main() -> int:
     reports = []
     for name, numbers in jobs.items():
         if numbers:
-            reports.append(check(name, numbers, arguments.seed))
+            reports.append(check(name, numbers, arguments.seed, arguments.accuracy))
             print(line(reports[-1:], name), flush=True)
     print(line(reports, "all"))
     for r in reports:

@@ -26,7 +26,7 @@ EVENTS = 6
 TOLERANCE = 1e-8
 # ... and how far scipy at two tolerances may differ before a system counts as ill-conditioned.
 CONDITION = 1e-9
-# Accuracy of hybridjax, and the number of its steps.
+# Tolerances of hybridjax, and the number of its steps.
 ACCURACY, STEPS = 1e-12, 1000
 # Systems in one compiled call.
 BATCH = 21
@@ -62,7 +62,7 @@ def shares(systems: int) -> dict[str, range]:
     return {name: range(each + (k < more)) for k, name in enumerate(names)}
 
 
-def check(name: str, numbers, seed: int = 0) -> Report:
+def check(name: str, numbers, seed: int = 0, accuracy: float = ACCURACY) -> Report:
     """Compare systems `numbers` of a structure."""
     plan = STRUCTURES[name][0]
     report = Report(name, len(numbers))
@@ -71,7 +71,8 @@ def check(name: str, numbers, seed: int = 0) -> Report:
     truths = [truth(plan, sample) for sample in samples]
     report.scipy_seconds = time.perf_counter() - clock
     clock = time.perf_counter()
-    found = engine(plan, samples, [stop(run, s) for run, s in zip(truths, samples, strict=True)])
+    ends = [stop(run, sample) for run, sample in zip(truths, samples, strict=True)]
+    found = engine(plan, samples, ends, accuracy)
     report.engine_seconds = time.perf_counter() - clock
     for k, run, (result, trial) in zip(numbers, truths, found, strict=True):
         if run.excluded:
@@ -126,7 +127,9 @@ def difference(a: Run, b: Run, end: bool) -> tuple[float, float]:
     return max(times, default=0.0), max(states, default=0.0)
 
 
-def engine(plan: Plan, samples: list[Sample], ends: list[float]) -> list[tuple[hj.Result, Run]]:
+def engine(
+    plan: Plan, samples: list[Sample], ends: list[float], accuracy: float
+) -> list[tuple[hj.Result, Run]]:
     """Results and trajectories by hybridjax, up to the wanted number of events.
 
     The one place that knows how the flow is called.
@@ -137,7 +140,8 @@ def engine(plan: Plan, samples: list[Sample], ends: list[float]) -> list[tuple[h
         fill = piece + piece[-1:] * (BATCH - len(piece))
         stops = ends[k : k + BATCH] + ends[-1:] * (BATCH - len(piece))
         many = jax.tree_util.tree_map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill)
-        moved = jax.tree_util.tree_map(np.asarray, _flow(plan, many, jnp.asarray(stops)))
+        moved = _flow(plan, many, jnp.asarray(stops), jnp.asarray(accuracy))
+        moved = jax.tree_util.tree_map(np.asarray, moved)
         for i in range(len(piece)):
             result, count, events, t, chart, q = jax.tree_util.tree_map(lambda x, i=i: x[i], moved)
             events = [
@@ -150,14 +154,14 @@ def engine(plan: Plan, samples: list[Sample], ends: list[float]) -> list[tuple[h
 
 
 @quick_jit
-def _flow(plan: Plan, many: Sample, ends):
+def _flow(plan: Plan, many: Sample, ends, accuracy):
     def one(sample: Sample, end):
         system = Random(plan, sample.charts, sample.arrows)
         t, q, u, _ = sample.start
         # `start_lanes` arms guards at zero input, so here it gets a system that adds the input.
         s = Structure(Driven(system, lambda t: u))
         q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
-        settings = Settings(rtol=ACCURACY, atol=ACCURACY, max_steps=STEPS)
+        settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
         lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q, end - t)
         moved, tape = record(system, lanes, u[:, None], until(end[None]), settings)
         happens = tape.code[:, 0] >= 0

@@ -20,7 +20,7 @@ def agree(jobs):
 
 
 def test_random_systems():
-    agree({"dips": range(16), "hop": range(16), "tour": range(16)})
+    agree({"dips": range(16), "hop": range(16), "switch": range(16)})
 
 
 @pytest.mark.slow

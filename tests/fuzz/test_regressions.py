@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compile import quick_jit
 from hybridjax.flow.events import start_lanes
-from hybridjax.flow.move import Settings, move
+from hybridjax.flow.move import Settings, move, record
 from hybridjax.flow.target import until
 from hybridjax.systems.structure import Structure
 
 from ..toys import Field
+from .campaign import check
 
 
 class Threshold(hj.HybridSystem):
@@ -42,9 +44,33 @@ class Rounded(hj.HybridSystem):
         return (hj.Transition("fall", "line", "line", guard),)
 
 
+class Layer(hj.HybridSystem):
+    """A point on the unit circle; an event where it enters the layer |x - level| < width, and
+    perhaps one where x falls through `other`. Neither changes anything."""
+
+    level: jax.Array = hj.parameter()
+    width: jax.Array = hj.parameter()
+    other: jax.Array = hj.parameter()
+
+    def charts(self):
+        return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}
+
+    def transitions(self):
+        def layer(t, q, u):
+            return (q[0] - self.level) ** 2 - self.width**2
+
+        return (
+            hj.Transition("layer", "turn", "turn", layer),
+            hj.Transition("other", "turn", "turn", lambda t, q, u: q[0] - self.other),
+        )
+
+
 ZERO_INPUT = "guards are armed at zero input, not at the input of the trajectory"
 NEW_INPUT = "an input that changes between pieces of flow moves guards, but does not arm them anew"
 ROUNDING = "guards count as zero by their rate and the time span only, not by their rounding errors"
+LANDING = "after a landing that is exact to 1e-12 of the step only, a guard is armed again at once"
+DIPS = "on the way to another guard's crossing, a dip and a near miss are not looked at"
+RISING = "a landing may end on the zero where the guard rises again"
 
 
 @pytest.mark.xfail(strict=True, reason=ZERO_INPUT)
@@ -63,7 +89,11 @@ def two_pieces(x, first, second):
     """One second at one input, and one at another."""
     system = Threshold()
     lanes = start_lanes(
-        Structure(system), jnp.zeros(1), jnp.zeros(1, int), jnp.full((1, 1), x), jnp.asarray(1.0)
+        Structure(system),
+        jnp.zeros(1),
+        jnp.zeros(1, jnp.int32),
+        jnp.full((1, 1), x),
+        jnp.asarray(1.0),
     )
     h = None
     for end, u in ((1.0, first), (2.0, second)):
@@ -101,7 +131,50 @@ def across(x, time, duration):
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
     system = Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit)))
-    lanes = start_lanes(Structure(system), t, jnp.zeros(1, int), q, duration)
+    lanes = start_lanes(Structure(system), t, jnp.zeros(1, jnp.int32), q, duration)
     u = jnp.zeros((1, 1))
     moved = move(system, lanes, u, until(t + duration), Settings())
     return moved.result[0], moved.lanes.events[0]
+
+
+@pytest.fixture(scope="module")
+def layers():
+    """Levels and widths of 1200 layers."""
+    grid = jnp.meshgrid(jnp.linspace(-0.6, 0.6, 300), jnp.array([2e-3, 3e-3, 1e-2, 3e-2]))
+    return [x.ravel() for x in grid]
+
+
+@pytest.mark.xfail(strict=True, reason=LANDING)
+def test_a_thin_layer_is_entered_once(layers):
+    """The other guard is never met."""
+    result, events, times = around(*layers, layers[0] - 5.0)
+    np.testing.assert_array_equal(result, hj.Result.OK)
+    np.testing.assert_allclose(times, jnp.arccos(sum(layers)), atol=1e-9)
+    np.testing.assert_array_equal(events, 1)
+
+
+@pytest.mark.xfail(strict=True, reason=DIPS)
+def test_a_thin_layer_is_not_jumped_over_on_the_way_to_another_guard(layers):
+    result, _, times = around(*layers, layers[0] - 0.04)
+    np.testing.assert_array_equal(result, hj.Result.OK)
+    np.testing.assert_allclose(times, jnp.arccos(sum(layers)), atol=1e-9)
+
+
+@pytest.mark.xfail(strict=True, reason=RISING)
+def test_an_event_is_where_its_guard_falls():
+    assert not check("dips", [28], seed=5, accuracy=1e-10).failures
+
+
+@quick_jit
+def around(level, width, other):
+    """Results, numbers of events, and times of the first, on half a turn at the usual accuracy."""
+
+    def one(*numbers):
+        system, t, q = Layer(*numbers), jnp.zeros(1), jnp.array([[1.0], [0.0]])
+        span = jnp.asarray(2.9)
+        lanes = start_lanes(Structure(system), t, jnp.zeros(1, jnp.int32), q, span)
+        moved, tape = record(system, lanes, jnp.zeros((1, 1)), until(t + span), Settings())
+        first = jnp.argmax(tape.code[:, 0] >= 0)
+        return moved.result[0], moved.lanes.events[0], tape.t[first, 0]
+
+    return jax.vmap(one)(level, width, other)
