@@ -14,7 +14,8 @@ from ..systems.system import HybridSystem
 from .batching import vmap_to_lanes
 from .lanes import Lanes
 from .replay import replay
-from .search import Found, Stride, initial_step, search, stride
+from .search import Found, search
+from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
 

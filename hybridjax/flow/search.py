@@ -20,33 +20,17 @@ from ..systems.transition import Scheduled
 from .attempt import SLOW, Aim, Attempt, attempt
 from .events import ZERO, apply_resets, enabled, keep_pace, next_schedule, rearm
 from .hermite import first_crossing
-from .lanes import Lanes, for_each_chart, only
+from .lanes import Lanes
+from .stride import Stride
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape, blank_tape, write_row
 from .target import Target
-from .watch import Watch, chart_field, watch
+from .watch import Watch, watch
 
 
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
 # Attempts to land on a crossing before the step in which it was seen is halved.
 _TRIES = 8
-
-
-class Stride(NamedTuple):
-    """How lanes set out: what is known beforehand about their way."""
-
-    h: Float[Array, " L"]
-    """The first step."""
-    lead: Float[Array, " L"]
-    """Expected time to the target's level as a multiple of Newton's guess at the start; 0 if it is
-    not known."""
-    slack: Float[Array, " L"]
-    """A step's error estimate may be this many times the tolerance."""
-
-
-def stride(h: Float[Array, " L"]) -> Stride:
-    """Set out with steps h, and no further knowledge."""
-    return Stride(h, jnp.zeros_like(h), jnp.ones_like(h))
 
 
 class Found(NamedTuple):
@@ -88,7 +72,6 @@ class _State(NamedTuple):
     result: Array
     arrived: Array
     i: Array
-    tape: Tape | None
 
 
 class _Way(NamedTuple):
@@ -137,8 +120,8 @@ def search(
         result,
         jnp.zeros(L, bool),
         jnp.zeros((), jnp.int32),
-        blank_tape(max_steps, lanes) if tape else None,
     )
+    blank = blank_tape(max_steps, lanes) if tape else None
 
     def active(state):
         return ~state.arrived & (state.result == Result.OK)
@@ -153,25 +136,29 @@ def search(
         calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
         return calm, (state, active(state), aim, way, new, u, target, stride, span)
 
-    def body(state):
+    def going(carry):
+        state, _ = carry
+        return (state.i < max_steps) & active(state).any()
+
+    def body(carry):
+        state, tape = carry
         calm, arguments = attempted(state)
-        return jax.lax.cond(
+        new, row = jax.lax.cond(
             (calm | ~active(state)).all(),
             lambda: _calmly(*arguments),
             lambda: _eventfully(s, *arguments),
         )
+        return new, None if tape is None else write_row(tape, state.i, row)
 
     def all_the_way():
-        def going(state):
-            return (state.i < max_steps) & active(state).any()
-
-        end = jax.lax.while_loop(going, body, state)
+        end, tape = jax.lax.while_loop(going, body, (state, blank))
         result = update_result(end.result, active(end), Result.STEP_LIMIT)
-        return Found(end.lanes, end.h, end.error, result, end.tape)
+        return Found(end.lanes, end.h, end.error, result, tape)
 
     def in_one_step(arguments):
-        end = _calmly(*arguments)
-        return Found(end.lanes, end.h, end.error, end.result, end.tape)
+        end, row = _calmly(*arguments)
+        tape = None if blank is None else write_row(blank, state.i, row)
+        return Found(end.lanes, end.h, end.error, end.result, tape)
 
     if not glide:
         return all_the_way()
@@ -213,7 +200,9 @@ def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _W
     return Aim(which, step, reach), _Way(known, jnp.where(last, schedule, -1), last)
 
 
-def _calmly(state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span):
+def _calmly(
+    state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span
+) -> tuple[_State, Tape]:
     """Nothing happened to any lane, except perhaps that it arrived."""
     lanes = state.lanes
     level, on_time = active & new.lands, way.last
@@ -223,12 +212,10 @@ def _calmly(state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target,
     lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, lanes.pace.at[0].add(moved))
     h = jnp.where(active, _next_step(state.h, aim.step, new.error / stride.slack), state.h)
     late = active & ~arrived & (t >= target.limit)
-    tape = state.tape
-    if tape is not None:
-        code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
-        code = jnp.where(active, code, IDLE)
-        tape = write_row(tape, state.i, moved, code, t, new.q, new.q, lanes.chart)
-    return _State(
+    code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
+    code = jnp.where(active, code, IDLE).astype(jnp.int32)
+    row = Tape(moved, code, t, new.q, new.q, lanes.chart)
+    end = _State(
         lanes,
         _merge(active, new.seen, state.seen),
         state.aimed,
@@ -238,13 +225,13 @@ def _calmly(state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target,
         update_result(state.result, late, target.missed),
         state.arrived | arrived,
         state.i + 1,
-        tape,
     )
+    return end, row
 
 
 def _eventfully(
     s, state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span
-) -> _State:
+) -> tuple[_State, Tape]:
     """Find out what happened to each lane, and let it happen."""
     lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
     G = len(s.transitions)
@@ -330,15 +317,13 @@ def _eventfully(
     result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)
     result = update_result(result, active & ~arrived & (after.t >= target.limit), target.missed)
 
-    tape = state.tape
-    if tape is not None:
-        code = jnp.where(accept, MOVE, IDLE)
-        code = jnp.where(on_time, ARRIVE_TIME, code)
-        code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
-        tape = write_row(tape, state.i, moved, code, t, new.q, after.q, after.chart)
+    code = jnp.where(accept, MOVE, IDLE)
+    code = jnp.where(on_time, ARRIVE_TIME, code)
+    code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
+    row = Tape(moved, code.astype(jnp.int32), t, new.q, after.q, after.chart)
     error = state.error + jnp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
-    return _State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1, tape)
+    return _State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
 
 
 def _next_step(h, step, error):
@@ -389,18 +374,3 @@ def _expected(order, events, fired):
     if not order:
         return jnp.zeros(fired.shape, bool)
     return jnp.array(order)[events % len(order)] == fired
-
-
-def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol):
-    """A cautious first step: a fraction of the time in which the state changes by its size."""
-
-    def work(a, here, out):
-        q = only(here, lanes.q[: s.dims[a]])
-        f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
-        ratio = jnp.linalg.norm(q, axis=0) / jnp.linalg.norm(f, axis=0)
-        ratio = jnp.where(jnp.isfinite(ratio) & (ratio > 0), ratio, jnp.inf)
-        h = jnp.minimum(0.1 * ratio * (100 * rtol) ** (1 / 7), 0.01 * span)
-        return jnp.where(here, h, out)
-
-    everywhere = jnp.ones(lanes.t.shape[0], bool)
-    return for_each_chart(s, lanes.chart, everywhere, work, 0.01 * span)

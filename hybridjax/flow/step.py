@@ -17,6 +17,8 @@ from .tableau import VERNER76
 
 LaneField = Callable[[jax.Array, jax.Array], jax.Array]
 
+# From this number of lanes on, stages are always written out.
+_MANY = 128
 _STAGES = VERNER76.num_stages
 _A = np.zeros((_STAGES, _STAGES))
 for _k, _row in enumerate(VERNER76.a_lower):
@@ -46,10 +48,10 @@ def rk_step(
 ) -> Step:
     """One step of Verner's 7(6) pair from (t, q) over h.
 
-    With `unroll`, the stages are written out: faster, and slower to compile.
+    With `unroll`, or for many lanes, the stages are written out: faster, and slower to compile.
     """
-    stages = _written_out if unroll else _in_a_loop
-    K = stages(field, t, q, h)
+    unroll = unroll or t.shape[0] >= _MANY
+    K = (_written_out if unroll else _in_a_loop)(field, t, q, h)
     if unroll:
         end, error = (_combine(w, K) for w in (VERNER76.b_sol, VERNER76.b_error))
     else:

@@ -13,7 +13,8 @@ IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = -4, -3, -2, -1
 
 
 class Tape(NamedTuple):
-    """What was done, one row per iteration and one column per lane."""
+    """What was done, one row per iteration and one column per lane. Without its first axis: one
+    row."""
 
     h: Float[Array, "R L"]
     """Length of the move."""
@@ -42,7 +43,6 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     )
 
 
-def write_row(tape: Tape, i: Int[Array, ""], h, code, t, before, after, chart) -> Tape:
-    """The tape with its row i filled in."""
-    row = (h, code.astype(jnp.int32), t, before, after, chart)
-    return Tape(*(x.at[i].set(y) for x, y in zip(tape, row, strict=True)))
+def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
+    """The tape with its row i filled in. (Outside of any branch, where it is done in place.)"""
+    return Tape(*(x.at[i].set(y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))

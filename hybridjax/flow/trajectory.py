@@ -19,7 +19,7 @@ from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
 from .move import Settings, record
-from .search import initial_step
+from .stride import initial_step
 from .tape import IDLE
 from .target import until
 from .watch import slopes

@@ -194,7 +194,7 @@ def find_limit_cycle(
     solution = solve(system, start, base, expected, settings, False, traced)
     if not traced and int(solution[-1]) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
-        second = solve(system, start, base, expected, settings, True, False)
+        second = solve(system, start, base, expected, settings, True, False, 64)
         solution = second if int(second[-1]) == Result.OK else solution
     start, period, factors, seen, steps, result = solution
     if not traced:

@@ -23,8 +23,10 @@ def flow_jacobian(
     settings: Settings,
     h: Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
+    of_states: bool = False,
 ) -> tuple[Float[Array, "L n m"], Moved, Tape]:
-    """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0.
+    """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
+    respect to q only (`of_states`).
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearising first
@@ -34,12 +36,12 @@ def flow_jacobian(
     """
     zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
     moved, tape = record(system, lanes, zero, target, settings, h, result)
-    columns, end = _push(system, lanes, target, tape)
+    columns, end = _push(system, lanes, target, tape, of_states)
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
     return columns.transpose(2, 1, 0), moved, tape
 
 
-def _columns(system, lanes, target, tape):
+def _columns(system, lanes, target, tape, of_states):
     """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
     s = Structure(system)
     L, d = lanes.t.shape[0], s.d
@@ -51,21 +53,23 @@ def _columns(system, lanes, target, tape):
         return jnp.concatenate([t[None], q])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
-    tangents = jnp.broadcast_to(jnp.eye(n)[:, :, None], (n, n, L))
+    directions = jnp.eye(n)[1 : 1 + d] if of_states else jnp.eye(n)
+    tangents = jnp.broadcast_to(directions[:, :, None], (*directions.shape, L))
     push = jax.vmap(lambda tangent: jax.jvp(flow, (x,), (tangent,)), out_axes=(None, 0))
     end, columns = push(tangents)
     return columns, end
 
 
 @eqx.filter_custom_jvp
-def _push(system, lanes, target, tape):
+def _push(system, lanes, target, tape, of_states):
     """`_columns`, with the axes that `jax.vmap` maps as more lanes."""
     bare = dataclasses.replace(target, levels=None)
 
     def run(common, lane):
         system, levels = common
         lanes, target, tape = lane
-        return _columns(system, lanes, dataclasses.replace(target, levels=levels), tape)
+        target = dataclasses.replace(target, levels=levels)
+        return _columns(system, lanes, target, tape, of_states)
 
     return vmap_to_lanes(run)((system, target.levels), (lanes, bare, tape))
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from ..flow.move import Settings, move
-from ..flow.search import Stride
+from ..flow.stride import Stride
 from ..flow.watch import watch
 from ..systems.structure import Structure
 from .place import PATIENCE, PlacedSections
@@ -42,7 +42,7 @@ class Plan(eqx.Module):
 
     **Fields:**
 
-    - `h`: first step; `lead`, `slack`: see `flow.search.Stride`.
+    - `h`: first step; `lead`, `slack`: see `flow.stride.Stride`.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
         cycle and relative to the states' scales: the largest that it ever leads to at a later
         section, summed over all turns as if each made the same error.

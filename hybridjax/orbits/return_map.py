@@ -34,7 +34,9 @@ _SINGULAR = 1e-7
 
 
 @quick_jit
-def solve(system, start: Lanes, base, expected, settings, damped: bool, follow: bool):
+def solve(
+    system, start: Lanes, base, expected, settings, damped: bool, follow: bool, max_steps: int = 32
+):
     """Newton on the return map, and what it saw in its last turn.
 
     **Arguments:** `damped` takes the smaller steps of Levenberg and Marquardt; `follow` goes round
@@ -54,7 +56,7 @@ def solve(system, start: Lanes, base, expected, settings, damped: bool, follow: 
         start.q[:, 0],
         (system, start, base, expected),
         has_aux=True,
-        max_steps=64 if damped else 32,
+        max_steps=max_steps,
         throw=False,
     )
     q, seen = solution.value, solution.aux
@@ -120,7 +122,7 @@ def _turn_with_jacobian(q, system, start, base, expected, settings):
         q, system, start, base, expected, settings, _flow_with_jacobian
     )
     n = q.shape[0]
-    factors = jacobians[:, 0, 1 : n + 1, 1 : n + 1]
+    factors = jacobians[:, 0, 1 : n + 1]
     valid = jnp.arange(n) < jnp.array(Structure(system).dims)[start.chart[0]]
     monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
     jacobian = jnp.where(valid[:, None], monodromy, 0.0) - jnp.eye(n)
@@ -137,7 +139,9 @@ def _flow(system, lanes, target, settings, h, result):
 
 
 def _flow_with_jacobian(system, lanes, target, settings, h, result):
-    jacobian, moved, tape = flow_jacobian(system, lanes, target, settings, h, result)
+    jacobian, moved, tape = flow_jacobian(
+        system, lanes, target, settings, h, result, of_states=True
+    )
     return moved, (lanes, jacobian, tape.code)
 
 

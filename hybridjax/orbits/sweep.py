@@ -1,0 +1,236 @@
+"""Limit cycles of many systems at once: the points of a parameter sweep side by side."""
+
+import functools as ft
+import operator
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+from tqdm import tqdm
+
+from .._core.errors import DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..flow.lanes import Lanes
+from ..flow.move import Settings, move
+from ..flow.sections import AtEvent, ListLevels
+from ..flow.target import toward, until
+from ..systems.structure import Structure, check_system
+from ..systems.system import HybridSystem
+from .cycle import LimitCycle
+from .return_map import solve
+
+
+# Newton steps of a batch, in which all systems wait for the last one.
+_NEWTON = 6
+# Periods for which a system flows freely before Newton tries again.
+_SETTLE = 40
+
+
+class LimitCycles(eqx.Module):
+    """Limit cycles of S systems; `cycles[i]` is one of them.
+
+    **Fields**, with the systems on the first axis:
+
+    - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`,
+        `dims`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `codes`: the events of one turn, in order, filled up with negative numbers.
+    """
+
+    systems: HybridSystem
+    base: object
+    period: Float[np.ndarray, " S"]
+    start: Lanes
+    legs: Lanes
+    factors: Float[np.ndarray, "S K d d"]
+    dims: Int[np.ndarray, "S K"]
+    residual: Float[np.ndarray, " S"]
+    iterations: Int[np.ndarray, " S"]
+    result: Int[np.ndarray, " S"]
+    codes: Int[np.ndarray, "S R"]
+    settings: Settings
+
+    def __len__(self) -> int:
+        return len(self.result)
+
+    def __getitem__(self, i: int) -> LimitCycle:
+        """The cycle of system i, found or not (see its `result`)."""
+        pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
+        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+        return LimitCycle(
+            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.start),
+            pick(self.legs), pick(self.factors), pick(self.dims), pick(self.residual),
+            pick(self.iterations), pick(self.result),
+            tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
+        )  # fmt: skip
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " S"]:
+        """Which cycles were found."""
+        return self.result == Result.OK
+
+    @property
+    def failed(self) -> Int[np.ndarray, " F"]:
+        """Indices of the systems without a cycle."""
+        return np.flatnonzero(~self.ok)
+
+    @ft.cached_property
+    def multipliers(self) -> Complex[np.ndarray, "S d"]:
+        """Floquet multipliers, the largest first; NaN where there is no cycle.
+
+        Eigenvalues of the product of the factors, filled up with zeros: those far below the
+        largest are lost in rounding. `cycles[i].multipliers` sees them, too.
+        """
+        factors = np.asarray(self.factors)
+        product = factors[:, 0]
+        for k in range(1, factors.shape[1]):
+            product = factors[:, k] @ product
+        product = np.where(self.ok[:, None, None], product, 0.0)
+        values = np.linalg.eigvals(product).astype(complex)
+        order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+        values = np.take_along_axis(values, order, axis=-1)
+        values[~self.ok] = np.nan
+        return values
+
+    def summary(self, limit: int = 5) -> str:
+        """`10000/10000 found`, or why the first `limit` of the others were not."""
+        text = [f"{self.ok.sum()}/{len(self)} found"]
+        text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
+        if len(self.failed) > limit:
+            text.append(f"and {len(self.failed) - limit} more")
+        return "; ".join(text)
+
+    def __repr__(self):
+        return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
+
+
+def find_limit_cycles(
+    systems: HybridSystem | Sequence[HybridSystem],
+    guess: LimitCycle,
+    *,
+    settings: Settings | None = None,
+    batch: int = 250,
+    progress: bool = False,
+) -> LimitCycles:
+    """Find the limit cycles of many systems that differ in their parameters.
+
+    Newton starts from the guess for all of them side by side. Systems for which that fails flow
+    freely for some periods, and Newton starts again from where they are then.
+
+    **Arguments:**
+
+    - `systems`: a list of systems of one class, or one system whose arrays all have a leading
+        axis, as `equinox.filter_vmap` makes it:
+        `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
+    - `guess`: a limit cycle of a similar system.
+    - `settings`: accuracy of the flow; 1e-10 by default.
+    - `batch`: systems per compiled call.
+
+    **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
+    for those.
+
+    **Raises:** `DefinitionError` for systems that do not belong together.
+    """
+    settings = Settings(rtol=1e-10, atol=1e-10) if settings is None else settings
+    systems = _stacked(systems)
+    require_x64(systems)
+    arrays, rest = eqx.partition(systems, eqx.is_array)
+    S = len(jax.tree_util.tree_leaves(arrays)[0])
+    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
+    if not isinstance(guess, LimitCycle):
+        raise DefinitionError(
+            f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
+            "find_limit_cycle first."
+        )
+    out = _tiles(systems, guess, settings, False, np.arange(S), batch, progress)
+    again = np.flatnonzero(out[-2] != Result.OK)
+    if len(again):
+        second = _tiles(systems, guess, settings, True, again, batch, progress)
+        for x, y in zip(*map(jax.tree_util.tree_leaves, (out, second)), strict=True):
+            x[again] = y
+    start, period, factors, seen, steps, result, dims = out
+    codes = _ragged(seen.codes.reshape(S, -1))
+    return LimitCycles(
+        systems, guess.base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
+        codes, settings,
+    )  # fmt: skip
+
+
+def _stacked(systems) -> HybridSystem:
+    if isinstance(systems, HybridSystem):
+        shapes = {x.shape[:1] for x in jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_array))}
+        if len(shapes) != 1 or () in shapes:
+            raise DefinitionError(
+                "all arrays of `systems` need the same leading axis, one entry for each system: "
+                "make it by equinox.filter_vmap, or pass a list of systems."
+            )
+        return systems
+    systems = list(systems)
+    kinds = {jax.tree_util.tree_structure(eqx.filter(x, eqx.is_array)) for x in systems}
+    if len(kinds) != 1 or not all(isinstance(x, HybridSystem) for x in systems):
+        raise DefinitionError("`systems` must be at least one system, all of the same class.")
+    arrays = [eqx.filter(x, eqx.is_array) for x in systems]
+    stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
+    return eqx.combine(stacked, eqx.filter(systems[0], eqx.is_array, inverse=True))
+
+
+def _tiles(systems, guess, settings, settle: bool, rows, batch: int, progress: bool):
+    """`_tile` for some rows, in calls of one size, gathered as numpy arrays."""
+    arrays, rest = eqx.partition(systems, eqx.is_array)
+    arrays = jax.tree_util.tree_map(np.asarray, arrays)
+    size = min(batch, len(rows))
+    parts = []
+    for k in tqdm(range(0, len(rows), size), disable=not progress, desc="cycles"):
+        some = rows[np.arange(k, k + size) % len(rows)]
+        tile = jax.tree_util.tree_map(operator.itemgetter(some), arrays)
+        part = _tile(eqx.combine(tile, rest), guess, settings, jnp.asarray(settle))
+        keep = slice(min(size, len(rows) - k))
+        part = jax.tree_util.tree_map(np.asarray, part)
+        parts.append(jax.tree_util.tree_map(operator.itemgetter(keep), part))
+    return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
+
+
+@eqx.filter_jit
+def _tile(systems, guess: LimitCycle, settings, settle: Bool[Array, ""]):
+    def one(system):
+        start, expected, result = guess.start, guess.period, jnp.zeros(1, jnp.int32)
+        if guess.clocked:
+            expected = jnp.asarray(system.period(), float)
+            start = eqx.tree_at(lambda x: x.t, start, start.t / guess.period * expected)
+        start, result = _settled(system, guess.base, start, expected, settle)
+        *found, code = solve(system, start, guess.base, expected, settings, False, False, _NEWTON)
+        code = jnp.where(result[0] == Result.OK, code, result[0])
+        return *found, code, jnp.array(Structure(system).dims)[found[3].legs.chart]
+
+    return eqx.filter_vmap(one)(systems)
+
+
+def _settled(system, base, start: Lanes, expected, settle: Bool[Array, ""]):
+    """Where a system is after it has flowed freely for a while, at the guess's phase or section;
+    or without `settle`, where it was."""
+    u = jnp.zeros((len(system.inputs), 1))
+    patient = Settings(rtol=1e-8, atol=1e-8, max_steps=512 * _SETTLE)
+    turns = jnp.where(settle, _SETTLE, 0) * expected
+    moved = move(system, start, u, until(start.t + turns), patient)
+    if base is not None:
+        event = Structure(system).transition_index(base.name) if isinstance(base, AtEvent) else -1
+        target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
+        if event < 0:
+            target = eqx.tree_at(
+                lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
+            )
+        again = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
+        pick = lambda new, old: jnp.where(settle, new, old)  # noqa: E731
+        moved = jax.tree_util.tree_map(pick, again, moved)
+    lanes = eqx.tree_at(lambda x: (x.t, x.events), moved.lanes, (start.t, start.events))
+    return lanes, moved.result
+
+
+def _ragged(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
+    """Codes of events moved to the front of each row, and the columns without any left out."""
+    order = np.argsort(codes < 0, axis=1, kind="stable")
+    codes = np.take_along_axis(codes, order, axis=1)
+    return codes[:, : max(int((codes >= 0).sum(axis=1).max(initial=0)), 1)]
