@@ -49,7 +49,7 @@ class Attempt(NamedTuple):
     """Time from the end of the step aimed for to the zero, as far as is known."""
     lands: Bool[Array, " L"]
     slow: Bool[Array, " L"]
-    """The zero is crossed at a vanishing speed."""
+    """The zero that the lane lands on is not crossed in falling, or at a vanishing speed."""
     bent: Bool[Array, " L"]
     """A watched function is not resolved by its cubic interpolant over the step.
 
@@ -135,7 +135,7 @@ def attempt(
         armed = jnp.stack([ready[row] for row in rows])
         far = jnp.where(armed, low > NEAR * scale, high <= 0)
         fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
-        slow = (own & (jnp.abs(ends[3]) < SLOW * fastest)).any(axis=0)
+        slow = (own & (ends[3] > -SLOW * fastest)).any(axis=0)
         return Attempt(
             out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
             write(out.seen, rows, here, Watch(value, rate)),

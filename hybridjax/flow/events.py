@@ -7,14 +7,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .lanes import Lanes, only
-from .target import until
-from .watch import Watch, watch
+from .lanes import Lanes, for_each_chart, only
+from .watch import Watch
 
 
 # A watched function counts as zero if its rate would have made its value in this fraction of the
 # time span at hand.
 ZERO = 1e-12
+# Rounding errors of a time or a state, relative to it.
+_ROUNDING = 4e-15
 # Times of a schedule are equal if they differ by less than this fraction of its period.
 _TIE = 1e-11
 # Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
@@ -28,18 +29,28 @@ def start_lanes(
     t: Float[Array, " L"],
     chart: Int[Array, " L"],
     q: Float[Array, "d L"],
-    span: Float[Array, ""],
 ) -> Lanes:
-    """Lanes with fresh bookkeeping, at zero input; guards that are positive are armed.
-
-    `span` is the time scale on which a guard's value is judged to be zero.
-    """
+    """Lanes with fresh bookkeeping. No guard is armed yet: that is done where they set out."""
     L = t.shape[0]
-    all_lanes = jnp.ones(L, bool)
-    seen = watch(s, t, chart, q, jnp.zeros((s.nu, L)), until(t), all_lanes)
-    armed = (seen.value > ZERO * span * jnp.abs(seen.rate)) & mine(s, chart)
     pace = jnp.zeros((4, L)).at[1].set(jnp.inf)
-    return Lanes(t, chart, q, armed[:-1], jnp.zeros(L, jnp.int32), pace)
+    armed = jnp.zeros((len(s.transitions), L), bool)
+    return Lanes(t, chart, q, armed, jnp.zeros(L, jnp.int32), pace)
+
+
+def width(t: Float[Array, " L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
+    """Values of watched functions that count as zero: what their rates make of rounding errors."""
+    return (ZERO * span + _ROUNDING * jnp.abs(t)) * jnp.abs(rate)
+
+
+def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> Lanes:
+    """Arm the guards that are positive at the beginning of a piece of flow.
+
+    A guard that its input, which may have jumped, makes negative is crossed by no motion: it is
+    no event, and not armed until it is positive again.
+    """
+    zero = width(lanes.t, span, seen.rate)
+    armed = (lanes.armed & (seen.value >= -zero)[:-1]) | (seen.value > zero)[:-1]
+    return eqx.tree_at(lambda x: x.armed, lanes, armed & mine(s, lanes.chart)[:-1])
 
 
 def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
@@ -55,19 +66,49 @@ def rearm(
     fired: Int[Array, " L"],
     together: Bool[Array, " L"],
     span: Float[Array, " L"],
+    u: Float[Array, "nu L"],
+    residue: Float[Array, " L"],
 ) -> Lanes:
     """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
-    A guard that is zero there waits until it has left zero. The one exception are events at the
+    A guard that is zero there, up to rounding and to the `residue` that the guard that fired was
+    left with, waits until it has left zero. The one exception are events at the
     same instant: where another guard of the old chart was at its zero too (`together`), a guard
     other than the one that fired, at zero and falling, is still due.
     """
     value, rate = seen.value[:-1], seen.rate[:-1]
-    width = ZERO * span * jnp.abs(rate)
     other = jnp.arange(len(s.transitions))[:, None] != fired
-    due = together & other & (jnp.abs(value) <= width) & (rate < 0)
-    armed = ((value > width) | due) & mine(s, lanes.chart)[:-1]
+    zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
+    zero = jnp.maximum(zero, jnp.where(other, 0.0, 4 * residue))
+    due = together & other & (jnp.abs(value) <= zero) & (rate < 0)
+    armed = ((value > zero) | due) & mine(s, lanes.chart)[:-1]
     return eqx.tree_at(lambda x: x.armed, lanes, jnp.where(fired >= 0, armed, lanes.armed))
+
+
+def _noise(s: Structure, lanes: Lanes, u, mask: Bool[Array, " L"]) -> Float[Array, "G L"]:
+    """A bound on the rounding errors of the guards of the charts that lanes are in."""
+
+    def work(a, here, out):
+        rows = s.guards(a)
+        if not rows:
+            return out
+
+        def one(s, t, q, u):
+            guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in rows])  # noqa: E731
+            by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
+            return _ROUNDING * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
+
+        n = s.dims[a]
+        noise = s.by_lane(one)(only(here, lanes.t), only(here, lanes.q[:n]), only(here, u))
+        place = {row: k for k, row in enumerate(rows)}
+        each = [
+            jnp.where(here, noise[place[g]], out[g]) if g in place else out[g]
+            for g in range(len(out))
+        ]
+        return jnp.stack(each)
+
+    nothing = jnp.zeros((len(s.transitions), lanes.t.shape[0]))
+    return for_each_chart(s, lanes.chart, mask, work, nothing)
 
 
 def apply_resets(

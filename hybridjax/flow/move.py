@@ -1,6 +1,7 @@
 """Flow of many lanes to their targets, differentiable in forward and reverse mode."""
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +36,14 @@ class Settings(eqx.Module):
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
 
 
+class _How(NamedTuple):
+    """Ways of `search`."""
+
+    tape: bool
+    glide: bool
+    new_input: bool
+
+
 class Moved(eqx.Module):
     """Lanes at the end of a piece of flow."""
 
@@ -55,6 +64,7 @@ def move(
     settings: Settings,
     setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
+    new_input: bool = True,
 ) -> Moved:
     """Flow every lane to its target under a constant input.
 
@@ -63,10 +73,11 @@ def move(
     floating-point array: states, times, inputs, parameters, the target.
 
     `setout` is the first step, or a `Stride`: then one step is thought to be enough for most.
+    With `new_input`, the guards are armed anew; otherwise the lanes go on as they are.
     """
-    glide = isinstance(setout, Stride)
+    how = _How(False, isinstance(setout, Stride), new_input)
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, glide)
+    return _move(system, lanes, u, target, setout, result, settings, how)
 
 
 def record(
@@ -77,11 +88,12 @@ def record(
     settings: Settings,
     setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
+    new_input: bool = True,
 ) -> tuple[Moved, Tape]:
     """As `move`, with a record of every step, and without derivatives."""
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     arguments = system, lanes, u, target, setout, result
-    found = _search(*(_constant(x) for x in arguments), settings, True, False)
+    found = _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input))
     return _moved(found), found.tape
 
 
@@ -113,13 +125,13 @@ def _moved(found: Found) -> Moved:
 
 
 @eqx.filter_jit
-def _search(system, lanes, u, target, setout, result, settings, tape: bool, glide: bool) -> Found:
+def _search(system, lanes, u, target, setout, result, settings, how: _How) -> Found:
     bare = dataclasses.replace(target, levels=None)
-    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, tape, glide))
+    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, how))
     return run((system, target.levels, settings), (lanes, u, bare, setout, result))
 
 
-def _run(system, levels, settings, lanes, u, target, setout, result, tape, glide) -> Found:
+def _run(system, levels, settings, lanes, u, target, setout, result, how: _How) -> Found:
     settings = shared(settings)
     return search(
         Structure(system),
@@ -131,20 +143,19 @@ def _run(system, levels, settings, lanes, u, target, setout, result, tape, glide
         rtol=settings.rtol,
         atol=settings.atol,
         max_steps=settings.max_steps,
-        tape=tape,
-        glide=glide,
+        **how._asdict(),
     )
 
 
 @eqx.filter_custom_jvp
-def _move(system, lanes, u, target, setout, result, settings, glide):
-    return _moved(_search(system, lanes, u, target, setout, result, settings, False, glide))
+def _move(system, lanes, u, target, setout, result, settings, how: _How):
+    return _moved(_search(system, lanes, u, target, setout, result, settings, how))
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
-    system, lanes, u, target, setout, result, settings, _ = primals
-    moved, tape = record(system, lanes, u, target, settings, setout, result)
+    system, lanes, u, target, setout, result, settings, how = primals
+    moved, tape = record(system, lanes, u, target, settings, setout, result, how.new_input)
 
     def ends(system, t, q, u, target):
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))

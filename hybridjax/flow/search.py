@@ -18,7 +18,7 @@ from .._core.results import Result, update_result
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .attempt import SLOW, Aim, Attempt, attempt
-from .events import ZERO, apply_resets, enabled, keep_pace, next_schedule, rearm
+from .events import apply_resets, arm, enabled, keep_pace, next_schedule, rearm, width
 from .hermite import first_crossing
 from .lanes import Lanes
 from .stride import Stride
@@ -98,11 +98,13 @@ def search(
     max_steps: int,
     tape: bool,
     glide: bool,
+    new_input: bool,
 ) -> Found:
     """Flow every lane to its target, or to a result code that says why not.
 
     Lanes whose `result` is not OK at the start stay where they are. With `glide`, one step of all
-    lanes is tried first: if it brings all of them home, nothing else is done.
+    lanes is tried first: if it brings all of them home, nothing else is done. With `new_input`,
+    guards are armed for the input u, which may have jumped.
     """
     L = lanes.t.shape[0]
     finite = jnp.isfinite(lanes.t) & jnp.isfinite(lanes.q).all(axis=0) & jnp.isfinite(u).all(axis=0)
@@ -111,7 +113,7 @@ def search(
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
     none = jnp.zeros(L, jnp.int32)
     state = _State(
-        lanes,
+        arm(s, lanes, seen, span) if new_input else lanes,
         seen,
         _aims(seen, span),
         _Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
@@ -241,7 +243,8 @@ def _eventfully(
     tau = approach.tau + new.past
     enough = 1e-6 * approach.reach + 1e-13 * span
     inside = (tau >= -enough) & (tau <= approach.reach + enough)
-    lands = active & new.lands & jnp.where(approach.on, inside, near)
+    falling = _row(end.rate, jnp.maximum(aim.which, 0)) < 0
+    lands = active & new.lands & falling & jnp.where(approach.on, inside, near)
     closer = active & approach.on & ~lands & (approach.tries < _TRIES)
     lost = active & approach.on & ~lands & ~closer
     moved = aim.step + jnp.where(new.lands, new.past, 0.0)
@@ -250,17 +253,16 @@ def _eventfully(
     # 2. What was crossed on the way.
     ready = jnp.concatenate([lanes.armed, state.aimed[None]])
     crossing = first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
-    zero = ZERO * span * jnp.abs(end.rate)
+    zero = width(t, span, end.rate)
     chosen = lands & (jnp.arange(G + 1)[:, None] == aim.which)
-    # On the way to a crossing that was seen before, only what has fallen by its end can be new.
-    old = lands & jnp.where(approach.on, end.value >= -zero, jnp.abs(end.value) <= zero)
+    old = lands & (jnp.abs(end.value) <= zero)
     s_first = jnp.where(chosen | old, jnp.inf, crossing.s)
     which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
     first = jnp.min(s_first, axis=0)
     fresh = active & ~approach.on & near
     bent = fresh & new.bent
     crosses = ((fresh | lands) & jnp.isfinite(first)) & ~bent
-    refine = bent | (fresh & ~crosses & (crossing.near & ~chosen).any(axis=0))
+    refine = bent | ((fresh | lands) & ~crosses & (crossing.near & ~chosen).any(axis=0))
     touch = fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0)
     lands = lands & ~crosses & ~refine
     chosen = chosen & lands
@@ -344,7 +346,8 @@ def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, u, fired)
         new = eqx.tree_at(lambda x: (x.q, x.chart), lanes, (q, chart))
         after = watch(s, new.t, chart, q, u, target, fires)
-        new = rearm(s, new, after, fired, together, span)
+        residue = jnp.abs(_row(seen.value, jnp.maximum(fired, 0)))
+        new = rearm(s, new, after, fired, together, span, u, residue)
         return new, _merge(fires, after, seen), jnp.where(fires, _aims(after, span), aimed)
 
     return jax.lax.cond(fires.any(), work, lambda: (lanes, seen, aimed))

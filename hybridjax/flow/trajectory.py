@@ -212,7 +212,7 @@ def _constant_input(s: Structure, input) -> np.ndarray:
 def _start(system, t, a, state, u, span, settings):
     s = Structure(system)
     q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
-    lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q, span)
+    lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q)
     return lanes, initial_step(s, lanes, u, span[None], settings.rtol)
 
 

@@ -277,10 +277,8 @@ def _prepare(system, guess, section, settle, max_period, settings):
         )
     if section is not None:
         section.check(s)
-    span = jnp.asarray(max_period if period is None else period, float)
-    lanes = start_at(
-        system, guess.time[None], jnp.array([a], jnp.int32), _pad(s, guess.state), span
-    )
+    q = jnp.zeros((s.d, 1)).at[: s.dims[a], 0].set(guess.state)
+    lanes = start_lanes(s, guess.time[None], jnp.array([a], jnp.int32), q)
     if settle:
         turns = float(settle) if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + turns, -1, lanes.t + turns), settings)
@@ -332,16 +330,6 @@ def _require(moved, doing: str, s: Structure) -> None:
             f"'{s.names[int(lanes.chart[0])]}': {result.message}. Check the guess and the guards "
             "with `simulate(..., throw=False)`."
         )
-
-
-def _pad(s: Structure, q):
-    return jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
-
-
-@quick_jit
-def start_at(system, t, chart, q, span) -> Lanes:
-    """Lanes at the given times, charts and padded states."""
-    return start_lanes(Structure(system), t, chart, q, span)
 
 
 @quick_jit

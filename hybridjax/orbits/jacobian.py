@@ -24,6 +24,7 @@ def flow_jacobian(
     h: Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
     of_states: bool = False,
+    new_input: bool = True,
 ) -> tuple[Float[Array, "L n m"], Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
     respect to q only (`of_states`).
@@ -35,7 +36,7 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
-    moved, tape = record(system, lanes, zero, target, settings, h, result)
+    moved, tape = record(system, lanes, zero, target, settings, h, result, new_input)
     columns, end = _push(system, lanes, target, tape, of_states)
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
     return columns.transpose(2, 1, 0), moved, tape

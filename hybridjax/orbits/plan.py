@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
+from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
 from ..flow.watch import watch
@@ -68,8 +69,6 @@ def make_plan(
 ) -> Plan:
     """Find the fewest steps between sections that keep the accuracy asked for.
 
-    All candidates, the reference and the perturbed flows are lanes of one call.
-
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
     """
     N, n = scale.shape
@@ -87,23 +86,26 @@ def make_plan(
     by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
     longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
 
-    # Lanes in blocks of N: K candidates, the reference, and one for each coordinate of (t, q).
-    many = K + 1 + n
-    lanes = jax.tree_util.tree_map(lambda x: jnp.tile(x, many), placed.lanes)
-    nudge = _NUDGE * scale.T[:, None, :] * jnp.eye(n)[:, :, None]
-    nudge = jnp.concatenate([jnp.zeros((n, K + 1, N)), nudge], axis=1).reshape(n, many * N)
-    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (lanes.t + nudge[0], lanes.q + nudge[1:]))
-    free = jnp.repeat(jnp.arange(many) < K, N)
-    divide = jnp.repeat(jnp.array([*_PIECES, *[2] * (1 + n)]), N)
-    start = Stride(
-        jnp.tile(longest, many) / divide, jnp.tile(lead, many), jnp.where(free, jnp.inf, 1.0)
-    )
-    target = placed.target(jnp.tile(following, many), lanes.t, jnp.tile(turns, many))
-    u = jnp.zeros((len(placed.cycle.system.inputs), many * N))
-    moved = move(placed.cycle.system, lanes, u, target, tight, start)
-    ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q]).reshape(n, many, N)
-    ends = jnp.where((moved.result == 0).reshape(many, N), ends, jnp.nan)
+    # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
+    nudge = _NUDGE * scale.T[None] * jnp.eye(n)[:, :, None]
+    nudge = jnp.concatenate([jnp.zeros((K + 1, n, N)), nudge])
+    divide = jnp.array([*_PIECES, *[2] * (1 + n)])
+    slack = jnp.array([*[jnp.inf] * K, *[1.0] * (1 + n)])
+    target = placed.target(following, placed.lanes.t, turns)
+    u = jnp.zeros((len(placed.cycle.system.inputs), N))
 
+    def block(xs):
+        nudge, divide, slack = xs
+        moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
+        lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
+        start = Stride(longest / divide, lead, jnp.full(N, slack))
+        moved = move(placed.cycle.system, lanes, u, target, tight, start)
+        ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
+        return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
+
+    ends, error = jax.lax.map(block, (nudge, divide, slack))
+    ends = jnp.moveaxis(ends, 0, 1)
+    estimate = error[:K] * (_TIGHT / settings.rtol)
     exact = ends[:, K]
     J = jnp.transpose((ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1)) / scale[:, None, :]
     J = J.at[:, :, 0].set(jnp.where(placed.time_is_state[:, None], J[:, :, 0], 0.0))
@@ -112,7 +114,6 @@ def make_plan(
     if not placed.cycle.clocked:
         error = error.at[..., 0].set(0.0)
     impact = jnp.maximum(_impact(J, error, scale), _ROUNDING)
-    estimate = moved.error.reshape(many, N)[:K] * (_TIGHT / settings.rtol)
     estimate = jnp.maximum(estimate, 1e-6)
 
     # The largest share of the accuracy for each section that keeps their sum.

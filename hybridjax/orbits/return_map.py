@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.results import Result
-from ..flow.events import start_lanes
+from ..flow.events import arm, start_lanes
 from ..flow.lanes import Lanes
 from ..flow.move import move
 from ..flow.sections import AtEvent, ListLevels
-from ..flow.target import Target, toward
-from ..flow.watch import slopes
+from ..flow.target import Target, toward, until
+from ..flow.watch import slopes, watch
 from ..systems.structure import Structure
 from .jacobian import flow_jacobian
 
@@ -135,12 +135,12 @@ def _turn_with_jacobian(q, system, start, base, expected, settings):
 
 def _flow(system, lanes, target, settings, h, result):
     u = jnp.zeros((len(system.inputs), 1))
-    return move(system, lanes, u, target, settings, h, result), None
+    return move(system, lanes, u, target, settings, h, result, new_input=False), None
 
 
 def _flow_with_jacobian(system, lanes, target, settings, h, result):
     jacobian, moved, tape = flow_jacobian(
-        system, lanes, target, settings, h, result, of_states=True
+        system, lanes, target, settings, h, result, of_states=True, new_input=False
     )
     return moved, (lanes, jacobian, tape.code)
 
@@ -171,7 +171,10 @@ def _turn(q, system, start: Lanes, base, expected, settings, flow):
 
 def _begin(s: Structure, q, start: Lanes, base, expected) -> Lanes:
     """The lane at the beginning of a turn: right after an event, that event is not due again."""
-    lanes = start_lanes(s, start.t, start.chart, q[:, None], expected)
+    lanes = start_lanes(s, start.t, start.chart, q[:, None])
+    u, everywhere = jnp.zeros((s.nu, 1)), jnp.ones(1, bool)
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, until(lanes.t), everywhere)
+    lanes = arm(s, lanes, seen, expected[None])
     if isinstance(base, AtEvent):
         own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(base.name)
         lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)

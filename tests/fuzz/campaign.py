@@ -13,7 +13,6 @@ from hybridjax.flow.events import start_lanes
 from hybridjax.flow.move import Settings, record
 from hybridjax.flow.target import until
 from hybridjax.systems.structure import Structure
-from hybridjax.systems.system import Driven
 
 from . import scipy_loop
 from .drawing import STRUCTURES, draw
@@ -158,11 +157,10 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
     def one(sample: Sample, end):
         system = Random(plan, sample.charts, sample.arrows)
         t, q, u, _ = sample.start
-        # `start_lanes` arms guards at zero input, so here it gets a system that adds the input.
-        s = Structure(Driven(system, lambda t: u))
+        s = Structure(system)
         q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
-        lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q, end - t)
+        lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q)
         moved, tape = record(system, lanes, u[:, None], until(end[None]), settings)
         happens = tape.code[:, 0] >= 0
         (rows,) = jnp.nonzero(happens, size=EVENTS, fill_value=0)
