@@ -1,107 +1,115 @@
-"""How long the main steps take, compile time apart from run time, with their accuracy beside.
+"""How fast and how accurate hybridjax is, beside other libraries. Prints `name.metric value` lines.
 
-Prints `name.metric value` lines. Times are in seconds: `compile` is the first call less a later
-one, without a cache from earlier processes; `run` is the best of several calls. Every error is the
-largest difference from the same computation at a tolerance of 1e-14.
+    python benchmarks/run.py                                  everything but jaxonomy
+    python benchmarks/run.py --only experiments,grid          some cases
+    python benchmarks/run.py --with jaxonomy=ENV/bin/python   jaxonomy, from its own environment
+    python benchmarks/run.py --quick                          small: does all of it work?
+    python benchmarks/run.py --baseline                       keep the numbers in baseline.json
+    python benchmarks/run.py --table                          put baseline.json into the docs
 
-    python benchmarks/run.py [--repeat 3] [--experiments 80] [--cycles 84]
+Times are seconds: `cpu` of the processor, `wall` of the wall's clock, each the least of several
+calls, and `compile`, by how much the first call was longer. Everything but the cases `cores` and
+`compile` runs on one core. `error` is the largest difference from a closed form (benchmarks/
+truth.py). The cases are described in benchmarks/cases, the figures in docs/benchmarks.md.
 """
 
 import argparse
-import dataclasses
-import os
-import platform
+import importlib
+import json
+import pathlib
+import sys
 import time
-from collections.abc import Callable
-from typing import Any
+import traceback
 
-import jax
-import numpy as np
-
-import hybridjax as hj
-
-
-OUTPUTS = ("yM", "vM")
-TIGHT = hj.Settings(rtol=1e-14, atol=1e-14)
-APEX = hj.Crossing("vM", "falling")
-FAMILIES = {
-    "isochron": hj.ClockPhase(32, start=APEX),
-    "kinematic": hj.KinematicPhase(
-        32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
-    ),
-}
+import one_thread
+from cases import NAMES, Options
+from report import Report, hardware, software, today
+from tables import fill
 
 
-def show(name: str, value: Any) -> None:
-    print(name, f"{value:.3g}" if isinstance(value, float) else value, flush=True)
+HERE = pathlib.Path(__file__).parent
+BASELINE = HERE / "baseline.json"
+PAGE = HERE.parent / "docs" / "benchmarks.md"
 
 
-def measure(name: str, work: Callable[[], Any], repeat: int) -> Any:
-    """Time a first call and later ones, and return the result."""
-    seconds = []
-    for _ in range(repeat + 1):
-        begin = time.perf_counter()
-        result = jax.block_until_ready(work())
-        seconds.append(time.perf_counter() - begin)
-    run = min(seconds[1:])
-    show(f"{name}.compile", seconds[0] - run)
-    show(f"{name}.run", run)
-    return result
+def main() -> int:
+    options = arguments()
+    if options.table:
+        fill(PAGE, json.loads(BASELINE.read_text()))
+        return 0
+    machine = hardware()
+    one_thread.pin()
+    import hybridjax as hj
 
-
-def processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            return next(x.split(":")[1].strip() for x in file if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--repeat", type=int, default=3, help="later calls, the best of which counts"
-    )
-    parser.add_argument("--experiments", type=int, default=80)
-    parser.add_argument("--cycles", type=int, default=84)
-    options = parser.parse_args()
     hj.enable_x64()
-    show("hardware.cpu", f"{processor()}, {os.cpu_count()} cores")
-    show("hardware.device", jax.devices()[0].device_kind)
-    show("software", f"hybridjax {hj.__version__}, jax {jax.__version__}")
-
-    hopper = hj.models.VerticalHopper()
-    cycle = measure("find_limit_cycle", lambda: hj.find_limit_cycle(hopper), options.repeat)
-    tight = hj.find_limit_cycle(hopper, settings=TIGHT)
-    show("find_limit_cycle.error", distance(cycle.start.q, tight.start.q))
-    show("find_limit_cycle.multiplier_error", distance(cycle.multipliers, tight.multipliers))
-
-    periods = options.cycles - 20
-    design = hj.paper_design(periods=periods, experiments=options.experiments)
-    for name, family in FAMILIES.items():
-        placed = measure(
-            f"place_sections.{name}", lambda f=family: hj.place_sections(cycle, f), options.repeat
-        )
-        model = measure(
-            f"linearize.{name}", lambda p=placed: hj.linearize(cycle, p, OUTPUTS), options.repeat
-        )
-        f = design.frequencies[:: max(1, len(design.frequencies) // 60)]
-        error = model.htf(f).error(hj.linearize(tight, family, OUTPUTS).htf(f))
-        show(f"linearize.{name}.htf_error", float(np.max(error)))
-
-        def experiments(placed=placed, **settings):
-            return hj.run_experiments(cycle, placed, design, OUTPUTS, **settings)
-
-        data = measure(f"run_experiments.{name}", experiments, options.repeat)
-        finer = experiments(settings=dataclasses.replace(TIGHT, max_steps=64))
-        show(f"run_experiments.{name}.section_maps", data.u[..., 0].size)
-        show(f"run_experiments.{name}.failed", int(np.sum(~data.ok)))
-        show(f"run_experiments.{name}.error", distance(data.y, finer.y))
+    report = Report()
+    about = {"date": today(), "hardware": machine, "software": software()}
+    for group in ("hardware", "software"):
+        for name, value in about[group].items():
+            report.under(group)(name, value)
+    chosen = Options(options.repeat, options.quick, options.jaxonomy)
+    found, failed = {}, False
+    for name in options.only:
+        show, begin = report.under(name), time.perf_counter()
+        try:
+            importlib.import_module(f"cases.{name}").run(show, chosen)
+        except Exception:  # the other cases are worth having
+            failed = True
+            traceback.print_exc()
+            show("failed", "see the traceback")
+            continue
+        show("seconds", time.perf_counter() - begin)
+        values = {x: v for x, v in report.values.items() if x.startswith(f"{name}.")}
+        found[name] = about | {"repeat": options.repeat, "quick": options.quick, "values": values}
+        if options.json:
+            options.json.write_text(json.dumps(found, indent=1) + "\n")
+        if options.baseline:
+            keep_baseline(found)
+    return int(failed)
 
 
-def distance(a, b) -> float:
-    return float(np.max(np.abs(np.asarray(a) - np.asarray(b))))
+def keep_baseline(found: dict) -> None:
+    """Cases that did not run keep their numbers, with the date and the machine they are from."""
+    old = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
+    new = {name: (old | found)[name] for name in NAMES if name in old | found}
+    BASELINE.write_text(json.dumps(new, indent=1) + "\n")
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", type=names, default=NAMES, help=f"of {','.join(NAMES)}")
+    parser.add_argument("--with", dest="peer", metavar="jaxonomy=PYTHON", help="add jaxonomy")
+    parser.add_argument(
+        "--repeat", type=int, default=5, help="calls, the least time of which counts"
+    )
+    parser.add_argument("--quick", action="store_true", help="less of everything")
+    parser.add_argument("--json", type=pathlib.Path, help="a file for all numbers")
+    parser.add_argument("--baseline", action="store_true", help="keep them in baseline.json")
+    parser.add_argument("--table", action="store_true", help="only update docs/benchmarks.md")
+    options = parser.parse_args()
+    if options.table and not BASELINE.exists():
+        parser.error("there is no baseline.json yet: measure it by --baseline")
+    if options.baseline and options.quick:
+        parser.error("a baseline is not measured with --quick")
+    options.jaxonomy = None
+    if options.peer is not None:
+        peer, _, python = options.peer.partition("=")
+        if peer != "jaxonomy":
+            parser.error(f"--with knows jaxonomy, not {peer}")
+        options.jaxonomy = python or sys.executable
+    return options
+
+
+def names(text: str) -> list[str]:
+    """Names of cases, separated by commas."""
+    chosen = text.split(",")
+    for name in chosen:
+        if name not in NAMES:
+            raise argparse.ArgumentTypeError(f"there is no case {name}: {', '.join(NAMES)}")
+    return [name for name in NAMES if name in chosen]
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

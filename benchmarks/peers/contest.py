@@ -124,8 +124,10 @@ def jacobians(job: Job, exact: np.ndarray, show, repeat: int = 20) -> None:
         show(f"{label}.skipped", f'"{reason}"')
 
 
-def sizes(job: Job, show, counts=(1, 8, 80, 1000, 10_000), cycles: int = 4) -> None:
-    """Microseconds per section map in batches of several sizes: the C loop, heyoka."""
+def sizes(job: Job, exact, show, counts, cycles: int) -> None:
+    """Microseconds per section map in batches of several sizes: the C loop, heyoka.
+
+    `exact` is the record of the job's first cycles (S, 32 * cycles, 2)."""
     from . import c_peer, heyoka_peer
 
     for count in counts:
@@ -139,7 +141,9 @@ def sizes(job: Job, show, counts=(1, 8, 80, 1000, 10_000), cycles: int = 4) -> N
         ):
             try:
                 ready = peer.setup(part, *options)
-                _, seconds = measure(lambda p=part, r=ready, x=peer: x.run(p, r), repeat)
+                y, seconds = measure(lambda p=part, r=ready, x=peer: x.run(p, r), repeat)
                 show(f"{label}.{name}.microseconds", 1e6 * seconds.cpu / part.u.size)
+                error = np.abs(y - exact[np.arange(count) % len(exact)])
+                show(f"{label}.{name}.error", float(np.max(error)))
             except Unavailable as reason:
                 show(f"{label}.{name}.skipped", f'"{reason}"')
