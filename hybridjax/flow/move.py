@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._core.lanewise import shared
+from .._core.lanewise import PerLane, shared
 from .._core.results import Result
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -98,7 +98,11 @@ def record(
 
 
 def follow(
-    system: HybridSystem, lanes: Lanes, u: Float[Array, "nu L"], target: Target, tape: Tape
+    system: HybridSystem | PerLane,
+    lanes: Lanes,
+    u: Float[Array, "nu L"],
+    target: Target,
+    tape: Tape,
 ) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
     return replay(Structure(system), lanes, u, target, tape.h, tape.code)

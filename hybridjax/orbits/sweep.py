@@ -181,7 +181,7 @@ def _tiles(systems, guess, settings, settle: bool, rows, batch: int, progress: b
     """`_tile` for some rows, in calls of one size, gathered as numpy arrays."""
     arrays, rest = eqx.partition(systems, eqx.is_array)
     arrays = jax.tree_util.tree_map(np.asarray, arrays)
-    size = min(batch, len(rows))
+    size = min(batch, len(jax.tree_util.tree_leaves(arrays)[0]))  # one program for all calls
     parts = []
     for k in tqdm(range(0, len(rows), size), disable=not progress, desc="cycles"):
         some = rows[np.arange(k, k + size) % len(rows)]
