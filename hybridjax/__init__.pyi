@@ -19,7 +19,15 @@ from .experiments.multisine import (
     paper_design as paper_design,
     single_cosine as single_cosine,
 )
-from .experiments.run import run_experiments as run_experiments
+from .experiments.respond import Response as Response
+from .experiments.response import (
+    ResponseFunction as ResponseFunction,
+    response_function as response_function,
+)
+from .experiments.run import (
+    run_experiments as run_experiments,
+    stream_experiments as stream_experiments,
+)
 from .flow.move import Settings as Settings
 from .flow.sections import (
     AtEvent as AtEvent,
@@ -48,8 +56,16 @@ from .orbits.maps import (
     section_map as section_map,
 )
 from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections
+from .orbits.sweep import (
+    LimitCycles as LimitCycles,
+    find_limit_cycles as find_limit_cycles,
+)
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
+from .store import (
+    StoredExperiments as StoredExperiments,
+    store_experiments as store_experiments,
+)
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
 from .systems.system import (

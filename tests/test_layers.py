@@ -24,6 +24,7 @@ LAYERS = [
     "fitting",
     "plot",
     "io",
+    "store",
     "report",
     "reproduce",
     "cli",

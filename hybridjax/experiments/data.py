@@ -133,15 +133,7 @@ class ExperimentData(eqx.Module):
 
     def summary(self, limit: int = 5) -> str:
         """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
-        failed = np.flatnonzero(~self.ok)
-        text = [f"{self.ok.sum()}/{len(self.ok)} ok"]
-        for s in failed[:limit]:
-            cycle, section = divmod(int(self.failed_at[s]), self.sections)
-            where = f"section {section}, cycle {cycle}: " if self.failed_at[s] >= 0 else ""
-            text.append(f"#{s}: {where}{Result(int(self.result[s])).message}")
-        if len(failed) > limit:
-            text.append(f"and {len(failed) - limit} more")
-        return "; ".join(text)
+        return summary(self.result, self.failed_at, self.sections, limit)
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
@@ -151,6 +143,21 @@ class ExperimentData(eqx.Module):
             f"{self.sections} sections each, window P = {self.periods} periods; "
             f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
         )
+
+
+def summary(
+    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], sections: int, limit: int
+) -> str:
+    """What became of experiments, and where and why the first `limit` that failed did so."""
+    failed = np.flatnonzero(result != Result.OK)
+    text = [f"{len(result) - len(failed)}/{len(result)} ok"]
+    for s in failed[:limit]:
+        cycle, section = divmod(int(failed_at[s]), sections)
+        where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
+        text.append(f"#{s}: {where}{Result(int(result[s])).message}")
+    if len(failed) > limit:
+        text.append(f"and {len(failed) - limit} more")
+    return "; ".join(text)
 
 
 def _real(name: str, values: Any) -> np.ndarray:

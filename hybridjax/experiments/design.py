@@ -156,21 +156,30 @@ class Design(eqx.Module):
         """All frequencies that the design measures, ascending, each once."""
         return np.unique(self.line) / self.periods
 
-    def inputs(self, cycles: int | None = None) -> Float[np.ndarray, "S n nu"]:
+    def inputs(
+        self, cycles: int | None = None, experiments: slice | None = None
+    ) -> Float[np.ndarray, "S n nu"]:
         """The signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
 
         They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
         have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
         (which is why estimates divide by the spectrum of the window itself).
+
+        **Arguments:** `experiments`, consecutive ones, e.g. `slice(0, 100)`; by default all.
         """
         cycles = self.periods if cycles is None else cycles
         if cycles < 1:
             raise DefinitionError(f"cycles must be at least 1, not {cycles}.")
+        first, last, step = (experiments or slice(None)).indices(self.experiments)
+        if step != 1 or last <= first:
+            raise DefinitionError(f"{experiments} holds no consecutive experiments.")
+        some = slice(*np.searchsorted(self.experiment, (first, last)))
+        experiment, line, channel = self.experiment[some], self.line[some], self.channel[some]
         length = self.sections * self.periods
-        spectrum = np.zeros((self.experiments, length // 2 + 1, len(self.input_names)), complex)
-        value = 0.5 * length * self.amplitude * np.exp(1j * self.phase)
-        value = np.where(is_real(self.line, self.periods, self.sections), 2 * value.real, value)
-        spectrum[self.experiment, self.line, self.channel] = value
+        spectrum = np.zeros((last - first, length // 2 + 1, len(self.input_names)), complex)
+        value = 0.5 * length * self.amplitude[some] * np.exp(1j * self.phase[some])
+        value = np.where(is_real(line, self.periods, self.sections), 2 * value.real, value)
+        spectrum[experiment - first, line, channel] = value
         one = np.fft.irfft(spectrum, n=length, axis=1)
         index = np.arange(cycles * self.sections) % length
         return one[:, index]

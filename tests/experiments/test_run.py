@@ -1,6 +1,7 @@
 """Batched experiments on the hopper: accuracy, isolation of failures, bad input.
 
-All runs have 80 experiments of 84 cycles, so that one program per section family is compiled.
+All runs have batches of 40 experiments of 84 cycles, so that one program for each family of
+sections is compiled.
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ from ..orbits import hopper_scipy
 
 FAMILIES = ("isochron", "kinematic")
 N, CYCLES = 32, 84
+BATCH = dict(batch=40)
 
 
 @pytest.fixture(scope="session")
@@ -34,13 +36,13 @@ def family(request, hopper_cycle, design):
         {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}[request.param]
     )
     ldtp = request.getfixturevalue(f"{request.param}_ldtp")
-    data = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS)
+    data = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, **BATCH)
     return request.param, placed, ldtp, data
 
 
 @pytest.fixture(scope="session")
 def isochron_data(hopper_cycle, placed_isochrons, design):
-    return hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS)
+    return hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS, **BATCH)
 
 
 def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
@@ -81,7 +83,7 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     _, placed, _, data = family
     u = design.inputs(CYCLES)
     u[17, 3 * N : 4 * N] = 60.0
-    broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20)
+    broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20, **BATCH)
     assert list(np.flatnonzero(~broken.ok)) == [17]
     assert 3 * N <= broken.failed_at[17] < 8 * N
     assert "#17: section" in broken.summary() and "79/80 ok" in broken.summary()
@@ -96,7 +98,7 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
 
 def test_batches_do_not_change_the_result(hopper_cycle, placed_isochrons, isochron_data):
     u = np.concatenate([isochron_data.u, isochron_data.u[:20]])
-    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, batch=80)
+    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, **BATCH)
     np.testing.assert_array_equal(data.y[:80], isochron_data.y)
     np.testing.assert_allclose(data.y[80:], isochron_data.y[:20], atol=1e-12)
 
@@ -105,7 +107,9 @@ def test_a_periodic_start_has_no_transient(hopper_cycle, family):
     _, placed, ldtp, _ = family
     line = np.arange(1, 81)[:, None]
     u = 1e-5 * np.cos(2 * np.pi * line * np.arange(CYCLES * N) / (CYCLES * N))[..., None]
-    data = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, start="periodic", discard=0)
+    data = hj.run_experiments(
+        hopper_cycle, placed, u, OUTPUTS, start="periodic", discard=0, **BATCH
+    )
     assert data.periods == CYCLES
     for k in (3, 24, 79):
         x0 = ldtp.periodic_state(u[k], CYCLES)
@@ -117,7 +121,7 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
     hopper_cycle, placed_isochrons, design
 ):
     u = design.inputs(CYCLES) * 100
-    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20)
+    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH)
     assert 0 < data.ok.sum() < 80
     codes = {hj.Result(int(r)) for r in data.result[~data.ok]}
     assert codes == {hj.Result.EVENT_ORDER}
@@ -126,7 +130,7 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
 def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     unstable = dataclasses.replace(hopper_cycle, factors=1.1 * hopper_cycle.factors)
     with pytest.raises(hj.ComputationError, match="not stable .largest multiplier 3.4"):
-        hj.run_experiments(unstable, placed_isochrons, design, OUTPUTS)
+        hj.run_experiments(unstable, placed_isochrons, design, OUTPUTS, **BATCH)
 
 
 @pytest.mark.parametrize(
@@ -155,13 +159,13 @@ def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
 
 
 def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isochrons, design):
-    hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS)
+    hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS, **BATCH)
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
     )
     stiffer = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(10.001, float))
-    hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS)
+    hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS, **BATCH)
     assert not compiled
 
 

@@ -1,0 +1,250 @@
+"""Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
+
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from tqdm import tqdm
+
+from .._core.compile import quick_jit
+from .._core.errors import ComputationError, DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..flow.move import Settings
+from ..orbits.cycle import LimitCycle
+from ..orbits.linearize import linearize
+from ..orbits.place import PATIENCE, PlacedSections, as_placed
+from ..orbits.plan import Plan, make_plan, section_scales
+from ..periodic.ldtp import LDTP
+from ..systems.output import Output
+from ..systems.structure import Outputs, Structure
+from .data import ExperimentData
+from .design import Design
+from .respond import observe, respond
+
+
+# Experiments in one compiled call: on CPU, where more of them leave the cache and fewer share the
+# cost of what is done once for all; and elsewhere.
+_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+# Splitting fewer than this among workers gains nothing.
+_FEW = 32
+# A multiple of the numbers that processors add at once: other batches are up to a third slower.
+_VECTOR = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Campaign:
+    """What all experiments have in common. `run` does some of them."""
+
+    placed: PlacedSections
+    source: Design | np.ndarray
+    count: int
+    """S, the number of experiments."""
+    cycles: int
+    """Their length in periods of the cycle."""
+    periods: int
+    outputs: Outputs
+    accuracy: float
+    scales: Float[np.ndarray, "N n"]
+    settings: Settings
+    plan: Plan
+    model: LDTP | None
+    """Predicts the start of a periodic response; None to start on the cycle."""
+
+    def inputs(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
+        """The inputs of some experiments."""
+        if isinstance(self.source, Design):
+            return self.source.inputs(self.cycles, rows)
+        return np.asarray(self.source[rows], float)
+
+    def run(self, rows: slice, size: int, workers: int, progress: bool = False) -> ExperimentData:
+        """Run some of the experiments, in batches of `size` on so many threads (see `divide`)."""
+        N = self.placed.count
+        u = self.inputs(rows)
+        S = len(u)
+        start = self._start(u)
+        device = jax.config.jax_default_device  # which other threads would not know
+
+        def work(k):
+            require_x64()
+            some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
+            with jax.default_device(device):
+                part = _respond(
+                    self.placed,
+                    self.plan,
+                    jnp.asarray(start[:, some]),
+                    jnp.asarray(u[some]),
+                    tuple(self.outputs.items),
+                    self.settings,
+                )
+                return [np.asarray(x)[: S - k] for x in part]
+
+        with ThreadPoolExecutor(workers) as pool:
+            parts = pool.map(work, range(0, S, size))
+            bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
+            y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
+        base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
+        if not (np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)).all():
+            for a in np.unique(self.placed.lanes.chart):
+                self.outputs.require(int(a))
+            raise DefinitionError(
+                "an output is NaN although its experiment ran well: it is not defined everywhere "
+                "that the experiments go."
+            )
+        y.reshape(S, -1, N, y.shape[2])[...] -= base
+        return ExperimentData(
+            u,
+            y,
+            sections=N,
+            periods=self.periods,
+            inputs=self.placed.cycle.system.inputs,
+            outputs=self.outputs.names,
+            result=result,
+            failed_at=failed_at,
+            error=error,
+            cycle_outputs=base,
+            family=self.placed.sections.label,
+        )
+
+    def _start(self, u) -> Float[np.ndarray, "n S"]:
+        """Times and states in which the experiments begin, at section 0."""
+        lanes = self.placed.lanes
+        on_cycle = np.concatenate([lanes.t[None], lanes.q])[:, :1]
+        if self.model is None:
+            return np.repeat(on_cycle, len(u), axis=1)
+        embed = np.asarray(self.placed.frames()[0][0])[:, : self.model.A.shape[1]]
+        window = jnp.asarray(u[:, : self.periods * self.placed.count])
+        x0 = jax.vmap(lambda u: self.model.periodic_state(u, self.periods))(window)
+        return on_cycle + embed @ np.asarray(x0).T
+
+
+_respond = eqx.filter_jit(respond)
+
+
+def prepare(
+    cycle: LimitCycle,
+    sections,
+    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    outputs: Sequence[str | Output] | str | Output,
+    *,
+    start: str = "cycle",
+    discard: int | None = None,
+    periods: int | None = None,
+    accuracy: float = 1e-9,
+    scale: Mapping[str, float] | None = None,
+) -> Campaign:
+    """Check what `run_experiments` was given, and do what is done once for all experiments."""
+    placed = as_placed(cycle, sections)
+    require_x64(cycle)
+    z = Structure(cycle.system).resolve_outputs(outputs)
+    if not 1e-13 <= accuracy <= 1e-2:
+        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
+    if start not in ("cycle", "periodic"):
+        raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
+    if not cycle.stable:
+        largest = np.abs(cycle.multipliers[0])
+        raise ComputationError(
+            f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
+            "experiments would leave it: stabilise the system, or use the exact linearisation "
+            "(`linearize`), which needs no experiments."
+        )
+    nu = len(cycle.system.inputs)
+    source, count, cycles, periods = _source(design, placed.count, nu, start, discard, periods)
+    model = None
+    if start == "periodic":
+        if cycles % periods:
+            raise DefinitionError(
+                "a periodic start needs inputs of a whole number of windows: use `discard=0`."
+            )
+        model = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
+    scales = section_scales(placed, scale)
+    settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
+    plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
+    return Campaign(
+        placed, source, count, cycles, periods, z, float(accuracy), scales, settings, plan, model
+    )
+
+
+def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:
+    """The size of batches for S experiments, and how many threads share them.
+
+    **Raises:** `DefinitionError` for numbers below one.
+    """
+    if batch is not None and batch < 1:
+        raise DefinitionError(f"batch is the number of experiments per call, not {batch}.")
+    if workers is not None and workers < 1:
+        raise DefinitionError(f"workers is the number of threads, not {workers}.")
+    on_cpu = jax.default_backend() == "cpu"
+    if workers is None:
+        workers = _cores() if on_cpu else 1
+    if batch is not None:
+        size = min(batch, S)
+    else:
+        most = _BATCH if on_cpu else _BATCH_ON_ACCELERATOR
+        # As many batches as there are turns of all workers, and all batches of one size.
+        turns = -(-S // (most * workers))
+        size = max(-(-S // (turns * workers)), min(_FEW, S))
+        size = min(-(-size // _VECTOR) * _VECTOR, max(S, 1))
+    return size, min(workers, -(-S // size))
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _source(design, N: int, nu: int, start: str, discard, periods):
+    """Where inputs come from, the number of experiments, their cycles, and those of the window."""
+    discard = (20 if start == "cycle" else 0) if discard is None else discard
+    if discard < 0 or discard != int(discard):
+        raise DefinitionError(f"discard is the number of cycles before the window, not {discard}.")
+    if isinstance(design, Design):
+        if design.sections != N:
+            raise DefinitionError(
+                f"the design is for {design.sections} sections, but the family has {N}."
+            )
+        if len(design.input_names) != nu:
+            raise DefinitionError(
+                f"the design has {len(design.input_names)} inputs, but the system has {nu}."
+            )
+        if periods not in (None, design.periods):
+            raise DefinitionError(
+                f"`periods` is for inputs given as an array; the design has {design.periods}."
+            )
+        return design, design.experiments, int(discard) + design.periods, design.periods
+    if np.iscomplexobj(design):
+        raise DefinitionError("inputs must be real; these are complex.")
+    u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
+    if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
+        raise DefinitionError(
+            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
+            f"the {N} sections; got {u.shape}."
+        )
+    for k in range(0, len(u), 1024):
+        finite = np.isfinite(np.asarray(u[k : k + 1024], float)).all(axis=(1, 2))
+        if not finite.all():
+            worst = k + int(np.argmin(finite))
+            raise DefinitionError(f"the input of experiment {worst} is NaN or infinite.")
+    cycles = u.shape[1] // N
+    available = cycles - discard
+    periods = available if periods is None else periods
+    if not 1 <= periods <= available:
+        raise DefinitionError(
+            f"inputs of {cycles} cycles less {discard} discarded ones leave {available} "
+            f"for estimation; got periods = {periods}."
+        )
+    return u, len(u), cycles, int(periods)
+
+
+@quick_jit
+def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
+    s = Structure(placed.cycle.system)
+    u = jnp.zeros((s.nu, placed.count))
+    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
