@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .lanes import Lanes, for_each_chart, only
+from .lanes import Lanes, for_each_chart, needed, only
 from .watch import Watch
 
 
@@ -122,8 +122,9 @@ def apply_resets(
 
         def work(carry, g=g, n=n, b=b, here=here):
             q, chart = carry
-            arguments = only(here, t), only(here, q[:n]), only(here, u)
-            new = s.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))(*arguments)
+            own = Structure(needed(here, s.source))
+            arguments = needed(here, [only(here, x) for x in (t, q[:n], u)])
+            new = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))(*arguments)
             new = jnp.zeros_like(q).at[: s.dims[b]].set(new)
             return jnp.where(here, new, q), jnp.where(here, b, chart)
 

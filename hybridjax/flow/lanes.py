@@ -50,3 +50,18 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     undefined; NaN there would poison reverse-mode derivatives even if it is masked afterwards.
     """
     return jnp.where(mask, x, x[..., jnp.argmax(mask)][..., None])
+
+
+def needed(mask: Bool[Array, " L"], tree):
+    """`tree` itself, without derivatives if `mask` has no lanes.
+
+    Where `jax.vmap` maps a branch, both of its sides are computed, the one that is not taken with
+    zero cotangents. At another chart's states these may meet infinite derivatives, and zero times
+    infinity is NaN: it must not reach states or parameters.
+    """
+    some = mask.any()
+
+    def cut(x):
+        return jnp.where(some, x, jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
+
+    return jax.tree_util.tree_map(cut, tree)

@@ -5,6 +5,9 @@ left, so that this function has exact derivatives in forward and reverse mode. T
 crossings follow from two Newton steps on the true guard, which is the saltation formula.
 """
 
+import dataclasses
+import functools as ft
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -12,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import apply_resets, scheduled_time
-from .lanes import Lanes, for_each_chart, only
+from .lanes import Lanes, for_each_chart, needed, only
 from .step import rk_step
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .target import Target
@@ -49,11 +52,13 @@ def replay(
 
         return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
 
+    @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry, rows):
         follow = lambda carry: jax.lax.scan(row, carry, rows)[0]  # noqa: E731
         return jax.lax.cond((rows[1] != IDLE).any(), follow, lambda carry: carry, carry), None
 
-    # Most tapes are empty but for their beginning: empty blocks of rows are skipped.
+    # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
+    # mode keeps no more of a block than where it starts.
     rows, L = h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
     h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
@@ -68,17 +73,18 @@ def _advance(s, t, q, chart, moves, u, target, h, which):
     def work(a, here, out):
         t_out, q_out = out
         n = s.dims[a]
-        t0, q0, u0 = only(here, t), only(here, q[:n]), only(here, u)
-        h0, index = only(here, h), only(here, target.index)
-        crossing = jnp.where(here, which, -1)
-        step = rk_step(chart_field(s, a, u0), t0, q0, h0)
+        own, levels = needed(here, (s.source, target.levels))
+        own, goal = Structure(own), dataclasses.replace(target, levels=levels)
+        t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
+        index, crossing = only(here, target.index), jnp.where(here, which, -1)
+        step = rk_step(chart_field(own, a, u0), t0, q0, h0)
         q1, t1 = step.q, t0 + h0
 
         def land():
-            settled = settle(s, a, target, t1, q1, step.f1, u0, index, crossing)
+            settled = settle(own, a, goal, t1, q1, step.f1, u0, index, crossing)
             return t1 + settled.past, settled.q
 
-        if watched(s, a, target):
+        if watched(own, a, goal):
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
         return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
 

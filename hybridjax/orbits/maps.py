@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
-from .._core.results import Result
+from .._core.results import Result, update_result
 from .._core.tracing import is_traced
 from ..flow.move import move
 from ..systems.structure import Structure
@@ -17,14 +18,15 @@ from .place import PlacedSections, as_placed
 
 
 class Arrival(NamedTuple):
-    """Where a section map arrives."""
+    """Where a section map arrives. Times and states are NaN if it does not, and so are their
+    derivatives."""
 
     t: Float[Array, ""]
     """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""
     q: Float[Array, " n"]
     """State in the chart in which the cycle crosses section j."""
     result: Int[Array, ""]
-    """`Result` code."""
+    """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's."""
 
 
 class SectionMap(eqx.Module):
@@ -32,7 +34,8 @@ class SectionMap(eqx.Module):
 
     Call it with `q` (n_i,), a state near section i of the cycle, `u` (nu,), zero by default, and
     `t`, the time there (by default the cycle's). It returns an `Arrival` and can be
-    differentiated, jitted and vmapped.
+    differentiated, jitted and vmapped. Made under a JAX transformation, where charts are not
+    known, it takes and returns states that are padded with zeros to the largest chart's dimension.
 
     **Raises** (outside of JAX transformations): `ComputationError` if section j is not reached,
     or is reached in another chart than the cycle's.
@@ -41,14 +44,13 @@ class SectionMap(eqx.Module):
     placed: PlacedSections
     i: int = eqx.field(static=True)
     j: int = eqx.field(static=True)
+    dims: tuple[int, int] = eqx.field(static=True)
+    """Dimensions n_i and n_j."""
 
     @property
     def fixed_point(self) -> Float[Array, " n"]:
         """The cycle's state at section i."""
-        return self.placed.lanes.q[: self._dim(self.i), self.i]
-
-    def _dim(self, k: int) -> int:
-        return Structure(self.placed.cycle.system).dims[int(self.placed.lanes.chart[k])]
+        return self.placed.lanes.q[: self.dims[0], self.i]
 
     def __call__(self, q, u=None, t=None) -> Arrival:
         q = jnp.asarray(q, float)
@@ -60,20 +62,13 @@ class SectionMap(eqx.Module):
         nu = len(self.placed.cycle.system.inputs)
         u = jnp.broadcast_to(jnp.asarray(0.0 if u is None else u, float), (nu,))
         t = self.placed.lanes.t[self.i] if t is None else jnp.asarray(t, float)
-        arrival, chart = _map(self.placed, self.i, self.j, q, u, t)
-        if not is_traced((arrival, chart)):
-            code = Result(int(arrival.result))
-            if code == Result.OK and int(chart) != int(self.placed.lanes.chart[self.j]):
-                raise ComputationError(
-                    f"{self.placed.sections.describe(self.j)} is reached in another chart than on "
-                    "the cycle: the start is too far from it."
-                )
-            if code != Result.OK:
-                raise ComputationError(
-                    f"{self.placed.sections.describe(self.j)} is not reached from section "
-                    f"{self.i}: {code.message}."
-                )
-        return Arrival(arrival.t, arrival.q[: self._dim(self.j)], arrival.result)
+        arrival = _map(self.placed, self.i, self.j, q, u, t)
+        if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
+            raise ComputationError(
+                f"{self.placed.sections.describe(self.j)} is not reached from section {self.i}: "
+                f"{code.message}."
+            )
+        return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
 
 
 def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
@@ -88,11 +83,13 @@ def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
             raise DefinitionError(
                 f"section {k} does not exist; sections are 0..{placed.count - 1}."
             )
-    return SectionMap(placed, int(i), int(j))
+    s, chart = Structure(cycle.system), placed.lanes.chart
+    dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
+    return SectionMap(placed, int(i), int(j), dims)
 
 
 @quick_jit
-def _map(placed, i, j, q, u, t):
+def _map(placed, i, j, q, u, t) -> Arrival:
     system = placed.cycle.system
     s = Structure(system)
     pick = slice(i, i + 1)
@@ -107,4 +104,6 @@ def _map(placed, i, j, q, u, t):
     target = placed.target(jnp.array([j]), t[None], jnp.array([1 if j <= i else 0]))
     moved = move(system, start, u[:, None], target, placed.cycle.settings)
     end = moved.lanes
-    return Arrival(end.t[0], end.q[:, 0], moved.result[0]), end.chart[0]
+    result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
+    keep = jnp.where(result == Result.OK, 1.0, jnp.nan)  # a factor makes derivatives NaN, too
+    return Arrival((keep * end.t)[0], (keep * end.q)[:, 0], result[0])
