@@ -15,7 +15,8 @@ def call(module: str, *arguments: str, **environment: str) -> Any:
     path = os.pathsep.join([str(here), *(x for x in sys.path if x)])
     done = subprocess.run(
         (sys.executable, "-m", f"cases.{module}", *arguments),
-        env=os.environ | environment | {"PYTHONPATH": path},
+        # Programs from the cache make XLA print pages about features of the processor.
+        env=os.environ | environment | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"},
         stdout=subprocess.PIPE,
         text=True,
         check=True,
