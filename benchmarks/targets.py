@@ -82,8 +82,7 @@ TARGETS = (
     *(
         Target(f"{what}, {family}", f"compile.{family}.{key}", 0, 0)
         for what, key in {
-            "programs traced again for another value": "another_value.traces",
-            "... compiled again": "another_value.compilations",
+            "programs compiled again for another value": "another_value.compilations",
             "programs with host callbacks": "programs_with_callbacks",
         }.items()
         for family in ("isochron", "kinematic")

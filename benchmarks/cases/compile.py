@@ -73,20 +73,27 @@ def main(family: str, folder: str | None) -> None:
         return
     pathlib.Path(folder).mkdir()
     jax.config.update("jax_dump_ir_to", folder)
-    counts = {"jaxpr_trace": 0, "backend_compile": 0}
+    seen = {"jaxpr_trace": [], "backend_compile": []}
 
-    def listen(event, *_, **__):
-        for name in counts:
-            counts[name] += name in event
+    def listen(event, *_, fun_name="", **__):
+        for name, functions in seen.items():
+            if name in event:
+                functions.append(fun_name)
 
     first_calls(family)
     jax.monitoring.register_event_duration_secs_listener(listen)
+    first_calls(family)
+    same = {name: len(functions) for name, functions in seen.items()}
     again = first_calls(family, 1)
     texts = [x.read_text() for x in pathlib.Path(folder).iterdir() if x.is_file()]
     callbacks = [x for x in texts if re.search(r"custom_call.*callback", x)]
     found = {
-        "another_value.traces": counts["jaxpr_trace"],
-        "another_value.compilations": counts["backend_compile"],
+        # Calls of JAX outside of compiled programs trace small functions at every call.
+        "same_value.traces": same["jaxpr_trace"],
+        "same_value.compilations": same["backend_compile"],
+        "another_value.traces": len(seen["jaxpr_trace"]) - same["jaxpr_trace"],
+        "another_value.traced": " ".join(seen["jaxpr_trace"][same["jaxpr_trace"] :]),
+        "another_value.compilations": len(seen["backend_compile"]) - same["backend_compile"],
         "programs": len(texts),
         "programs_with_callbacks": len(callbacks),
     }
