@@ -19,8 +19,8 @@ from .._core.results import Result
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import PATIENCE, PlacedSections, as_placed
-from ..orbits.plan import Plan, make_plan, section_scales
+from ..orbits.place import PlacedSections, as_placed
+from ..orbits.plan import Plan, plan_flow
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
@@ -143,8 +143,6 @@ def prepare(
     placed = as_placed(cycle, sections)
     require_x64(cycle)
     z = Structure(cycle.system).resolve_outputs(outputs)
-    if not 1e-13 <= accuracy <= 1e-2:
-        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
     if start not in ("cycle", "periodic"):
         raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
     if not cycle.stable:
@@ -163,9 +161,7 @@ def prepare(
                 "a periodic start needs inputs of a whole number of windows: use `discard=0`."
             )
         model = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
-    scales = section_scales(placed, scale)
-    settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
-    plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
+    plan, settings, scales = plan_flow(placed, accuracy, scale)
     return Campaign(
         placed, source, count, cycles, periods, z, float(accuracy), scales, settings, plan, model
     )

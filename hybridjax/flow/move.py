@@ -13,6 +13,7 @@ from .._core.results import Result
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .batching import vmap_to_lanes
+from .lane_jvp import lane_jvp
 from .lanes import Lanes
 from .replay import replay
 from .search import Found, search
@@ -161,16 +162,18 @@ def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
     moved, tape = record(system, lanes, u, target, settings, setout, result, how.new_input)
 
-    def ends(system, t, q, u, target):
+    def ends(lane, shared):
+        (t, q, u, rest), (system, levels) = lane, shared
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
-        return follow(system, start, u, target, tape)
+        to = dataclasses.replace(rest, levels=levels)
+        return replay(Structure(system), start, u, to, tape.h, tape.code, how.glide)
 
     t_system, t_lanes, t_u, t_target, *_ = tangents
-    (t, q), (t_t, t_q) = eqx.filter_jvp(
-        ends,
-        (system, lanes.t, lanes.q, u, target),
-        (t_system, t_lanes.t, t_lanes.q, t_u, t_target),
-    )
+    bare, t_bare = (dataclasses.replace(x, levels=None) for x in (target, t_target))
+    t_bare = eqx.tree_at(lambda x: x.limit, t_bare, None, is_leaf=lambda x: x is None)
+    lane = (lanes.t, lanes.q, u, bare), (t_lanes.t, t_lanes.q, t_u, t_bare)
+    shared = (system, target.levels), (t_system, t_target.levels)
+    (t, q), (t_t, t_q) = lane_jvp(ends, lane, shared)
     out = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (t, q))
     nothing = jax.tree_util.tree_map(lambda _: None, out)
     d_out = eqx.tree_at(

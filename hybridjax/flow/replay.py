@@ -22,7 +22,7 @@ from .target import Target
 from .watch import chart_field, settle, watched
 
 
-_BLOCK = 8
+_BLOCK = 4
 
 
 def replay(
@@ -32,6 +32,7 @@ def replay(
     target: Target,
     h: Float[Array, "R L"],
     code: Int[Array, "R L"],
+    unroll: bool = False,
 ) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
     """Times and states at the end of the moves `h` with outcomes `code` (see `search.Tape`)."""
     scheduled = jnp.array([isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False])
@@ -46,7 +47,7 @@ def replay(
             h1 = jnp.where(code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h))
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock, -1, which)
-            t, q = _advance(s, t, q, chart, code != IDLE, u, target, h1, which)
+            t, q = _advance(s, t, q, chart, code != IDLE, u, target, h1, which, unroll)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
@@ -67,7 +68,7 @@ def replay(
     return t, q
 
 
-def _advance(s, t, q, chart, moves, u, target, h, which):
+def _advance(s, t, q, chart, moves, u, target, h, which, unroll):
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
 
     def work(a, here, out):

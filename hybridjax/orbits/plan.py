@@ -6,13 +6,18 @@ way than the cycle are integrated just as well, only perhaps in more steps.
 
 import dataclasses
 import functools as ft
+import weakref
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
+from .._core.errors import DefinitionError
 from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
@@ -179,3 +184,56 @@ def _accumulated(J, error, scale) -> Float[Array, ""]:
 
     _, sizes = jax.lax.scan(follow, jnp.zeros(scale.shape[1]), jnp.arange(_TURNS * N))
     return jnp.max(sizes)
+
+
+def section_scales(placed: PlacedSections, scale: Mapping[str, float] | None) -> np.ndarray:
+    """Scales (N, 1 + d) of time and states at the sections: the largest size on the cycle."""
+    s = Structure(placed.cycle.system)
+    chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
+    given = dict(scale or {})
+    out = np.ones((placed.count, 1 + s.d))
+    out[:, 0] = given.pop("t", float(placed.cycle.period))
+    for name in s.state_names():
+        places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
+        size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
+        size = given.pop(name, size if size > 0 else 1.0)
+        for a, k in places:
+            out[chart == a, 1 + k] = size
+    if given or not np.all(out > 0) or not np.all(np.isfinite(out)):
+        raise DefinitionError(
+            "`scale` gives positive sizes of states, by name, and of time, as t; states are "
+            f"{', '.join(s.state_names())}. Got {scale}."
+        )
+    return out
+
+
+class Planned(NamedTuple):
+    """A plan, and what it was made from."""
+
+    plan: Plan
+    settings: Settings
+    scales: Float[np.ndarray, "N n"]
+
+
+# Plans by sections, accuracy and scales, as long as the sections live.
+_made: dict[tuple, tuple[weakref.ref, Planned]] = {}
+
+
+def plan_flow(
+    placed: PlacedSections, accuracy: float, scale: Mapping[str, float] | None = None
+) -> Planned:
+    """The plan for placed sections; made once for each accuracy and scale.
+
+    **Raises:** `DefinitionError` for an accuracy out of range, or scales of unknown states.
+    """
+    if not 1e-13 <= accuracy <= 1e-2:
+        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
+    key = id(placed), float(accuracy), tuple(sorted((scale or {}).items()))
+    owner, planned = _made.get(key, (None, None))
+    if owner is None or owner() is not placed:
+        scales = section_scales(placed, scale)
+        settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
+        plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
+        planned = Planned(plan, settings, scales)
+        _made[key] = weakref.ref(placed, lambda _: _made.pop(key, None)), planned
+    return planned
