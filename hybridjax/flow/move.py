@@ -162,18 +162,16 @@ def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
     moved, tape = record(system, lanes, u, target, settings, setout, result, how.new_input)
 
-    def ends(lane, shared):
-        (t, q, u, rest), (system, levels) = lane, shared
+    def ends(lane, common):
+        (t, q, u, time), (system, levels) = lane, common
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
-        to = dataclasses.replace(rest, levels=levels)
+        to = dataclasses.replace(target, time=time, levels=levels)
         return replay(Structure(system), start, u, to, tape.h, tape.code, how.glide)
 
     t_system, t_lanes, t_u, t_target, *_ = tangents
-    bare, t_bare = (dataclasses.replace(x, levels=None) for x in (target, t_target))
-    t_bare = eqx.tree_at(lambda x: x.limit, t_bare, None, is_leaf=lambda x: x is None)
-    lane = (lanes.t, lanes.q, u, bare), (t_lanes.t, t_lanes.q, t_u, t_bare)
-    shared = (system, target.levels), (t_system, t_target.levels)
-    (t, q), (t_t, t_q) = lane_jvp(ends, lane, shared)
+    lane = (lanes.t, lanes.q, u, target.time), (t_lanes.t, t_lanes.q, t_u, t_target.time)
+    common = (system, target.levels), (t_system, t_target.levels)
+    (t, q), (t_t, t_q) = lane_jvp(ends, lane, common)
     out = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (t, q))
     nothing = jax.tree_util.tree_map(lambda _: None, out)
     d_out = eqx.tree_at(
