@@ -5,6 +5,7 @@ also given as multiples of a plain run of the loss, and memory is what the compi
 for besides its arguments and results.
 """
 
+import dataclasses
 import functools as ft
 
 import equinox as eqx
@@ -58,7 +59,10 @@ def _run(ready, function, theta, arrays):
 
 def _loss(task: Problem):
     """A function of (theta (7,), arrays), and both."""
-    arrays, rest = eqx.partition(task.response(), eqx.is_array)
+    *others, settings = task.response()
+    # As `response_function` has it: derivatives remember this many steps between sections.
+    settings = dataclasses.replace(settings, max_steps=32)
+    arrays, rest = eqx.partition((*others, settings), eqx.is_array)
     system = task.cycle.system
     theta = jnp.array([getattr(system, name) for name in PARAMETERS])
 

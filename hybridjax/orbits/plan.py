@@ -131,7 +131,9 @@ def make_plan(
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
     together = _CAUTION * _accumulated(J, error[best, section], scale) / jnp.sum(impact)
     weight = impact / estimate * jnp.clip(together, 1 / _CANCEL, 1.0)
-    return Plan(longest / jnp.array(_PIECES)[best], lead, slack * estimate, weight)
+    # An estimate bounds the error itself, too: a section's share of the accuracy is always allowed.
+    slack = jnp.maximum(slack * estimate, 1 / N)
+    return Plan(longest / jnp.array(_PIECES)[best], lead, slack, weight)
 
 
 def _fewest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
