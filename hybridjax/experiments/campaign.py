@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -75,7 +76,7 @@ class Campaign:
             require_x64()
             some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
             with jax.default_device(device):
-                part = _respond(
+                part = _once_compiled(
                     self.placed,
                     self.plan,
                     jnp.asarray(start[:, some]),
@@ -125,6 +126,19 @@ class Campaign:
 
 
 _respond = eqx.filter_jit(respond)
+_compiling, _compiled = threading.Lock(), set()
+
+
+def _once_compiled(*arguments):
+    """`_respond`, where threads that need the same program wait until one has compiled it."""
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    program = structure, tuple(getattr(x, "shape", x) for x in leaves)
+    if program in _compiled:
+        return _respond(*arguments)
+    with _compiling:
+        out = _respond(*arguments)
+        _compiled.add(program)
+    return out
 
 
 def prepare(
