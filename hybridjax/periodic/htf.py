@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
 
 from .._core.errors import DefinitionError
 from .._core.tracing import is_traced
@@ -38,12 +38,21 @@ class HTF(eqx.Module):
     - `sections`: `N`, the number of sections (samples) in one period.
     - `inputs`, `outputs`: names.
     - `source`: a label, "exact" or "estimate".
+    - `variance` (M, F, ny, nu): of estimates, E|dH|^2 of the complex error dH, which is circular
+      (real and imaginary part each have half of it). Everything random that the experiments let
+      be seen; None where they do not.
+    - `noise_variance` (M, F, ny, nu): the part of it that is noise, from repeated periods. The
+      rest is nonlinear distortion, which random phases make random. None where it was not split.
+    - `freedom` (F,): complex degrees of freedom of `variance`; None where it is known exactly.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
 
     f: Float[Array, " F"]
     H: Complex[Array, "M F ny nu"]
+    variance: Float[Array, "M F ny nu"] | None
+    noise_variance: Float[Array, "M F ny nu"] | None
+    freedom: Float[Array, " F"] | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -59,6 +68,10 @@ class HTF(eqx.Module):
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         source: str = "estimate",
+        *,
+        variance: Any = None,
+        noise_variance: Any = None,
+        freedom: Any = None,
     ):
         H = H if isinstance(H, jax.Array) else np.asarray(H)
         if not np.issubdtype(H.dtype, np.number) or H.ndim != 4:
@@ -81,6 +94,9 @@ class HTF(eqx.Module):
         self.outputs = names("outputs", outputs, H.shape[2])
         self.inputs = names("inputs", inputs, H.shape[3])
         self.source = source
+        self.variance = _optional("variance", variance, H.shape)
+        self.noise_variance = _optional("noise_variance", noise_variance, H.shape)
+        self.freedom = _optional("freedom", freedom, self.f.shape)
 
     def __repr__(self) -> str:
         count = self.f.shape[-1]
@@ -110,7 +126,31 @@ class HTF(eqx.Module):
     def select(self, harmonics: int | Iterable) -> "HTF":
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.sections)
-        return self._with(self.f, self.H[np.array([self._index(m) for m in harmonics])], harmonics)
+        rows = np.array([self._index(m) for m in harmonics])
+        variance, noise = (None if v is None else v[rows] for v in self._variances)
+        return self._with(self.f, self.H[rows], harmonics, variance, noise, self.freedom)
+
+    def confidence_radius(self, level: float = 0.95) -> Float[Array, "M F ny nu"]:
+        r"""Radius of the disc around each estimate that holds the true value with this probability.
+
+        $r^2 = v\, F_{2, 2\nu}(level) = v\, \nu\, ((1 - level)^{-1/\nu} - 1)$ for the variance $v$
+        with $\nu$ complex degrees of freedom: the error is complex normal, and $v$ was estimated
+        from few experiments. The true value is the best linear approximation for inputs of the
+        kind that was applied, not the response to infinitely small ones.
+
+        **Raises:** `DefinitionError` without `variance`.
+        """
+        if self.variance is None:
+            raise DefinitionError(
+                "the HTFs have no variance: estimate them from several realisations of the "
+                "design or from repeated periods."
+            )
+        if not 0 < level < 1:
+            raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
+        if self.freedom is None:
+            return jnp.sqrt(-np.log1p(-level) * self.variance)
+        quantile = self.freedom * jnp.expm1(-np.log1p(-level) / self.freedom)
+        return jnp.sqrt(quantile[:, None, None] * self.variance)
 
     def interpolate(self, f: Any) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbours (host side).
@@ -120,13 +160,15 @@ class HTF(eqx.Module):
 
         **Arguments:** `f` (F,), cycles per period.
 
+        Variances are interpolated linearly, which is on the safe side: a spline averages.
+
         **Raises:** `DefinitionError` if a frequency lies in a gap more than twice as wide as the
         widest step between the frequencies given (or outside them all).
         """
         if is_traced(self.f, self.H, f):
             raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
         f = np.asarray(real_array("f", np.atleast_1d(f), ndim=1))
-        knots, values = self._neighbours()
+        knots, values = self._neighbours(self.H)
         given = np.unique(self.f)
         if len(given) < 2:
             raise DefinitionError("Interpolation needs at least two frequencies.")
@@ -144,7 +186,17 @@ class HTF(eqx.Module):
                 f"f = {f[missing][0]:g} cycles per period is too far from the frequencies "
                 f"measured ({given[0]:g} to {given[-1]:g}) to interpolate."
             )
-        return self._with(f, H, self.harmonics)
+
+        def linear(values):
+            if values is None:
+                return None
+            line = make_interp_spline(*self._neighbours(values), k=1, axis=1)
+            return line(place)
+
+        freedom = None if self.freedom is None else self.freedom[None, :, None, None]
+        freedom = None if freedom is None else linear(freedom + 0 * self.H.real)[0, :, 0, 0]
+        variance, noise = map(linear, self._variances)
+        return self._with(f, H, self.harmonics, variance, noise, freedom)
 
     def predict(self, u: ArrayLike) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -222,8 +274,15 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
-    def _with(self, f, H, harmonics):
-        return HTF(f, H, harmonics, self.sections, self.inputs, self.outputs, self.source)
+    @property
+    def _variances(self):
+        return self.variance, self.noise_variance
+
+    def _with(self, f, H, harmonics, variance, noise_variance, freedom):
+        return HTF(
+            f, H, harmonics, self.sections, self.inputs, self.outputs, self.source,
+            variance=variance, noise_variance=noise_variance, freedom=freedom,
+        )  # fmt: skip
 
     def _circle(self, f):
         """`f` modulo `N`, between `-N/2` and `N/2`."""
@@ -241,9 +300,9 @@ class HTF(eqx.Module):
         mirror = [known.get(-m % self.sections) for m in self.harmonics]
         return None if None in mirror else mirror
 
-    def _neighbours(self):
-        """Distinct frequencies on three turns of the circle of length `N`, and their values."""
-        f, H = np.asarray(self.f), np.asarray(self.H)
+    def _neighbours(self, values):
+        """Distinct frequencies on three turns of the circle of length `N`, and values there."""
+        f, H = np.asarray(self.f), np.asarray(values)
         mirror = self._mirror()
         if mirror is not None:
             f, H = np.concatenate([f, -f]), np.concatenate([H, H[mirror].conj()], axis=1)
@@ -254,3 +313,12 @@ class HTF(eqx.Module):
         f, H = f[order], H[:, order]
         turns = np.concatenate([f - self.sections, f, f + self.sections])
         return turns, np.tile(H, (1, 3, 1, 1))
+
+
+def _optional(name: str, value: Any, shape: tuple[int, ...]):
+    if value is None:
+        return None
+    value = real_array(name, value, ndim=len(shape))
+    if value.shape != shape:
+        raise DefinitionError(f"`{name}` must have the shape {shape}, not {value.shape}.")
+    return value

@@ -1,0 +1,54 @@
+"""Variances of HTFs: carried along, and what they say about an interval."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import hybridjax as hj
+
+
+F = np.arange(1, 20) / 20
+
+
+def an_htf(**more):
+    rng = np.random.default_rng(0)
+    H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
+    return hj.HTF(F, H, (-1, 0, 1), 4, **more)
+
+
+@pytest.fixture
+def htf():
+    size = np.random.default_rng(1).uniform(1, 2, (3, len(F), 2, 1))
+    return an_htf(variance=2 * size, noise_variance=size, freedom=np.full(len(F), 4.0))
+
+
+def test_the_radius_is_that_of_the_f_distribution(htf):
+    expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
+    np.testing.assert_allclose(htf.confidence_radius(), expected, rtol=1e-12)
+    known = an_htf(variance=htf.variance).confidence_radius(0.9)
+    np.testing.assert_allclose(
+        known, np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)), rtol=1e-12
+    )
+
+
+def test_variances_go_along(htf):
+    one = htf.select((0, 1))
+    np.testing.assert_array_equal(one.variance, htf.variance[1:])
+    np.testing.assert_array_equal(one.noise_variance, htf.noise_variance[1:])
+    np.testing.assert_array_equal(one.freedom, htf.freedom)
+    between = htf.interpolate([0.1, 0.125])
+    np.testing.assert_allclose(between.variance[:, 0], htf.variance[:, 1])
+    np.testing.assert_allclose(
+        between.variance[:, 1], (htf.variance[:, 1] + htf.variance[:, 2]) / 2
+    )
+    np.testing.assert_allclose(between.freedom, 4.0)
+    assert an_htf().interpolate([0.1]).variance is None
+
+
+def test_bad_variances(htf):
+    with pytest.raises(hj.DefinitionError, match="have no variance"):
+        an_htf().confidence_radius()
+    with pytest.raises(hj.DefinitionError, match="level must lie between 0 and 1"):
+        htf.confidence_radius(1.0)
+    with pytest.raises(hj.DefinitionError, match="`freedom` must have the shape"):
+        an_htf(freedom=np.ones(3))
