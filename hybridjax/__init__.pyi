@@ -19,6 +19,7 @@ from .experiments.multisine import (
     paper_design as paper_design,
     single_cosine as single_cosine,
 )
+from .experiments.records import add_noise as add_noise, odd_part as odd_part
 from .experiments.respond import Response as Response
 from .experiments.response import (
     ResponseFunction as ResponseFunction,

@@ -14,6 +14,7 @@ from .._core.results import Result
 from ..periodic._checks import names
 from ..periodic.ldtp import LDTP
 from .design import Design
+from .noise import draw_process_noise
 
 
 class ExperimentData(eqx.Module):
@@ -131,6 +132,21 @@ class ExperimentData(eqx.Module):
         """The samples that estimates use: the last P periods."""
         return slice(self.u.shape[1] - self.sections * self.periods, None)
 
+    def windows(self, repeats: int = 1) -> list[slice]:
+        """The last `repeats` windows of P periods each, one after the other.
+
+        **Raises:** `DefinitionError` if the record is too short.
+        """
+        n, length = self.u.shape[1], self.sections * self.periods
+        if repeats < 1 or repeats * length > n:
+            raise DefinitionError(
+                f"{repeats} windows of P = {self.periods} periods need {repeats * self.periods} "
+                f"cycles (and repeats >= 1), but the record has {n // self.sections}: record more "
+                "cycles, or take fewer repeats."
+            )
+        first = n - repeats * length
+        return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
+
     def summary(self, limit: int = 5) -> str:
         """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
         return summary(self.result, self.failed_at, self.sections, limit)
@@ -176,6 +192,8 @@ def simulate_experiments(
     *,
     discard: int | None = None,
     start: Literal["rest", "periodic"] = "rest",
+    process_noise: int | float = 0.0,
+    seed: int = 0,
 ) -> ExperimentData:
     """Run a design on a linear periodic model, from section 0.
 
@@ -186,6 +204,8 @@ def simulate_experiments(
       `"periodic"` starts on the periodic response, without a transient.
     - `discard`: cycles run before the window of P periods; by default 20 from rest (as in the
       paper), 0 from the periodic start.
+    - `process_noise`: standard deviation of a random input, held from section to section, that
+      acts beside the excitation and is not recorded. `seed`: of it.
 
     **Returns:** `ExperimentData` with `discard + P` cycles.
 
@@ -208,7 +228,8 @@ def simulate_experiments(
     if start == "periodic":
         # Outside of jit, where the model can tell that no periodic response exists.
         x0 = jax.vmap(lambda u: ldtp.periodic_state(u, design.periods))(design.inputs())
-    y = _respond(ldtp, jnp.asarray(u), x0)
+    kicks = draw_process_noise(u.shape, process_noise, seed)
+    y = _respond(ldtp, jnp.asarray(u + kicks), x0)
     return ExperimentData(
         u,
         y,

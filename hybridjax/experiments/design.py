@@ -1,5 +1,6 @@
 """Multisine designs: which cosines, with which phases, in which experiment."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -184,6 +185,73 @@ class Design(eqx.Module):
         index = np.arange(cycles * self.sections) % length
         return one[:, index]
 
+    def scaled(self, rms: Number) -> "Design":
+        """The same with amplitudes multiplied so that every signal has this rms value.
+
+        Each experiment and input by itself, over one window; the proportions within stay.
+        """
+        if not rms > 0:
+            raise DefinitionError(f"rms must be a positive number, not {rms}.")
+        now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
+        return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
+
+    def realisations(self, count: int, seed: int = 0) -> "Design":
+        """The design `count` times over, each time with new random phases.
+
+        Their responses scatter by noise and by distortion, so that the variance of an estimate can
+        be told. Cosines of one line and input turn by the same random angle in all experiments of
+        a realisation, which keeps differences of 90 degrees and orthogonal experiments as they are.
+
+        **Returns:** a design with `count` times the experiments, one realisation after the other.
+        """
+        if count < 1:
+            raise DefinitionError(f"count is the number of realisations, not {count}.")
+        rng = np.random.default_rng(seed)
+        pair = self.line * len(self.input_names) + self.channel
+        pairs, place = np.unique(pair, return_inverse=True)
+        turns = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
+        real = is_real(pairs // len(self.input_names), self.periods, self.sections)
+        turns = np.where(real, np.pi * (turns > np.pi), turns)
+        phase = (self.phase + turns[:, place]) % (2 * np.pi)
+        shift = np.arange(count)[:, None] * self.experiments
+        return self._times(count, phase, self.experiment + shift)
+
+    def with_negatives(self) -> "Design":
+        """Every experiment followed by the same with the sign changed.
+
+        In half the difference of their responses (`odd_part`) all even-order distortion cancels.
+        """
+        phase = np.stack([self.phase, (self.phase + np.pi) % (2 * np.pi)])
+        return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))
+
+    def _times(self, count: int, phase, experiment) -> "Design":
+        """The cosines repeated, with other phases, in other experiments."""
+        phase, experiment = phase.ravel(), experiment.ravel()
+        order = np.lexsort((np.tile(self.line, count), experiment))
+        each = {
+            n: np.tile(getattr(self, n), count)[order] for n in ("line", "channel", "amplitude")
+        }
+        return dataclasses.replace(
+            self,
+            experiment=experiment[order],
+            phase=phase[order],
+            experiments=count * self.experiments,
+            **each,
+        )
+
+    def expected_variance(self, noise: Number = 1.0, repeats: int = 1) -> Float[np.ndarray, "F nu"]:
+        """The variance of every H_m at `frequencies` under white noise of this std on the output.
+
+        `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
+        """
+        lines, place = np.unique(self.line, return_inverse=True)
+        power = np.zeros((len(lines), len(self.input_names)))
+        real = np.where(is_real(self.line, self.periods, self.sections), 2 * np.cos(self.phase), 1)
+        np.add.at(power, (place, self.channel), (self.amplitude * real) ** 2)
+        samples = self.sections * self.periods * repeats
+        with np.errstate(divide="ignore"):
+            return 4 * noise**2 / (samples * power)
+
     def cycles(self, discard: int = 20) -> int:
         """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
         return self.experiments * (self.periods + discard)
@@ -197,13 +265,15 @@ class Design(eqx.Module):
 
     def __repr__(self) -> str:
         f, sizes = self.frequencies, np.bincount(self.experiment)
-        crest = self.crest_factors()
+        crest, per = self.crest_factors(), self.expected_variance()
+        per = per[np.isfinite(per)]
         return (
             f"Design({_count(self.experiments, 'experiment')}, {len(f)} frequencies "
             f"{_span(f)} cycles per period in steps of 1/{self.periods}, "
             f"{_count(_span(sizes), 'cosine')} each of amplitude {_span(self.amplitude)}, "
             f"crest factor {_span(crest)}, N = {self.sections}, P = {self.periods} periods, "
-            f"inputs = {', '.join(self.input_names)})"
+            f"inputs = {', '.join(self.input_names)}; {self.cycles(0)} cycles without those "
+            f"discarded; output noise of std s gives each H_m a std of {_span(np.sqrt(per))} s)"
         )
 
 

@@ -42,6 +42,22 @@ def needs_two_phases(
     return is_half_integer(line, periods) & ~is_real(line, periods, sections)
 
 
+def meets_itself(
+    line: Int[np.ndarray, " K"], periods: int, sections: int, highest: int | None = None
+) -> Bool[np.ndarray, " K"]:
+    """Lines that need two phases, where harmonics beyond `highest` are taken as zero."""
+    meets = needs_two_phases(line, periods, sections)
+    if highest is not None:
+        meets &= _around(2 * line, periods, sections) <= highest
+    return meets
+
+
+def _around(lines: Int[np.ndarray, " K"], periods: int, sections: int) -> Int[np.ndarray, " K"]:
+    """The harmonic that leads over this distance: in periods, around the circle of N."""
+    turns = (lines // periods) % sections
+    return np.minimum(turns, sections - turns)
+
+
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
     """The exact minimum of experiments for these lines (repeated ones count as often)."""
     return int(np.bincount(line_class(line, periods)).max())
@@ -159,8 +175,11 @@ def check_sharing(
     line: Int[np.ndarray, " K"],
     periods: int,
     hint: Callable[[int], str] = lambda experiment: "",
+    sections: int = 0,
+    highest: int | None = None,
 ) -> None:
-    """Check that no two lines of one experiment have the same class.
+    """Check that no two lines of one experiment have the same class; or, where harmonics beyond
+    `highest` are taken as zero, that no such harmonic leads from one to the other.
 
     **Raises:** `DefinitionError` that names the experiment and the first pair; the text of
     `hint(experiment)` is added to it.
@@ -168,11 +187,21 @@ def check_sharing(
     classes = line_class(line, periods)
     order = np.lexsort((line, classes, experiment))
     e, c, j = experiment[order], classes[order], line[order]
-    clash = np.flatnonzero((e[1:] == e[:-1]) & (c[1:] == c[:-1]))
-    if len(clash) == 0:
-        return
-    first = clash[0]
-    low, high, number = int(j[first]), int(j[first + 1]), int(e[first])
+    for step in range(1, len(e)):
+        same = (e[step:] == e[:-step]) & (c[step:] == c[:-step])
+        if not same.any():
+            return
+        low, high = j[:-step], j[step:]
+        clash = same
+        if highest is not None:
+            apart = np.where((high - low) % periods == 0, high - low, high + low)
+            clash = same & (_around(apart, periods, sections) <= highest)
+        if clash.any():
+            first = int(np.argmax(clash))
+            _refuse(int(low[first]), int(high[first]), int(e[first]), periods, hint)
+
+
+def _refuse(low: int, high: int, number: int, periods: int, hint: Callable[[int], str]) -> None:
     a, b = low / periods, high / periods
     if low == high:
         reason = f"f = {a:.10g} is excited twice"

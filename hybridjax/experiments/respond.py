@@ -10,12 +10,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
-from ..flow.lanes import Lanes, for_each_chart, only
+from ..flow.lanes import Lanes, for_each_chart, needed, only
 from ..flow.move import Settings, move
 from ..orbits.place import PlacedSections
 from ..orbits.plan import Plan
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
+
+
+# Error that rounding alone may leave, relative to the states' scales.
+ROUNDING = 1e-13
 
 
 class Response(NamedTuple):
@@ -73,21 +77,17 @@ def respond(
             moved.lanes,
             (moved.lanes.t - turns * cycle.period, moved.lanes.events - turns * one_turn),
         )
-        share = jnp.where(result == Result.OK, moved.error * plan.weight[i], jnp.nan)
-        return (lanes, result), (y, jax.lax.stop_gradient(share))
+        ok = result == Result.OK
+        share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
+        return (lanes, result), (y, ok, jax.lax.stop_gradient(share))
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
     begin = (lanes, jnp.zeros(S, jnp.int32))
-    (_, result), (y, shares) = jax.lax.scan(section, begin, xs)
-    failed = jnp.isnan(shares)
-    failed_at = jnp.where(failed.any(axis=0), jnp.argmax(failed, axis=0), -1)
-    turns = jnp.nan_to_num(shares).reshape(n // N, N, S)
-    error = ROUNDING + jnp.max(jnp.sum(turns, axis=1), axis=0)
+    (_, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
+    failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
+    turns = jnp.sum(shares.reshape(n // N, N, S), axis=1)
+    error = ROUNDING + jnp.max(turns, axis=0)
     return Response(jnp.transpose(y, (2, 0, 1)), result, failed_at, error)
-
-
-# Error that rounding alone may leave, relative to the states' scales.
-ROUNDING = 1e-13
 
 
 def observe(s: Structure, z: Outputs, lanes: Lanes, u) -> Float[Array, "ny L"]:
@@ -95,7 +95,7 @@ def observe(s: Structure, z: Outputs, lanes: Lanes, u) -> Float[Array, "ny L"]:
     L = lanes.t.shape[0]
 
     def work(a, here, out):
-        point = only(here, lanes.t), only(here, lanes.q[: s.dims[a]]), only(here, u)
+        point = needed(here, [only(here, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
         values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
         return jnp.where(here, values, out)
 

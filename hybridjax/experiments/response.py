@@ -89,7 +89,9 @@ def response_function(
     memory grows by a few hundred bytes for each sample. Outputs of an experiment are NaN after it
     failed: leave it out by `result` before a mean is taken.
 
-    **Arguments:** as for `run_experiments`. **Raises:** as `run_experiments`.
+    **Arguments:** as for `run_experiments`. The cycle may be unstable, where experiments are short.
+
+    **Raises:** `DefinitionError` for outputs, sections or an accuracy that do not exist.
     """
     placed = as_placed(cycle, sections)
     require_x64(cycle)

@@ -16,7 +16,7 @@ from .batching import vmap_to_lanes
 from .lane_jvp import lane_jvp
 from .lanes import Lanes
 from .replay import replay
-from .search import Found, search
+from .search import Moved, search
 from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
@@ -43,18 +43,6 @@ class _How(NamedTuple):
     tape: bool
     glide: bool
     new_input: bool
-
-
-class Moved(eqx.Module):
-    """Lanes at the end of a piece of flow."""
-
-    lanes: Lanes
-    h: Float[Array, " L"]
-    """Step size to go on with."""
-    error: Float[Array, " L"]
-    """Sum of the steps' error estimates, relative to the tolerance."""
-    result: Int[Array, " L"]
-    """`Result` codes. A lane that failed stands where it failed."""
 
 
 def move(
@@ -94,8 +82,7 @@ def record(
     """As `move`, with a record of every step, and without derivatives."""
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     arguments = system, lanes, u, target, setout, result
-    found = _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input))
-    return _moved(found), found.tape
+    return _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input))
 
 
 def follow(
@@ -125,18 +112,14 @@ def _constant(tree):
     )
 
 
-def _moved(found: Found) -> Moved:
-    return Moved(found.lanes, found.h, found.error, found.result)
-
-
 @eqx.filter_jit
-def _search(system, lanes, u, target, setout, result, settings, how: _How) -> Found:
+def _search(system, lanes, u, target, setout, result, settings, how: _How):
     bare = dataclasses.replace(target, levels=None)
     run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, how))
     return run((system, target.levels, settings), (lanes, u, bare, setout, result))
 
 
-def _run(system, levels, settings, lanes, u, target, setout, result, how: _How) -> Found:
+def _run(system, levels, settings, lanes, u, target, setout, result, how: _How):
     settings = shared(settings)
     return search(
         Structure(system),
@@ -154,7 +137,7 @@ def _run(system, levels, settings, lanes, u, target, setout, result, how: _How) 
 
 @eqx.filter_custom_jvp
 def _move(system, lanes, u, target, setout, result, settings, how: _How):
-    return _moved(_search(system, lanes, u, target, setout, result, settings, how))
+    return _search(system, lanes, u, target, setout, result, settings, how)[0]
 
 
 @_move.def_jvp

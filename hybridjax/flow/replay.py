@@ -22,6 +22,7 @@ from .target import Target
 from .watch import chart_field, settle, watched
 
 
+# Rows of a tape that reverse mode computes again together.
 _BLOCK = 4
 
 
@@ -78,7 +79,7 @@ def _advance(s, t, q, chart, moves, u, target, h, which, unroll):
         own, goal = Structure(own), dataclasses.replace(target, levels=levels)
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
         index, crossing = only(here, target.index), jnp.where(here, which, -1)
-        step = rk_step(chart_field(own, a, u0), t0, q0, h0)
+        step = rk_step(chart_field(own, a, u0), t0, q0, h0, unroll)
         q1, t1 = step.q, t0 + h0
 
         def land():

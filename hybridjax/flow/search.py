@@ -33,16 +33,16 @@ _TINY = 1e-13
 _TRIES = 8
 
 
-class Found(NamedTuple):
-    """Result of a search."""
+class Moved(NamedTuple):
+    """Lanes at the end of a piece of flow."""
 
     lanes: Lanes
     h: Float[Array, " L"]
-    """The step size to go on with."""
+    """Step size to go on with."""
     error: Float[Array, " L"]
     """Sum of the steps' error estimates, relative to the tolerance."""
     result: Int[Array, " L"]
-    tape: Tape | None
+    """`Result` codes. A lane that failed stands where it failed."""
 
 
 class _Approach(NamedTuple):
@@ -99,7 +99,7 @@ def search(
     tape: bool,
     glide: bool,
     new_input: bool,
-) -> Found:
+) -> tuple[Moved, Tape | None]:
     """Flow every lane to its target, or to a result code that says why not.
 
     Lanes whose `result` is not OK at the start stay where they are. With `glide`, one step of all
@@ -129,14 +129,14 @@ def search(
         return ~state.arrived & (state.result == Result.OK)
 
     def attempted(state, unroll=False):
-        """An attempt in all active lanes, and which of them it leaves calm."""
+        """Aims, ways, and an attempt in all active lanes, and which of them it leaves calm."""
         aim, way = _take_aim(s, state, active(state), target, stride)
         ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
         here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
         new = attempt(s, *here, aim, *where, rtol, atol, span, unroll)
         calm = new.calm & (new.error <= stride.slack) & ~state.approach.on & (way.schedule < 0)
         calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
-        return calm, (state, active(state), aim, way, new, u, target, stride, span)
+        return calm, aim, way, new
 
     def going(carry):
         state, _ = carry
@@ -144,29 +144,29 @@ def search(
 
     def body(carry):
         state, tape = carry
-        calm, arguments = attempted(state)
-        new, row = jax.lax.cond(
+        calm, *made = attempted(state)
+        state, row = jax.lax.cond(
             (calm | ~active(state)).all(),
-            lambda: _calmly(*arguments),
-            lambda: _eventfully(s, *arguments),
+            lambda: _calmly(state, active(state), *made, target, stride),
+            lambda: _eventfully(s, state, active(state), *made, u, target, stride, span),
         )
-        return new, None if tape is None else write_row(tape, state.i, row)
+        return state, None if tape is None else write_row(tape, state.i - 1, row)
 
     def all_the_way():
         end, tape = jax.lax.while_loop(going, body, (state, blank))
         result = update_result(end.result, active(end), Result.STEP_LIMIT)
-        return Found(end.lanes, end.h, end.error, result, tape)
+        return Moved(end.lanes, end.h, end.error, result), tape
 
-    def in_one_step(arguments):
-        end, row = _calmly(*arguments)
+    def in_one_step():
+        end, row = _calmly(state, active(state), aim, way, new, target, stride)
         tape = None if blank is None else write_row(blank, state.i, row)
-        return Found(end.lanes, end.h, end.error, end.result, tape)
+        return Moved(end.lanes, end.h, end.error, end.result), tape
 
     if not glide:
         return all_the_way()
-    calm, arguments = attempted(state, unroll=True)
-    home = calm & (arguments[4].lands | arguments[3].last)
-    return jax.lax.cond((home | ~active(state)).all(), lambda: in_one_step(arguments), all_the_way)
+    calm, aim, way, new = attempted(state, unroll=True)
+    home = calm & (new.lands | way.last)
+    return jax.lax.cond((home | ~active(state)).all(), in_one_step, all_the_way)
 
 
 def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _Way]:
@@ -203,7 +203,7 @@ def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _W
 
 
 def _calmly(
-    state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span
+    state: _State, active, aim: Aim, way: _Way, new: Attempt, target, stride
 ) -> tuple[_State, Tape]:
     """Nothing happened to any lane, except perhaps that it arrived."""
     lanes = state.lanes

@@ -1,24 +1,28 @@
 """Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
 
+import functools
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Float
 
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
 from ..experiments.data import ExperimentData
-from ..experiments.partition import needs_two_phases
 from ..periodic.htf import HTF
 from ..periodic.transfer import check_harmonics
-from .sums import Sums, sums_of
+from .solve import solve
+from .sums import Query, sums_of
 
 
 def estimate_htf(
     data: ExperimentData | Iterable[ExperimentData],
     harmonics: int | Sequence[int] | None = None,
     *,
+    repeats: int = 1,
+    variance: Literal["auto", "noise", "total"] = "auto",
+    highest: int | None = None,
     half_integers: Literal["error", "skip"] = "error",
     threshold: float = 1e-6,
 ) -> HTF:
@@ -29,30 +33,53 @@ def estimate_htf(
     a `Design`, if they obey its rules. Where a frequency was measured more than once the
     estimate is the least-squares one. On multiples of 1/2 (other than 0 and N/2) the line meets
     its own mirror image, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`, which is solved
-    for both unknowns from two or more experiments with different phases. Failed experiments are
-    left out (`missing_frequencies` says what is lost by that), and with several inputs only
-    frequencies that were measured from each of them are kept.
+    for both unknowns from two or more experiments with different phases. Inputs that excite one
+    line together are told apart by as many experiments. Failed experiments are left out
+    (`missing_frequencies` says what is lost by that), and with several inputs only frequencies
+    that were measured from each of them are kept.
+
+    The estimate is of the best linear approximation for signals of the kind that was applied
+    (Pintelon and Schoukens 2012, ch. 3): its `variance` says how well it is known. Frequencies that
+    were measured in several realisations of random phases scatter by noise and by nonlinear
+    distortion together; with `repeats` the scatter between windows is that of noise alone, the
+    `noise_variance`. With realisations missing, `variance` itself is that of noise alone.
 
     **Arguments:**
 
     - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
-      `StoredExperiments` give them, of which only sums over experiments are kept. With several
-      inputs, a line is excited by one of them at a time.
-    - `harmonics`: which ones; None means all N.
+      `StoredExperiments` give them, of which only sums over experiments are kept.
+    - `harmonics`: which ones; None means all N (with `highest`, all up to it).
+    - `repeats`: how many of the last windows of P periods are averaged.
+    - `variance`: "auto" is what the experiments allow; "noise", from the repeats alone, and
+      "total", from realisations, are errors where they cannot be had.
+    - `highest`: harmonics beyond this one are taken as zero, as in designs with few experiments
+      (`multisine(highest_harmonic=...)`).
     - `half_integers`: what to do with a multiple of 1/2 measured with one phase only.
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy.
 
-    **Returns:** `HTF` with ascending frequencies, source "estimate".
+    **Returns:** `HTF` with ascending frequencies, source "estimate". Its `variance` is infinite
+    where failed experiments have left one realisation.
 
     **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines
     of one experiment disturb each other (the message names the pair); for one phase only on a
-    multiple of 1/2; or for parts that do not belong together.
+    multiple of 1/2; for too few periods or realisations for the variance asked; or for parts that
+    do not belong together.
     """
     if half_integers not in ("error", "skip"):
         raise DefinitionError(f"half_integers must be 'error' or 'skip', not {half_integers!r}.")
+    if variance not in ("auto", "noise", "total"):
+        raise DefinitionError(f"variance must be 'auto', 'noise' or 'total', not {variance!r}.")
+    if variance == "noise" and repeats < 2:
+        raise DefinitionError(
+            "the variance of noise alone needs two windows or more: record P periods more, and "
+            "say repeats=2."
+        )
+    if highest is not None and highest < 0:
+        raise DefinitionError(f"highest is a harmonic, 0 or more, not {highest}.")
     require_x64()
-    sums = sums_of(data, threshold, lambda sections: check_harmonics(harmonics, sections))
+    choose = functools.partial(_choose, harmonics, highest)
+    sums = sums_of(data, Query(choose, threshold, highest, repeats))
     unsolved = sums.one_phase(sums.tried)
     if unsolved.any() and half_integers == "error":
         f = sums.line[unsolved][0] / sums.about.periods
@@ -62,21 +89,29 @@ def estimate_htf(
             "(half_integers='two-phase' in the design does so), or leave it out here with "
             "half_integers='skip' and use HTF.interpolate."
         )
-    grid = _complete(sums)
-    if len(grid) == 0:
+    rows = np.flatnonzero(sums.solvable(sums.ran))
+    if len(rows) == 0:
         raise DefinitionError(
             f"no frequency is left to estimate: {sums.summary}; a frequency must have been "
             f"measured from each of the {len(sums.about.inputs)} inputs."
         )
+    solution = solve(sums, rows)
+    if variance == "noise":
+        solution = solution.of_noise()
+    elif variance == "total":
+        solution.require_total(sums.line[rows] / sums.about.periods)
     about = sums.about
     return HTF(
-        grid / about.periods,
-        _solve(sums, grid),
+        sums.line[rows] / about.periods,
+        solution.H,
         sums.harmonics,
         about.sections,
         about.inputs,
         about.outputs,
         "estimate",
+        variance=solution.variance,
+        noise_variance=solution.noise_variance,
+        freedom=solution.freedom,
     )
 
 
@@ -88,25 +123,20 @@ def missing_frequencies(
     Because their experiments failed, or not all inputs were applied at them, or because they lie
     on a multiple of 1/2 and one phase is all there is.
     """
-    sums = sums_of(data, threshold, lambda sections: ())
-    return np.setdiff1d(sums.line, _complete(sums)) / sums.about.periods
+    sums = sums_of(data, Query(lambda sections: (), threshold))
+    return sums.line[~sums.solvable(sums.ran)] / sums.about.periods
 
 
-def _complete(sums: Sums) -> Int[np.ndarray, " F"]:
-    """The lines that can be solved for every input."""
-    good = (sums.ran.power > 0) & ~sums.one_phase(sums.ran)
-    line, inputs = np.unique(sums.line[good], return_counts=True)
-    return line[inputs == len(sums.about.inputs)]
-
-
-def _solve(sums: Sums, grid: Int[np.ndarray, " F"]) -> Complex[np.ndarray, "M F ny nu"]:
-    """Least squares for each frequency and input: `Y = H_l U + G conj(U)`, G = 0 off (1/2)Z."""
-    here = np.isin(sums.line, grid)
-    mirrored = needs_two_phases(sums.line[here], sums.about.periods, sums.about.sections)
-    mirrored = mirrored[:, None, None]
-    S = sums.ran.power[here][:, None, None]
-    Q = np.where(mirrored, sums.ran.square[here][:, None, None], 0)
-    direct, mirror = sums.direct[here], np.where(mirrored, sums.mirror[here], 0)
-    H = (S * direct - Q.conj() * mirror) / (S**2 - np.abs(Q) ** 2)
-    H = H.reshape(len(grid), len(sums.about.inputs), *H.shape[1:])
-    return H.transpose(2, 0, 3, 1)
+def _choose(harmonics, highest: int | None, sections: int) -> tuple[int, ...]:
+    if highest is None:
+        return check_harmonics(harmonics, sections)
+    known = check_harmonics(None, sections)
+    if harmonics is None:
+        return tuple(m for m in known if abs(m) <= highest)
+    chosen = check_harmonics(harmonics, sections)
+    if max(map(abs, chosen)) > highest:
+        raise DefinitionError(
+            f"harmonics beyond highest = {highest} are taken as zero, so {chosen} cannot all be "
+            "estimated."
+        )
+    return chosen

@@ -2,24 +2,24 @@
 
 from collections.abc import Sequence
 from itertools import count
-from typing import NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Complex, Float, Inexact
+from jaxtyping import Complex, Float
 
 from .._core.errors import DefinitionError
+from .._core.results import Result
 from ..periodic.htf import HTF
 from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
-from .compare import MultiplierComparison, Multipliers, compare_multipliers
+from .estimate import MultiplierEstimate, roots_of
+from .likelihood import maximum_likelihood, noise_levels, summarize
+from .projection import chi, groups_of, numerators
 
 
-_RANK = 1e-13  # singular values below this part of the largest are rounding errors
-
-
-class StructuredFit(eqx.Module):
+class StructuredFit(MultiplierEstimate):
     r"""All harmonics, outputs and inputs with one denominator in $z^{-N}$.
 
     $$H_m(z) = \frac{B_m(z^{-1})}{\chi(z^{-N})}, \qquad
@@ -32,16 +32,27 @@ class StructuredFit(eqx.Module):
     **Fields:**
 
     - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d, real.
+    - `covariance` (d, d): of the coefficients, estimated with `covariance_freedom` degrees of
+      freedom. `standard_errors`, `contains` and `ellipse` give what follows for multipliers.
     - `residual` (ny,): rms misfit of each output's HTFs relative to their rms.
+    - `cost`: sum of squares of the misfit in units of the errors' standard deviations, and
+      `freedom`, the number that it is expected to be. Where no variances were given the unit is
+      what the misfit itself says, and the two are equal.
     - `numerators` (M, degree + 1, ny, nu): coefficients of B_m, by rising power of z^-1. In a
       narrow band of frequencies many give the same fit; these are the smallest.
+    - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `sections`, `inputs`, `outputs`: what was fitted.
     """
 
     multipliers: Complex[np.ndarray, " d"]
     coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    covariance_freedom: float = eqx.field(static=True)
     residual: Float[np.ndarray, " ny"]
     numerators: Complex[np.ndarray, "M coefficients ny nu"]
+    cost: float = eqx.field(static=True)
+    freedom: int = eqx.field(static=True)
+    result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
     sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -60,24 +71,24 @@ class StructuredFit(eqx.Module):
                 f"harmonic {absent[0]} was not fitted; the harmonics are {self.harmonics}."
             )
         rows = [self.harmonics.index(m) for m in wanted]
-        powers = _powers(f, self.sections, self.numerators.shape[1])
+        degrees = np.arange(self.numerators.shape[1])
+        powers = np.exp(-2j * np.pi / self.sections * f[:, None] * degrees)
         H = np.einsum("fr,mrij->mfij", powers, self.numerators[rows])
-        H = H / _chi(np.exp(-2j * np.pi * f), self.coefficients)[:, None, None]
+        H = H / chi(np.exp(-2j * np.pi * f), self.coefficients)[:, None, None]
         return HTF(f, H, wanted, self.sections, self.inputs, self.outputs, "structured fit")
 
-    def compare(self, true: Multipliers) -> MultiplierComparison:
-        """The multipliers beside the true ones, paired; printing it shows a table."""
-        return compare_multipliers(self.multipliers, true)
-
     def __repr__(self) -> str:
-        shown = ", ".join(f"{x.real:+.7f}{x.imag:+.7f}i" for x in self.multipliers)
         misfit = ", ".join(
             f"{name} {x:.1e}" for name, x in zip(self.outputs, self.residual, strict=True)
         )
+        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         return (
-            f"StructuredFit(multipliers {shown}; residual {misfit}; "
-            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1})"
+            f"StructuredFit(multipliers {self.show_multipliers()}; residual {misfit}; "
+            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state})"
         )
+
+
+Errors = Literal["residuals", "variance"]
 
 
 def fit_multipliers(
@@ -86,170 +97,167 @@ def fit_multipliers(
     harmonics: int | Sequence[int] | None = None,
     *,
     overhang: int | None = None,
-    iterations: int = 6,
+    errors: Errors | None = None,
+    max_steps: int = 50,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
 
-    Multiplied by $\chi$, the equation is linear in its coefficients c and in those of the
-    numerators; the numerators are projected out (singular value decomposition of their powers of
-    z), and c is left as a small least-squares problem over all harmonics, outputs and inputs
-    together. Iterated with the weight $1/|\chi|$ of the last solution, so that in the end the
-    misfit of the HTFs counts. Positive and negative frequencies are used:
-    $H_m(-w) = \overline{H_{-m}(w)}$, for m = 0 (and N/2) numerators are real.
+    The maximum-likelihood estimate for independent, circular, normally distributed errors of the
+    HTFs with the variances `htf.variance`: the sum of $|H - B/\chi|^2 / \mathrm{var}$ is
+    minimised over all numerators and c. Numerators are solved for inside (variable projection), so
+    that Gauss and Newton's steps are taken in the d coefficients c only. They start from two
+    solutions of the linearised problem, the better of them: iterated least squares (Sanathanan
+    and Koerner 1963) and its correction for the bias that errors give it (generalised total least
+    squares). Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, treat
+    all three. Positive and negative frequencies are used, $H_m(-w) = \overline{H_{-m}(w)}$; for
+    m = 0 (and N/2) numerators are real.
 
     **Arguments:**
 
-    - `htf`: exact or estimated. Each output counts relative to its own rms.
+    - `htf`: exact or estimated. Without variances each output counts relative to its misfit.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
+      `select_order` helps to find it.
     - `harmonics`: those to use; None means all of `htf`.
     - `overhang`: degree of the numerators beyond d N; None means N.
-    - `iterations`: number of weighted solutions.
+    - `errors`: what the covariance is computed from. `"residuals"`, the default: from the misfit
+      at each frequency, so that it holds also where the errors of different harmonics are
+      dependent (process noise, distortion) or the variances are only roughly known (White 1980).
+      `"variance"`: from the variances, which must then be right.
+    - `max_steps`: of Gauss and Newton's iteration.
 
-    **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, a harmonic that `htf`
-    does not hold, or too few frequencies for so many coefficients (the message says how many).
+    **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, variances that are not
+    positive, a harmonic that `htf` does not hold, or too few frequencies for so many coefficients
+    (the message says how many).
     """
     order = order.rank() if isinstance(order, LDTP) else order
     N = htf.sections
     overhang = N if overhang is None else overhang
-    if order < 1 or iterations < 1 or overhang < 0:
+    if order < 1 or max_steps < 1 or overhang < 0:
         raise DefinitionError(
-            "a structured fit needs order >= 1 (the number of non-zero multipliers), iterations "
-            f">= 1 and overhang >= 0, not {order}, {iterations} and {overhang}."
+            "a structured fit needs order >= 1 (the number of non-zero multipliers), max_steps "
+            f">= 1 and overhang >= 0, not {order}, {max_steps} and {overhang}."
         )
+    if errors not in (None, "residuals", "variance"):
+        raise DefinitionError(f"errors must be 'residuals' or 'variance', not {errors!r}.")
     if harmonics is not None:
         htf = htf.select(harmonics)
-    f, H = np.asarray(htf.f), np.asarray(htf.H)
+    rms = check_values(htf)
+    if errors == "variance" and htf.variance is None:
+        raise DefinitionError(
+            "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
+        )
+    unknowns = order * N + overhang + 1
+    _check_freedom(htf, order, unknowns)
+
+    groups = groups_of(htf, weights_of(htf, rms), unknowns)
+    c, converged = maximum_likelihood(groups, order, max_steps)
+    if htf.variance is None:
+        # Once more with the outputs weighted by what their misfit says.
+        noise = np.maximum(noise_levels(groups, c, len(rms)), 1e-15)
+        groups = groups_of(htf, weights_of(htf, rms * noise), unknowns)
+        c, converged = maximum_likelihood(groups, order, max_steps, c)
+    summary = summarize(groups, c, "residuals" if errors is None else errors)
+
+    B = np.zeros((len(htf.harmonics), unknowns, len(htf.outputs), len(htf.inputs)), complex)
+    for group in groups:
+        b = numerators(group, c).T
+        i, j = group.columns.T
+        B[group.rows, :, i, j] = b
+        if group.mirror is not None:
+            B[group.mirror, :, i, j] = b.conj()
+    fit = StructuredFit(
+        multipliers=roots_of(c),
+        coefficients=c,
+        covariance=summary.covariance,
+        covariance_freedom=summary.covariance_freedom,
+        residual=np.zeros(len(rms)),
+        numerators=B,
+        cost=summary.cost,
+        freedom=summary.freedom,
+        result=Result.OK if converged else Result.NOT_CONVERGED,
+        harmonics=htf.harmonics,
+        sections=N,
+        inputs=htf.inputs,
+        outputs=htf.outputs,
+    )
+    misfit = np.abs(np.asarray(fit.evaluate(htf.f).H) - np.asarray(htf.H)) ** 2
+    residual = np.sqrt(np.mean(misfit, axis=(0, 1, 3))) / rms
+    return eqx.tree_at(lambda fit: fit.residual, fit, residual)
+
+
+def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
+    """The rms of each output's HTFs.
+
+    **Raises:** `DefinitionError` for NaN, an output that is zero, bad variances.
+    """
+    H = np.asarray(htf.H)
     if not np.isfinite(H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")
     rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
     if (rms == 0).any():
         name = htf.outputs[int(np.argmin(rms))]
         raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
+    if htf.variance is not None:
+        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
+        if len(bad):
+            m, k, i, _ = (int(x) for x in bad[0])
+            raise DefinitionError(
+                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
+                f"{float(htf.f[k]):g} is not a positive number; leave this frequency out, or give "
+                "HTFs without variances."
+            )
+    return rms
 
-    unknowns = order * N + overhang + 1
-    blocks = _blocks(htf, H / rms[:, None], unknowns)
-    if _freedom(blocks, len(f), unknowns) < order:
-        needed = next(F for F in count(1) if _freedom(blocks, F, unknowns) >= order)
+
+def weights_of(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
+    """One over the standard deviation of real and imaginary part, known or supposed.
+
+    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
+    by the nearest product of a factor for each frequency and one for each harmonic, up to its
+    sign (which is what white noise and any spectrum of the input give).
+    """
+    rounding = (1e-15 * rms[:, None]) ** 2
+    if htf.variance is None:
+        return np.broadcast_to(1 / rms[:, None], htf.H.shape)
+    variance = np.asarray(htf.variance)
+    if htf.freedom is not None:
+        variance = _smooth(variance, np.asarray(htf.harmonics), np.asarray(htf.freedom))
+    return np.sqrt(2 / np.maximum(variance, rounding))
+
+
+def _smooth(variance, harmonics, freedom):
+    """The product of factors of frequency and harmonic with the same sums (gamma likelihood)."""
+    if not variance.all():
+        return variance
+    _, same = np.unique(np.abs(harmonics), return_inverse=True)
+    share = freedom / freedom.sum()
+    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+    for _ in range(20):
+        by_line = (variance / size[same]).mean(axis=0)
+        each = np.tensordot(share, variance / by_line, axes=(0, 1))
+        size = np.stack([each[same == k].mean(axis=0) for k in range(len(size))])[:, None]
+    return size[same] * by_line
+
+
+def _check_freedom(htf: HTF, order: int, unknowns: int) -> None:
+    frequencies = len(htf.f)
+    if freedom(htf, frequencies, unknowns) < order:
+        needed = next(F for F in count(1) if freedom(htf, F, unknowns) >= order)
         raise DefinitionError(
-            f"{len(f)} frequencies are too few for numerators of {unknowns} coefficients and "
+            f"{frequencies} frequencies are too few for numerators of {unknowns} coefficients and "
             f"{order} multipliers: {needed} or more are needed. Measure more, or lower `order` or "
             "`overhang`."
         )
-    c = np.zeros(order)
-    for _ in range(iterations):
-        c = _denominator(blocks, c)
-
-    numerators = np.zeros((len(htf.harmonics), unknowns, *H.shape[2:]), complex)
-    for block in blocks:
-        b = block.numerators(c).reshape(unknowns, len(block.rows), *H.shape[2:])
-        numerators[block.rows] = b.swapaxes(0, 1)
-        if block.mirror is not None:
-            numerators[block.mirror] = b.swapaxes(0, 1).conj()
-    multipliers = np.roots([1.0, *c]).astype(complex)
-    fit = StructuredFit(
-        multipliers=multipliers[np.lexsort((-multipliers.imag, -np.abs(multipliers)))],
-        coefficients=c,
-        residual=np.zeros(len(rms)),
-        numerators=numerators * rms[:, None],
-        harmonics=htf.harmonics,
-        sections=N,
-        inputs=htf.inputs,
-        outputs=htf.outputs,
-    )
-    misfit = np.abs(np.asarray(fit.evaluate(f).H) - H) ** 2
-    residual = np.sqrt(np.mean(misfit, axis=(0, 1, 3))) / rms
-    return eqx.tree_at(lambda fit: fit.residual, fit, residual)
 
 
-class _Block(NamedTuple):
-    """Harmonics whose numerators solve the same linear problem.
-
-    `data` (equations, series) and `powers` (equations, unknowns) are complex; the unknowns are
-    real if `real`. `lag` is z^-N for each equation. `rows` are the harmonics in the HTF and, in
-    a block of pairs, `mirror` their negatives.
-    """
-
-    rows: list[int]
-    mirror: list[int] | None
-    real: bool
-    lag: Complex[np.ndarray, " E"]
-    powers: Complex[np.ndarray, "E R"]
-    data: Complex[np.ndarray, "E series"]
-
-    def _split(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate([values.real, values.imag]) if self.real else values
-
-    def _weighted_powers(self, c: Float[np.ndarray, " d"]):
-        """1/|chi| for each equation, and the decomposition of the powers with these weights."""
-        weight = 1 / np.abs(_chi(self.lag, c))[:, None]
-        u, s, vh = np.linalg.svd(self._split(weight * self.powers), full_matrices=False)
-        kept = s > _RANK * s[0]
-        return weight, u[:, kept], s[kept], vh[kept]
-
-    def projected(self, c: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows columns"]:
-        """What is left of z^{-jN} H, j = 0..d, when all numerators are projected out."""
-        weight, u, _, _ = self._weighted_powers(c)
-        columns = []
-        for j in range(len(c) + 1):
-            column = self._split(weight * self.lag[:, None] ** j * self.data)
-            column = column - u @ (u.conj().T @ column)
-            columns.append(np.concatenate([column.real.ravel(), column.imag.ravel()]))
-        return np.stack(columns, axis=1)
-
-    def numerators(self, c: Float[np.ndarray, " d"]) -> Inexact[np.ndarray, "R series"]:
-        weight, u, s, vh = self._weighted_powers(c)
-        target = self._split(weight * _chi(self.lag, c)[:, None] * self.data)
-        return vh.conj().T @ ((u.conj().T @ target) / s[:, None])
-
-
-def _blocks(htf: HTF, H: Complex[np.ndarray, "M F ny nu"], unknowns: int) -> list[_Block]:
-    f, N = np.asarray(htf.f), htf.sections
-    place = {m % N: row for row, m in enumerate(htf.harmonics)}
-    own = [row for m, row in place.items() if -m % N == m]
-    pairs = [(row, place[-m % N]) for m, row in place.items() if 0 < m < N / 2 and -m % N in place]
-    rest = [row for m, row in place.items() if -m % N not in place]
-
-    def series(values):
-        return np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-
-    powers, lag = _powers(f, N, unknowns), np.exp(-2j * np.pi * f)
-    blocks = []
-    if own:
-        blocks.append(_Block(own, None, True, lag, powers, series(H[own])))
-    if pairs:
-        rows, mirror = (list(side) for side in zip(*pairs, strict=True))
-        both = np.concatenate([series(H[rows]), series(H[mirror]).conj()])
-        lags, all_powers = (
-            np.concatenate([lag, lag.conj()]),
-            np.concatenate([powers, powers.conj()]),
-        )
-        blocks.append(_Block(rows, mirror, False, lags, all_powers, both))
-    if rest:
-        blocks.append(_Block(rest, None, False, lag, powers, series(H[rest])))
-    return blocks
-
-
-def _freedom(blocks: list[_Block], frequencies: int, unknowns: int) -> int:
-    """Real equations that are left for the denominator when the numerators are gone."""
+def freedom(htf: HTF, frequencies: int, unknowns: int) -> int:
+    """Real equations that so many frequencies leave when the numerators are gone."""
+    places = {m % htf.sections for m in htf.harmonics}
     total = 0
-    for block in blocks:
-        equations = 2 * frequencies if block.mirror is not None else frequencies
-        surplus = 2 * equations - (1 if block.real else 2) * unknowns
-        total += max(surplus, 0) * block.data.shape[1]
-    return total
-
-
-def _denominator(blocks: list[_Block], c: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """Least squares for c, weighted by 1/|chi| of the last c."""
-    columns = np.concatenate([block.projected(c) for block in blocks])
-    return np.linalg.lstsq(columns[:, 1:], -columns[:, 0])[0]
-
-
-def _powers(f: Float[np.ndarray, " F"], sections: int, number: int):
-    """z^0, z^-1, ... at the frequencies f, (F, number)."""
-    return np.exp(-2j * np.pi / sections * f[:, None] * np.arange(number))
-
-
-def _chi(lag: Complex[np.ndarray, " E"], c: Float[np.ndarray, " d"]) -> Complex[np.ndarray, " E"]:
-    """1 + c_1 z^-N + ... + c_d z^-dN, with `lag` = z^-N."""
-    return np.polynomial.polynomial.polyval(lag, np.concatenate([[1.0], c]))
+    for m in places:
+        if (-m) % htf.sections not in places:
+            equations, coefficients = 2 * frequencies, 2 * unknowns
+        else:  # half of a pair, or a harmonic that is its own mirror image
+            equations, coefficients = 2 * frequencies, unknowns
+        total += max(equations - coefficients, 0)
+    return total * len(htf.outputs) * len(htf.inputs)

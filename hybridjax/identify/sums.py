@@ -1,4 +1,4 @@
-"""What an estimate needs of experiments: sums over them, for each line and input.
+"""What an estimate needs of experiments: sums over them, for each line.
 
 They take the same memory for any number of experiments, and those of two sets of experiments add.
 """
@@ -11,7 +11,8 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.partition import check_sharing, needs_two_phases
+from ..experiments.partition import check_sharing, meets_itself
+from .phases import PhaseTest, examine_phases, no_phases
 
 
 class About(NamedTuple):
@@ -23,54 +24,86 @@ class About(NamedTuple):
     outputs: tuple[str, ...]
 
 
-class Phases(NamedTuple):
-    """Sums over some experiments, for K pairs of a line and an input."""
+class Query(NamedTuple):
+    """What is wanted of the experiments."""
 
-    power: Float[np.ndarray, " K"]
-    """Of |U|^2."""
-    square: Complex[np.ndarray, " K"]
-    """Of U^2: as large as the power where all phases are the same (mod 180 degrees)."""
+    harmonics: Callable[[int], tuple[int, ...]]
+    """The harmonics, for the number of sections."""
+    threshold: float = 1e-6
+    highest: int | None = None
+    """Harmonics beyond this one count as zero."""
+    repeats: int = 1
+    """How many windows are averaged."""
+
+
+class Phases(NamedTuple):
+    """Sums over some experiments, for K lines."""
+
+    power: Complex[np.ndarray, "K nu nu"]
+    """Of conj(U) U^T."""
+    square: Complex[np.ndarray, "K nu nu"]
+    """Of U U^T: as large as the power where all phases are the same (mod 180 degrees)."""
 
 
 class Sums(NamedTuple):
-    """Sums over experiments, for K pairs of a line and an input, ascending."""
+    """Sums over experiments, for K lines, ascending."""
 
     about: About
     harmonics: tuple[int, ...]
     line: Int[np.ndarray, " K"]
-    channel: Int[np.ndarray, " K"]
+    mirrored: Bool[np.ndarray, " K"]
+    """Lines that meet their own mirror images."""
     tried: Phases
     """Over all experiments."""
     ran: Phases
-    """Over those that did not fail."""
-    direct: Complex[np.ndarray, "K M ny"]
-    """Of conj(U[k]) Y[k + l P], over those that did not fail."""
-    mirror: Complex[np.ndarray, "K M ny"]
+    """Over those that did not fail, as all that follow."""
+    count: Int[np.ndarray, " K"]
+    direct: Complex[np.ndarray, "K nu M ny"]
+    """Of conj(U[k]) Y[k + l P], Y the mean over the repeated windows."""
+    mirror: Complex[np.ndarray, "K nu M ny"]
     """Of U[k] Y[k + l P]."""
-    summary: str
+    energy: Float[np.ndarray, "K M ny"]
+    """Of |Y[k + l P]|^2."""
+    noise: Float[np.ndarray, "K M ny"]
+    """Of the variance of Y[k + l P], as seen from one window to the next; zero for one window."""
+    phases: PhaseTest
+    repeats: int
+    summary: str = ""
+
+    def gram(self, phases: Phases, rows: np.ndarray, both: bool) -> Complex[np.ndarray, "k n n"]:
+        """Normal matrices of Y on U, or for `both` on U and conj(U)."""
+        power, square = phases.power[rows], phases.square[rows]
+        if not both:
+            return power
+        upper = np.concatenate([power, square.conj()], axis=2)
+        return np.concatenate([upper, np.concatenate([square, power.conj()], axis=2)], axis=1)
+
+    def solvable(self, phases: Phases) -> Bool[np.ndarray, " K"]:
+        """Lines with responses to all inputs (and mirror images) that can be told apart."""
+        out = np.zeros(len(self.line), bool)
+        for rows in (np.flatnonzero(~self.mirrored), np.flatnonzero(self.mirrored)):
+            out[rows] = _regular(self.gram(phases, rows, bool(self.mirrored[rows].any())))
+        return out
 
     def one_phase(self, phases: Phases) -> Bool[np.ndarray, " K"]:
-        """Lines on multiples of 1/2 that were excited with one phase only."""
-        alike = np.abs(phases.square) > (1 - 1e-6) * phases.power
-        return needs_two_phases(self.line, self.about.periods, self.about.sections) & alike
+        """Lines that meet their mirror images and were excited with one phase only."""
+        rows = np.flatnonzero(self.mirrored)
+        out = np.zeros(len(self.line), bool)
+        out[rows] = _regular(self.gram(phases, rows, False))
+        out[rows] &= ~_regular(self.gram(phases, rows, True))
+        return out
 
 
-def sums_of(
-    data: ExperimentData | Iterable[ExperimentData],
-    threshold: float,
-    choose: Callable[[int], tuple[int, ...]],
-) -> Sums:
+def sums_of(data: ExperimentData | Iterable[ExperimentData], query: Query) -> Sums:
     """The sums over all experiments, which may come in parts.
 
-    **Arguments:** `choose` gives the harmonics for the number of sections.
-
     **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
-    other, or if parts do not belong together.
+    other, if records are too short, or if parts do not belong together.
     """
-    if not 0 < threshold < 1:
-        raise DefinitionError(f"threshold must lie between 0 and 1, not {threshold}.")
+    if not 0 < query.threshold < 1:
+        raise DefinitionError(f"threshold must lie between 0 and 1, not {query.threshold}.")
     if isinstance(data, ExperimentData):
-        total, summary = _sums(data, threshold, choose(data.sections), 0), data.summary()
+        total, summary = _sums(data, query, 0), data.summary()
     else:
         total, count, good = None, 0, 0
         for part in data:
@@ -79,8 +112,7 @@ def sums_of(
                     f"these experiments do not belong together: some have {total.about}, others "
                     f"{other}."
                 )
-            harmonics = choose(part.sections) if total is None else total.harmonics
-            new = _sums(part, threshold, harmonics, count)
+            new = _sums(part, query, count)
             total = new if total is None else _add(total, new)
             count, good = count + len(part.ok), good + int(part.ok.sum())
         if total is None:
@@ -95,53 +127,98 @@ def _about(data: ExperimentData) -> About:
     return About(data.sections, data.periods, data.inputs, data.outputs)
 
 
-def _sums(data: ExperimentData, threshold: float, harmonics: tuple[int, ...], first: int) -> Sums:
+def _regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
+    """Whether normal equations can be solved, whatever the sizes of the unknowns."""
+    size = np.sqrt(np.einsum("kii->ki", gram).real)
+    there = size.min(axis=1) > 1e-6 * size.max(axis=1)
+    size = np.where(there[:, None], size, 1.0)
+    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
+    return there & (least > 1e-6)
+
+
+def _sums(data: ExperimentData, query: Query, first: int) -> Sums:
     """The sums over one part, whose first experiment has the number `first`."""
-    experiment, line, channel, U = _excited(data, threshold, first)
-    pair, place = np.unique(line * len(data.inputs) + channel, return_inverse=True)
+    N, P, harmonics = data.sections, data.periods, query.harmonics(data.sections)
+    highest = None if query.highest is None else query.highest + max(map(abs, harmonics), default=0)
+    windows = data.windows(query.repeats)
+    experiment, line, U = _excited(data, windows, query.threshold, highest, first)
+    lines, place = np.unique(line, return_inverse=True)
     good = data.ok[experiment]
 
     def total(values, keep):
-        """Sums over the entries of each pair."""
+        """Sums over the entries of each line."""
         values, where = values[keep], place[keep]
         order = np.argsort(where, kind="stable")
         begin = np.flatnonzero(np.diff(where[order], prepend=-1))
-        out = np.zeros((len(pair), *values.shape[1:]), values.dtype)
+        out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
         if len(begin):
             out[where[order][begin]] = np.add.reduceat(values[order], begin, axis=0)
         return out
 
     def phases(keep):
-        return Phases(total(np.abs(U) ** 2, keep), total(U**2, keep))
+        columns, rows = U[:, :, None], U[:, None, :]
+        return Phases(total(columns.conj() * rows, keep), total(columns * rows, keep))
 
-    everything = np.ones(len(U), bool)
-    Y = np.zeros((len(U), 0, len(data.outputs)), complex)
-    if harmonics:
-        output = line[:, None] + data.periods * np.asarray(harmonics)
-        output %= data.sections * data.periods
-        Y = np.fft.fft(data.y[:, data.window], axis=1)[experiment[:, None], output]
-    by = U[:, None, None]
+    Y, noise = _outputs(data, windows, experiment, line, harmonics)
+    by = U[:, :, None, None]
     return Sums(
         _about(data),
         harmonics,
-        *np.divmod(pair, len(data.inputs)),
-        tried=phases(everything),
+        lines,
+        meets_itself(lines, P, N, highest),
+        tried=phases(np.ones(len(U), bool)),
         ran=phases(good),
-        direct=total(by.conj() * Y, good),
-        mirror=total(by * Y, good),
-        summary="",
+        count=total(np.ones(len(U), int), good),
+        direct=total(by.conj() * Y[:, None], good),
+        mirror=total(by * Y[:, None], good),
+        energy=total(np.abs(Y) ** 2, good),
+        noise=total(noise, good),
+        phases=_test(data, lines, line, first),
+        repeats=query.repeats,
     )
 
 
-def _excited(data: ExperimentData, threshold: float, first: int):
-    """Experiment, line, input and U of every excited line, checked that they do not meet."""
-    u = data.u[:, data.window]
-    U = np.fft.rfft(np.where(np.isfinite(u).all(axis=(1, 2), keepdims=True), u, 0.0), axis=1)
+def _test(data: ExperimentData, lines, line, first: int) -> PhaseTest:
+    """Where lines are measured several times: whether their phases are random."""
+    if first == 0 and len(lines) == len(line):
+        return no_phases
+    return examine_phases(data.u[:, data.window])
+
+
+def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
+    """Y at the answers of each entry, the mean over the windows, and its variance."""
+    N, P, ny = data.sections, data.periods, len(data.outputs)
+    if not harmonics:
+        return np.zeros((len(line), 0, ny), complex), np.zeros((len(line), 0, ny))
+    output = (line[:, None] + P * np.asarray(harmonics)) % (N * P)
+    each = [np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows]
+    mean = sum(each) / len(each)
+    if len(each) == 1:
+        return mean, np.zeros(mean.shape)
+    spread = sum(np.abs(Y - mean) ** 2 for Y in each)
+    return mean, spread / (len(each) - 1) / len(each)
+
+
+def _excited(
+    data: ExperimentData, windows: list[slice], threshold: float, highest: int | None, first: int
+):
+    """Experiment, line and U of every excited line, checked that they do not meet."""
+    u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
+    each = [np.fft.rfft(u[:, window], axis=1) for window in windows]
+    U = sum(each) / len(each)
     size = np.abs(U)
     peak = size.max(axis=(1, 2), keepdims=True)
-    found = np.nonzero((size > threshold * peak) & (size > 1e-12 * peak.max()))
-    experiment, line, channel = found
-    number = np.bincount(experiment, minlength=len(u))
+    if max(np.abs(x - U).max(axis=(1, 2), keepdims=True).sum() for x in each) > 0:
+        worst = max(float(np.max(np.abs(x - U) / np.where(peak > 0, peak, 1))) for x in each)
+        if worst > max(threshold, 1e-2):
+            raise DefinitionError(
+                f"the input does not repeat: its last {len(windows)} windows of P = "
+                f"{data.periods} periods differ by {worst:.2g} of the largest line. Take fewer "
+                "`repeats`, or the right number of periods."
+            )
+    found = ((size > threshold * peak) & (size > 1e-12 * peak.max())).any(axis=2)
+    experiment, line = np.nonzero(found)
+    number = found.sum(axis=1)
     most = data.periods // 2 + 1
 
     def hint(experiment: int) -> str:
@@ -154,29 +231,22 @@ def _excited(data: ExperimentData, threshold: float, first: int):
             "`threshold`?)"
         )
 
-    check_sharing(experiment + first, line, data.periods, hint)
-    return experiment, line, channel, U[found]
+    check_sharing(experiment + first, line, data.periods, hint, data.sections, highest)
+    return experiment, line, U[experiment, line]
 
 
 def _add(a: Sums, b: Sums) -> Sums:
-    nu = len(a.about.inputs)
-    pairs = [x.line * nu + x.channel for x in (a, b)]
-    pair = np.union1d(*pairs)
-    places = [np.searchsorted(pair, x) for x in pairs]
+    line = np.union1d(a.line, b.line)
+    places = [np.searchsorted(line, x.line) for x in (a, b)]
 
     def add(x, y):
-        out = np.zeros((len(pair), *x.shape[1:]), x.dtype)
+        if isinstance(x, Phases):
+            return Phases(*map(add, x, y))
+        out = np.zeros((len(line), *x.shape[1:]), x.dtype)
         out[places[0]] += x
         out[places[1]] += y
         return out
 
-    return Sums(
-        a.about,
-        a.harmonics,
-        *np.divmod(pair, nu),
-        Phases(*map(add, a.tried, b.tried)),
-        Phases(*map(add, a.ran, b.ran)),
-        add(a.direct, b.direct),
-        add(a.mirror, b.mirror),
-        "",
-    )
+    sums = ("mirrored", "tried", "ran", "count", "direct", "mirror", "energy", "noise")
+    both = {name: add(getattr(a, name), getattr(b, name)) for name in sums}
+    return a._replace(line=line, phases=a.phases + b.phases, **both)

@@ -80,6 +80,7 @@ class LimitCycle(eqx.Module):
         Computed from the factors without forming their product, so that small ones are right
         too; zeros that stem from resets and sections are counted by rank and left out.
         """
+        _require_values(self, "multipliers")
         dims = np.asarray(self.dims)
         factors = np.asarray(self.factors)
         after = np.roll(dims, -1)
@@ -94,11 +95,13 @@ class LimitCycle(eqx.Module):
     @property
     def state(self) -> dict[str, float]:
         """The state at `start`, by name."""
+        _require_values(self, "state")
         chart = Structure(self.system).charts[int(self.start.chart[0])]
         return dict(zip(chart.states, self.start.q[:, 0].tolist(), strict=False))
 
     def trajectory(self, periods: float = 1.0) -> Trajectory:
         """The orbit from `start` on, with its events, dense enough to plot."""
+        _require_values(self, "trajectory")
         s = Structure(self.system)
         a = int(self.start.chart[0])
         return simulate(
@@ -124,6 +127,14 @@ class LimitCycle(eqx.Module):
             f"  events       {events}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"
+        )
+
+
+def _require_values(cycle: LimitCycle, name: str) -> None:
+    if is_traced(cycle):
+        raise DefinitionError(
+            f"`{name}` of a limit cycle needs its values, which a JAX transformation hides: use "
+            "its arrays (`start`, `period`, `factors`) there, or `linearize(...).monodromy()`."
         )
 
 
@@ -170,7 +181,7 @@ def find_limit_cycle(
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
-    cycle that was not found raise an error of the linear solver.
+    cycle that was not found mean nothing, and are NaN as a rule.
     """
     settings = Settings(rtol=1e-12, atol=1e-12) if settings is None else settings
     traced = is_traced(system)

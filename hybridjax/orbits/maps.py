@@ -1,6 +1,7 @@
 """The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
 
-from typing import NamedTuple
+import operator
+from typing import NamedTuple, SupportsIndex
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -71,13 +72,14 @@ class SectionMap(eqx.Module):
         return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
 
 
-def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
+def section_map(cycle: LimitCycle, sections, i: SupportsIndex, j: SupportsIndex) -> SectionMap:
     """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
 
     For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
     range; `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
+    i, j = operator.index(i), operator.index(j)
     for k in (i, j):
         if not 0 <= k < placed.count:
             raise DefinitionError(
@@ -85,7 +87,7 @@ def section_map(cycle: LimitCycle, sections, i: int, j: int) -> SectionMap:
             )
     s, chart = Structure(cycle.system), placed.lanes.chart
     dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
-    return SectionMap(placed, int(i), int(j), dims)
+    return SectionMap(placed, i, j, dims)
 
 
 @quick_jit

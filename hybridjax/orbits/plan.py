@@ -4,7 +4,6 @@ A plan serves prediction, step lengths and error estimates, not control flow: la
 way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
-import dataclasses
 import functools as ft
 import weakref
 from collections.abc import Mapping
@@ -26,8 +25,10 @@ from ..systems.structure import Structure
 from .place import PATIENCE, PlacedSections
 
 
-# Numbers of steps that are tried for each section.
+# Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
+# steps whose error estimate is at most this part of the tolerance.
 _PIECES = (1, 2, 3, 4, 6, 8)
+_PARTS = (1.0, 1e-2, 1e-4)
 # The reference, and the differences that give the sensitivities.
 _TIGHT, _NUDGE = 1e-13, 1e-6
 # Room for the way to a level, which takes longer in some lanes than on the cycle.
@@ -72,18 +73,13 @@ def make_plan(
     accuracy: Float[Array, ""],
     scale: Float[Array, "N n"],
 ) -> Plan:
-    """Find the fewest steps between sections that keep the accuracy asked for.
+    """Find the cheapest way between sections that keeps the accuracy asked for.
 
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
     """
     N, n = scale.shape
-    K = len(_PIECES)
-    tight = dataclasses.replace(
-        settings,
-        rtol=jnp.asarray(_TIGHT),
-        atol=settings.atol * _TIGHT / settings.rtol,
-        max_steps=max(settings.max_steps, PATIENCE),
-    )
+    K = len(_PIECES) + len(_PARTS)
+    patience = max(settings.max_steps, PATIENCE)
     section = jnp.arange(N)
     following = (section + 1) % N
     turns = (following == 0).astype(jnp.int32)
@@ -94,53 +90,57 @@ def make_plan(
     # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
     nudge = _NUDGE * scale.T[None] * jnp.eye(n)[:, :, None]
     nudge = jnp.concatenate([jnp.zeros((K + 1, n, N)), nudge])
-    divide = jnp.array([*_PIECES, *[2] * (1 + n)])
-    slack = jnp.array([*[jnp.inf] * K, *[1.0] * (1 + n)])
+    divide = jnp.array([*_PIECES, *[_PIECES[-1]] * len(_PARTS), *[2] * (1 + n)])
+    slack = jnp.array([*[jnp.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
+    rtol = jnp.where(jnp.isfinite(slack) & (jnp.arange(len(slack)) < K), settings.rtol, _TIGHT)
     target = placed.target(following, placed.lanes.t, turns)
     u = jnp.zeros((len(placed.cycle.system.inputs), N))
 
     def block(xs):
-        nudge, divide, slack = xs
+        nudge, divide, slack, rtol = xs
         moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
         lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
         start = Stride(longest / divide, lead, jnp.full(N, slack))
-        moved = move(placed.cycle.system, lanes, u, target, tight, start)
+        tolerance = Settings(rtol, settings.atol * rtol / settings.rtol, patience)
+        moved = move(placed.cycle.system, lanes, u, target, tolerance, start)
         ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
         return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
 
-    ends, error = jax.lax.map(block, (nudge, divide, slack))
+    ends, error = jax.lax.map(block, (nudge, divide, slack, rtol))
     ends = jnp.moveaxis(ends, 0, 1)
-    estimate = error[:K] * (_TIGHT / settings.rtol)
+    estimate = error[:K] * (rtol[:K, None] / settings.rtol)
     exact = ends[:, K]
     J = jnp.transpose((ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1)) / scale[:, None, :]
     J = J.at[:, :, 0].set(jnp.where(placed.time_is_state[:, None], J[:, :, 0], 0.0))
-    J = jnp.nan_to_num(J)
     error = jnp.transpose(ends[:, :K] - exact[:, None], (1, 2, 0))
     if not placed.cycle.clocked:
         error = error.at[..., 0].set(0.0)
     impact = jnp.maximum(_impact(J, error, scale), _ROUNDING)
+    impact = jnp.where(jnp.isnan(impact), jnp.inf, impact)
     estimate = jnp.maximum(estimate, 1e-6)
 
     # The largest share of the accuracy for each section that keeps their sum.
     shares = accuracy * 0.5 ** jnp.arange(0, 4 + N.bit_length())
-    best = jax.vmap(ft.partial(_fewest, impact))(shares)
+    best = jax.vmap(ft.partial(_cheapest, impact))(shares)
     total = jnp.sum(impact[best, section], axis=1)
     k = jnp.where((total <= accuracy).any(), jnp.argmax(total <= accuracy), len(shares) - 1)
-    best, slack = best[k], jnp.clip(accuracy / total[k], 1e-6, _SLACK)
+    best, spare = best[k], jnp.clip(accuracy / total[k], 1e-6, _SLACK)
     impact, estimate = impact[best, section], estimate[best, section]
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
     together = _CAUTION * _accumulated(J, error[best, section], scale) / jnp.sum(impact)
-    weight = impact / estimate * jnp.clip(together, 1 / _CANCEL, 1.0)
-    # An estimate bounds the error itself, too: a section's share of the accuracy is always allowed.
-    slack = jnp.maximum(slack * estimate, 1 / N)
-    return Plan(longest / jnp.array(_PIECES)[best], lead, slack, weight)
+    weight = impact / estimate * jnp.maximum(together, 1 / _CANCEL)
+    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
+    share = jnp.minimum(accuracy * estimate / impact, 1.0) / N
+    by_steps = jnp.maximum(spare * estimate, share)
+    return Plan(
+        longest / divide[best], lead, jnp.where(best < len(_PIECES), by_steps, slack[best]), weight
+    )
 
 
-def _fewest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
+def _cheapest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
     """The first candidate of each section whose impact is at most `share`, or the best one."""
     enough = impact <= share
-    best = jnp.argmin(jnp.where(jnp.isnan(impact), jnp.inf, impact), axis=0)
-    return jnp.where(enough.any(axis=0), jnp.argmax(enough, axis=0), best)
+    return jnp.where(enough.any(axis=0), jnp.argmax(enough, axis=0), jnp.argmin(impact, axis=0))
 
 
 def _lead(placed: PlacedSections, following, turns):

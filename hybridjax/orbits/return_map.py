@@ -45,21 +45,7 @@ def solve(
     s = Structure(system)
     n = s.d
     valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
-    if damped:
-        solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
-    else:
-        # Along a direction in which J - I is singular, Newton does not move.
-        solver = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=lx.SVD(rcond=_SINGULAR))
-    solution = optx.root_find(
-        lambda q, args: _residual(q, *args, settings),
-        solver,
-        start.q[:, 0],
-        (system, start, base, expected),
-        has_aux=True,
-        max_steps=max_steps,
-        throw=False,
-    )
-    q, seen = solution.value, solution.aux
+    q, seen, steps = _root(system, start, base, expected, settings, damped, max_steps)
     if follow:
         _, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
     period = expected if base is None else seen.period
@@ -78,7 +64,6 @@ def solve(
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
     begin = _begin(s, q, start, base, expected)
-    steps = solution.stats["num_steps"]
     return begin, period, factors, seen, steps, code.astype(jnp.int32)
 
 
@@ -93,6 +78,46 @@ class Turn(eqx.Module):
     result: Int[Array, ""]
 
 
+# Along a direction in which J - I is singular, neither Newton nor a derivative moves.
+_SOLVER = lx.SVD(rcond=_SINGULAR)
+
+
+@eqx.filter_custom_jvp
+def _root(system, start, base, expected, settings, damped, max_steps):
+    """The state that the return map leaves where it is, what was seen there, and steps taken."""
+    if damped:
+        solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
+    else:
+        solver = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=_SOLVER)
+    solution = optx.root_find(
+        lambda q, args: _residual(q, *args, settings),
+        solver,
+        start.q[:, 0],
+        (system, start, base, expected),
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
+    )
+    return solution.value, solution.aux, solution.stats["num_steps"]
+
+
+@_root.def_jvp
+def _root_jvp(primals, tangents):
+    """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
+    where it is taken twice, since JAX cannot vectorise the derivative of `flow_jacobian`.)"""
+    *parameters, settings, _, _ = primals
+    q, seen, steps = _root(*primals)
+
+    def residual(system, start, base, expected):
+        return _turn(q, system, start, base, expected, settings, _flow)[0]
+
+    _, by_parameters = eqx.filter_jvp(residual, tuple(parameters), tuple(tangents[:4]))
+    jacobian = lx.MatrixLinearOperator(_turn_with_jacobian(q, *parameters, settings)[2])
+    t_q = -lx.linear_solve(jacobian, by_parameters, _SOLVER, throw=False).value
+    nothing = jax.tree_util.tree_map(lambda _: None, (seen, steps))
+    return (q, seen, steps), (t_q, *nothing)
+
+
 @eqx.filter_custom_jvp
 def _residual(q, system, start, base, expected, settings):
     """P(q) - q, and the `Turn`. The Jacobian is that of the turn's legs, computed with it."""
@@ -102,19 +127,9 @@ def _residual(q, system, start, base, expected, settings):
 
 @_residual.def_jvp
 def _residual_jvp(primals, tangents):
-    q, system, start, base, expected, settings = primals
+    """Newton asks for derivatives by q only."""
     residual, seen, jacobian = _turn_with_jacobian(*primals)
-    t_q, *t_rest = tangents
-    t_residual = jnp.zeros_like(q) if t_q is None else jacobian @ t_q
-    if jax.tree_util.tree_leaves(t_rest):
-        # Parameters: through the same turn, by the flow's own derivative.
-        def of_parameters(system, start, base, expected):
-            return _turn(q, system, start, base, expected, settings, _flow)[0]
-
-        _, more = eqx.filter_jvp(of_parameters, (system, start, base, expected), tuple(t_rest[:4]))
-        t_residual = t_residual + more
-    nothing = jax.tree_util.tree_map(lambda _: None, seen)
-    return (residual, seen), (t_residual, nothing)
+    return (residual, seen), (jacobian @ tangents[0], jax.tree_util.tree_map(lambda _: None, seen))
 
 
 def _turn_with_jacobian(q, system, start, base, expected, settings):

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import hybridjax as hj
 
@@ -182,3 +183,28 @@ def test_second_order_products_can_be_kept_off_the_lines(seed, experiments):
             for b in own:
                 for product in ((a + b) % 32, (a - b) % 32):
                     assert min(product, 32 - product) not in own
+
+
+def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
+    """No few equal steps will do: they are adapted, and the estimate still bounds the error."""
+    placed = hj.place_sections(vanderpol_cycle, [hj.Crossing("x", "falling")])
+    u = 0.1 * np.random.default_rng(0).standard_normal((3, 6, 1))
+    data = hj.run_experiments(vanderpol_cycle, placed, u, ("v",), discard=0)
+    assert data.ok.all() and (data.failed_at == -1).all()
+
+    def speeds(u):
+        """v at the falling zeros of x."""
+        v = float(placed.lanes.q[1, 0])
+        for value in u:
+            yield v
+            field = lambda t, q: (q[1], (1 - q[0] ** 2) * q[1] - q[0] + value)  # noqa: B023, E731
+            x = lambda t, q: q[0]  # noqa: E731
+            x.direction = -1
+            run = solve_ivp(field, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13)
+            v = next(q[1] for t, q in zip(run.t_events[0], run.y_events[0], strict=True) if t > 1)
+
+    true = np.array([list(speeds(row)) for row in u[:, :, 0]])
+    size = np.abs(true).max()
+    error = np.abs(data.y[:, :, 0] + data.cycle_outputs[:, 0] - true).max(axis=1) / size
+    assert np.ptp(true) > 0.1 * size  # the inputs do something
+    assert np.all(error <= data.error) and np.all(data.error < 1e-8)
