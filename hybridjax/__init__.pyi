@@ -38,6 +38,10 @@ from .flow.sections import (
     Sections as Sections,
 )
 from .flow.trajectory import Event as Event, Trajectory as Trajectory, simulate as simulate
+from .identify.bound import (
+    MultiplierBound as MultiplierBound,
+    multiplier_bound as multiplier_bound,
+)
 from .identify.compare import MultiplierComparison as MultiplierComparison
 from .identify.nonparametric import (
     estimate_htf as estimate_htf,
