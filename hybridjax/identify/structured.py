@@ -105,12 +105,11 @@ def fit_multipliers(
     The maximum-likelihood estimate for independent, circular, normally distributed errors of the
     HTFs with the variances `htf.variance`: the sum of $|H - B/\chi|^2 / \mathrm{var}$ is
     minimised over all numerators and c. Numerators are solved for inside (variable projection), so
-    that Gauss and Newton's steps are taken in the d coefficients c only. They start from two
-    solutions of the linearised problem, the better of them: iterated least squares (Sanathanan
-    and Koerner 1963) and its correction for the bias that errors give it (generalised total least
-    squares). Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, treat
-    all three. Positive and negative frequencies are used, $H_m(-w) = \overline{H_{-m}(w)}$; for
-    m = 0 (and N/2) numerators are real.
+    that Gauss and Newton's steps are taken in the d coefficients c only. They start from the
+    linearised problem, solved by generalised total least squares, which is consistent (Pintelon
+    and Schoukens, *System Identification: A Frequency Domain Approach*). Positive and negative
+    frequencies are used, $H_m(-w) = \overline{H_{-m}(w)}$; for m = 0 (and N/2) numerators are
+    real.
 
     **Arguments:**
 
@@ -147,7 +146,7 @@ def fit_multipliers(
             "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
         )
     unknowns = order * N + overhang + 1
-    _check_freedom(htf, order, unknowns)
+    check_freedom(htf, order, unknowns)
 
     groups = groups_of(htf, weights_of(htf, rms), unknowns)
     c, converged = maximum_likelihood(groups, order, max_steps)
@@ -239,7 +238,7 @@ def _smooth(variance, harmonics, freedom):
     return size[same] * by_line
 
 
-def _check_freedom(htf: HTF, order: int, unknowns: int) -> None:
+def check_freedom(htf: HTF, order: int, unknowns: int) -> None:
     frequencies = len(htf.f)
     if freedom(htf, frequencies, unknowns) < order:
         needed = next(F for F in count(1) if freedom(htf, F, unknowns) >= order)

@@ -1,7 +1,5 @@
 """Multipliers with errors: efficient, and with regions that hold what they promise."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -28,21 +26,20 @@ def with_variance(htf, H, variance, freedom=None):
 
 @pytest.fixture(scope="module")
 def small():
-    """Four sections, two multipliers, a state that dies within a period; and its HTFs."""
-    model = hj.LDTP.from_blocks(*blocks_at_random(3, (2, 3, 4, 2), 2, 1, gain=0.98))
+    """Four sections, two multipliers of modulus 0.7, states that die soon; its HTFs."""
+    A, B, C, D = blocks_at_random(3, (2, 3, 4, 2), 2, 1)
+    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers()[0])
+    model = hj.LDTP.from_blocks([a * (0.7 / size) ** 0.25 for a in A], B, C, D)
     return model, model.htf(np.linspace(0.01, 1.99, 80))
 
 
 @pytest.fixture(scope="module")
 def variance(small):
-    """Not the same at all frequencies, harmonics and outputs."""
-    _, htf = small
+    """Not the same for all frequencies, harmonics and outputs."""
     rng = np.random.default_rng(9)
-    levels = [10 ** rng.uniform(-1, 1, n) for n in (4, 80, 2, 1)]
-    levels[0][3] = levels[0][1]  # H_-1 and H_1
-    return 1e-4 * np.prod(np.ix_(*levels)[0:1], axis=0) * levels[1][:, None, None] * levels[2][
-        :, None
-    ]
+    harmonic = np.array([1.0, 0.3, 2.0, 0.3])[:, None, None, None]
+    line = 10 ** rng.uniform(-0.5, 0.5, 80)[:, None, None]
+    return 1e-2 * harmonic * line * np.array([1.0, 3.0])[:, None]
 
 
 def covered(hits, runs, level=0.95):
@@ -50,17 +47,107 @@ def covered(hits, runs, level=0.95):
     return stats.binomtest(hits, runs, level).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("correlation, errors", [(0, "variance"), (0, None), (0.7, None)])
+@pytest.mark.parametrize("correlation, errors", [(0, "variance"), (0.7, None)])
 def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
+    """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
-    true = model.multipliers()
-    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance))
-    hits, square, said = 0, 0.0, 0.0
-    for seed in range(150):
-        fit = hj.fit_multipliers(
+    true, runs = model.multipliers(), 100
+    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
+    fits = [
+        hj.fit_multipliers(
             noisy(htf, variance, np.random.default_rng(seed), correlation), 2, errors=errors
         )
-        hits += fit.contains(true).all()
-        square += fit.compare(true).error[0] ** 2 / 150
-        said += fit.standard_errors[0] ** 2 / 150
-    print(hits, square**.5, said**.5, bound)
+        for seed in range(runs)
+    ]
+    assert covered(sum(fit.contains(true).all() for fit in fits), runs)
+    rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
+    said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
+    np.testing.assert_allclose(said, rms, rtol=0.2)
+    if not correlation:
+        np.testing.assert_allclose(rms, bound, rtol=0.2)
+        freedom = np.sqrt(2 * fits[0].freedom * runs)
+        assert abs(sum(fit.cost - fit.freedom for fit in fits)) < 4 * freedom
+
+
+def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
+    model, htf = small
+    true = model.multipliers()
+    square = np.zeros(2)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        data = noisy(htf, variance, rng)
+        rough = variance * rng.gamma(2.0, 0.5, variance.shape)
+        fit = hj.fit_multipliers(with_variance(htf, data.H, rough, np.full(80, 2.0)), 2)
+        raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
+        square += [f.compare(true).error[0] ** 2 for f in (fit, raw)]
+    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors[0]
+    assert np.sqrt(square[0] / 40) < 1.3 * bound < np.sqrt(square[1] / 40)
+
+
+def test_without_variances_the_misfit_tells(small):
+    """One output is a hundred times as noisy, which nobody said."""
+    model, htf = small
+    variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
+    said = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
+    data = noisy(htf, variance, np.random.default_rng(0))
+    blind = hj.fit_multipliers(with_variance(htf, data.H, None), 2)
+    np.testing.assert_allclose(blind.standard_errors, said, rtol=0.3)
+    assert blind.contains(model.multipliers(), 0.999).all()
+
+
+@pytest.fixture(scope="module")
+def pair_and_real():
+    """An estimate of a conjugate pair and a real multiplier."""
+    true = np.array([0.6 + 0.3j, 0.6 - 0.3j, -0.4])
+    rng = np.random.default_rng(1)
+    square = rng.normal(size=(3, 3))
+    return hj.MultiplierBound(true, np.poly(true).real[1:], 1e-6 * square @ square.T), rng
+
+
+def test_first_order_covariances_and_regions(pair_and_real):
+    """Against the roots of coefficients drawn at random."""
+    estimate, rng = pair_and_real
+    true, c = estimate.multipliers, estimate.coefficients
+    draws = rng.multivariate_normal(c, estimate.covariance, size=4000)
+    roots = np.array([np.roots([1, *draw]) for draw in draws])
+    pick = np.argmin(np.abs(roots[:, :, None] - true), axis=1)
+    roots = np.take_along_axis(roots, pick, axis=1)
+    for i in range(3):
+        parts = np.stack([roots[:, i].real, roots[:, i].imag])
+        np.testing.assert_allclose(
+            np.cov(parts), estimate.multiplier_covariances[i], rtol=0.1, atol=1e-7
+        )
+    radius = np.sqrt(np.mean(np.abs(roots - true) ** 2, axis=0))
+    np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
+    # The border of the first-order region has the distance of the exact one.
+    for i, degrees in ((0, 2), (2, 1)):
+        border = estimate.ellipse(i, 0.9)
+        if degrees == 1:
+            border = border[[np.argmin(border.real), np.argmax(border.real)]].real
+        distance = estimate.distance(border)
+        np.testing.assert_allclose(distance, stats.chi2.ppf(0.9, degrees), rtol=0.05)
+    # The share of draws that a region around the truth holds.
+    held = [hj.MultiplierBound(true, draw, estimate.covariance).contains(true) for draw in draws]
+    assert np.all([covered(n, 4000) for n in np.sum(held, axis=0)])
+
+
+def test_bad_requests(pair_and_real, small, variance):
+    estimate, _ = pair_and_real
+    with pytest.raises(hj.DefinitionError, match="level lies between 0 and 1, not 95"):
+        estimate.contains([0.5], 95)
+    with pytest.raises(hj.DefinitionError, match="no multiplier 3: the fit has 3"):
+        estimate.ellipse(3)
+    model, htf = small
+    with pytest.raises(hj.DefinitionError, match="these have none: take 'residuals'"):
+        hj.fit_multipliers(htf, 2, errors="variance")
+    with pytest.raises(hj.DefinitionError, match="errors must be 'residuals'"):
+        hj.fit_multipliers(htf, 2, errors="guess")
+    wrong = variance.copy()
+    wrong[0, 3, 1] = np.nan
+    with pytest.raises(hj.DefinitionError, match="variance of H_-2 of y1 at f = 0.08.* is not"):
+        hj.fit_multipliers(with_variance(htf, htf.H, wrong), 2)
+    with pytest.raises(hj.DefinitionError, match="needs the variances"):
+        hj.multiplier_bound(model, htf)
+    other = hj.HTF(htf.f, htf.H, htf.harmonics, 4, "u", ("a", "b"), variance=variance)
+    with pytest.raises(hj.DefinitionError, match="different outputs"):
+        hj.multiplier_bound(model, other)
