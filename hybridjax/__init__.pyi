@@ -52,6 +52,10 @@ from .identify.structured import (
     StructuredFit as StructuredFit,
     fit_multipliers as fit_multipliers,
 )
+from .identify.transient import (
+    TransientFit as TransientFit,
+    remove_transient as remove_transient,
+)
 from .io import load as load, save as save
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
 from .orbits.linearize import linearize as linearize
