@@ -53,7 +53,7 @@ def remove_transient(
     """Fit the decay of whatever the experiments started with, and subtract it.
 
     Needs no model. The input has the period P over all of the record, which is longer than P
-    periods. If it is longer by several (20, say), everything that repeats after P periods is told
+    periods, by `skip` at least. If it is longer by several (20, say), everything that repeats after P periods is told
     from the decay, distortion included, and any design will do. With fewer, only the response at
     lines that are excited is, so that a design is needed that leaves out half of them
     (`multisine(lines="odd")`).
@@ -77,10 +77,10 @@ def remove_transient(
         raise DefinitionError(f"skip is a number of periods, not {skip}.")
     if order is not None and not 1 <= order <= cycles // 2:
         raise DefinitionError(f"order is the number of multipliers, at least 1, not {order}.")
-    if cycles <= P:
+    if cycles < P:
         raise DefinitionError(
-            f"the record has {n // N} cycles, but to remove a transient it must be longer than the "
-            f"window of P = {P} and the {skip} skipped ones: record some more."
+            f"the record has {n // N} cycles, but to remove a transient it must hold the "
+            f"window of P = {P} and the {skip} skipped ones before it: record some more."
         )
     if not data.ok.any():
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")

@@ -63,7 +63,7 @@ def test_what_is_refused(hopper, full):
         return hj.ExperimentData(data.u[:, :n], data.y[:, :n], sections=32, periods=12, **more)
 
     for message, data_, arguments in (
-        ("must be longer than the window of P = 12", cut(32 * 12), dict()),
+        ("must hold the window of P = 12", cut(32 * 12), dict()),
         ("nothing to tell the transient", cut(32 * 14), dict(order=2)),
         ("order is the number of multipliers", data, dict(order=0)),
         ("skip is a number of periods", data, dict(skip=-1)),
