@@ -29,6 +29,7 @@ from .experiments.run import (
     run_experiments as run_experiments,
     stream_experiments as stream_experiments,
 )
+from .experiments.steady import steady_start as steady_start
 from .flow.move import Settings as Settings
 from .flow.sections import (
     AtEvent as AtEvent,

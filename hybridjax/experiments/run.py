@@ -11,6 +11,7 @@ from ..systems.output import Output
 from .campaign import divide, prepare
 from .data import ExperimentData
 from .design import Design
+from .variation import vary
 
 
 # Experiments in one part of a stream.
@@ -26,6 +27,8 @@ def run_experiments(
     start: str = "cycle",
     discard: int | None = None,
     periods: int | None = None,
+    process_noise: float = 0.0,
+    seed: int = 0,
     accuracy: float = 1e-9,
     scale: Mapping[str, float] | None = None,
     batch: int | None = None,
@@ -47,9 +50,12 @@ def run_experiments(
         (by default all that are not discarded).
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
     - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
-        linearisation predicts, so that there is almost no transient.
+        linearisation predicts, so that there is almost no transient, and "steady" in the periodic
+        response itself, found by Newton's method, with none.
     - `discard`: cycles that come before the design's periods and are meant to be discarded. By
-        default 20 from the cycle (the paper's) and 0 from the periodic start.
+        default 20 from the cycle (the paper's) and 0 from a periodic start.
+    - `process_noise`: standard deviation of a random input, held from section to section, that
+        acts beside the excitation and is not recorded. `seed`: of it.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to `scale`. `data.error` is each experiment's own estimate.
     - `scale`: sizes of states by name (of time as `t`); by default the largest on the cycle.
@@ -64,9 +70,9 @@ def run_experiments(
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for
     an unstable cycle, from which any experiment would run away.
     """
-    campaign = prepare(
+    campaign = _prepare(
         cycle, sections, design, outputs, start=start, discard=discard, periods=periods,
-        accuracy=accuracy, scale=scale,
+        process_noise=process_noise, seed=seed, accuracy=accuracy, scale=scale,
     )  # fmt: skip
     size, workers = divide(campaign.count, batch, workers)
     return campaign.run(slice(0, campaign.count), size, workers, progress)
@@ -97,10 +103,17 @@ def stream_experiments(
 
     **Raises:** as `run_experiments`, at once.
     """
-    campaign = prepare(cycle, sections, design, outputs, **options)
+    campaign = _prepare(cycle, sections, design, outputs, **options)
     parts = chunks(campaign.count, chunk)
     size, workers = divide(parts[0].stop, batch, workers)
     return (campaign.run(rows, size, workers) for rows in parts)
+
+
+def _prepare(*arguments, start="cycle", process_noise=0.0, seed=0, **options):
+    """`prepare`, and what is done beside it."""
+    steady = start == "steady"
+    start = "periodic" if steady else start
+    return vary(prepare(*arguments, start=start, **options), steady, process_noise, seed)
 
 
 def chunks(count: int, chunk: int) -> list[slice]:
