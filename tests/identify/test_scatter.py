@@ -1,66 +1,177 @@
-"""Multipliers with errors: efficient, and with regions that hold what they promise."""
-
-import dataclasses
+"""Variances of estimates: noise, distortion, degrees of freedom, and when they cannot be had."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
 
-
-def noisy(htf, variance, rng, correlation=0.0):
-    """HTFs with circular errors; a share of them is common to all harmonics and outputs."""
-    parts = [rng.normal(size=htf.H.shape) + 1j * rng.normal(size=htf.H.shape) for _ in range(2)]
-    own, common = parts[0], parts[1][:1, :, :1]
-    error = np.sqrt(1 - correlation) * own + np.sqrt(correlation) * common
-    return with_variance(htf, np.asarray(htf.H) + np.sqrt(variance / 2) * error, variance)
-
-
-def with_variance(htf, H, variance, freedom=None):
-    return hj.HTF(
-        htf.f, H, htf.harmonics, htf.sections, htf.inputs, htf.outputs,
-        variance=variance, freedom=freedom,
-    )  # fmt: skip
+N, P = 4, 16
+LINES = hj.multisine(N, P, 2.0, 0.1, experiments=4)
 
 
 @pytest.fixture(scope="module")
-def small():
-    """Four sections, two multipliers, a state that dies within a period; and its HTFs."""
-    model = hj.LDTP.from_blocks(*blocks_at_random(3, (2, 3, 4, 2), 2, 1, gain=0.98))
-    return model, model.htf(np.linspace(0.01, 1.99, 80))
+def model():
+    rng = np.random.default_rng(0)
+    A = 0.6 * rng.normal(size=(N, 2, 2))
+    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
-@pytest.fixture(scope="module")
-def variance(small):
-    """Not the same at all frequencies, harmonics and outputs."""
-    _, htf = small
-    rng = np.random.default_rng(9)
-    levels = [10 ** rng.uniform(-1, 1, n) for n in (4, 80, 2, 1)]
-    levels[0][3] = levels[0][1]  # H_-1 and H_1
-    return 1e-4 * np.prod(np.ix_(*levels)[0:1], axis=0) * levels[1][:, None, None] * levels[2][
-        :, None
+def realised(model, count, repeats=1, noise=0.0, seed=0, **more):
+    design = LINES.realisations(count, seed)
+    data = hj.simulate_experiments(
+        model, design, start="periodic", discard=(repeats - 1) * P, seed=seed, **more
+    )
+    return hj.add_noise(data, std=noise, seed=seed)
+
+
+def inside(model, count, repeats, variance, runs=100, **more):
+    """How often discs of 95 % hold the true value, of how many: H_0 at every third line."""
+    hits = []
+    for seed in range(runs):
+        data = realised(model, count, repeats, seed=seed, **more)
+        estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
+        error = np.abs(estimate[0] - model.htf(estimate.f, 0)[0])
+        hits.append((error <= estimate.confidence_radius()[0])[::3])
+    return np.sum(hits), np.size(hits)
+
+
+@pytest.mark.parametrize(
+    "count, repeats, variance, noise",
+    [
+        (2, 1, "total", dict(noise=0.3)),
+        (5, 1, "total", dict(process_noise=0.02)),
+        (1, 2, "noise", dict(noise=0.3)),
+        (2, 3, "noise", dict(noise=0.1, process_noise=0.02)),
+    ],
+)
+def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, variance, noise):
+    hits, of = inside(model, count, repeats, variance, **noise)
+    assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
+
+
+def test_the_parts_of_the_variance(model):
+    """White noise: both parts are the same; their mean is the formula of the design."""
+    data = realised(model, 40, 8, noise=0.2)
+    estimate = hj.estimate_htf(data, repeats=8)
+    np.testing.assert_array_equal(estimate.freedom, 39)
+    once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
+    np.testing.assert_allclose(np.mean(estimate.variance), once, rtol=0.03)
+    np.testing.assert_allclose(np.mean(estimate.noise_variance), once, rtol=0.03)
+    alone = hj.estimate_htf(data, repeats=8, variance="noise")
+    np.testing.assert_array_equal(alone.variance, estimate.noise_variance)
+    np.testing.assert_array_equal(alone.freedom, 40 * 7)
+    assert alone.noise_variance is None
+
+
+def test_distortion_is_what_noise_is_not(model):
+    """y = linear + cube of the input: realisations scatter, repeated periods do not."""
+    data = realised(model, 20, 2)
+    bent = hj.ExperimentData(data.u, data.y + 5 * data.u**3, sections=N, periods=P)
+    estimate = hj.estimate_htf(bent, (0,), repeats=2)
+    assert np.all(estimate.noise_variance < 1e-25) and np.all(estimate.variance > 1e-8)
+    exact = model.htf(estimate.f, 0)[0]
+    # The best linear approximation is not the linear part, by 3 u^3 -> 9 var(u) u for many lines.
+    assert np.all(np.abs(estimate[0] - exact) > estimate.confidence_radius()[0])
+
+
+def test_sums_of_parts_are_those_of_the_whole(model):
+    data = realised(model, 4, 2, noise=0.1)
+    parts = [
+        hj.ExperimentData(data.u[k : k + 4], data.y[k : k + 4], sections=N, periods=P)
+        for k in range(0, 16, 4)
     ]
+    one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
+    for name in ("H", "variance", "noise_variance", "freedom"):
+        np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
 
 
-def covered(hits, runs, level=0.95):
-    """Consistent with the level by a two-sided binomial test of level 0.1 %."""
-    return stats.binomtest(hits, runs, level).pvalue > 1e-3
+def test_without_repeats_or_realisations_nothing_is_known(model):
+    estimate = hj.estimate_htf(realised(model, 1))
+    assert estimate.variance is None and estimate.freedom is None
+    with pytest.raises(hj.DefinitionError, match="several realisations"):
+        estimate.confidence_radius()
 
 
-@pytest.mark.parametrize("correlation, errors", [(0, "variance"), (0, None), (0.7, None)])
-def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
-    model, htf = small
-    true = model.multipliers()
-    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance))
-    hits, square, said = 0, 0.0, 0.0
-    for seed in range(150):
-        fit = hj.fit_multipliers(
-            noisy(htf, variance, np.random.default_rng(seed), correlation), 2, errors=errors
-        )
-        hits += fit.contains(true).all()
-        square += fit.compare(true).error[0] ** 2 / 150
-        said += fit.standard_errors[0] ** 2 / 150
-    print(hits, square**.5, said**.5, bound)
+def test_a_failed_realisation_leaves_the_others(model):
+    data = realised(model, 2, noise=0.1)
+    result = np.zeros(len(data.u), int)
+    result[0] = hj.Result.BLOW_UP
+    data = hj.ExperimentData(data.u, data.y, sections=N, periods=P, result=result)
+    estimate = hj.estimate_htf(data)
+    lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
+    assert np.all(np.isinf(estimate.variance[:, lost]))
+    assert np.all(np.isfinite(estimate.variance[:, ~lost]))
+    with pytest.raises(hj.DefinitionError, match="measured in one realisation only"):
+        hj.estimate_htf(data, variance="total")
+
+
+def test_pairs_cancel_even_distortion(model):
+    design = LINES.realisations(3).with_negatives()
+    data = hj.simulate_experiments(model, design, start="periodic")
+    bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, sections=N, periods=P)
+    estimate = hj.estimate_htf(hj.odd_part(bent))
+    assert estimate.error(model.htf(estimate.f)).max() < 1e-12
+    with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
+        hj.odd_part(realised(model, 2))
+    with pytest.raises(hj.DefinitionError, match="one has no partner"):
+        hj.odd_part(hj.ExperimentData(data.u[:3], data.y[:3], sections=N, periods=P))
+
+
+@pytest.mark.parametrize(
+    "message, arguments",
+    {
+        "3 windows of P = 16 periods need 48 cycles": dict(repeats=3),
+        "repeats >= 1": dict(repeats=0),
+        "needs two windows or more": dict(variance="noise"),
+        "variance must be": dict(variance="both"),
+        "threshold must lie": dict(threshold=0.0),
+    }.items(),
+)
+def test_variances_that_cannot_be_had(model, message, arguments):
+    estimate = getattr(hj.estimate_htf, "__wrapped__", hj.estimate_htf)
+    with pytest.raises(hj.DefinitionError, match=message):
+        estimate(realised(model, 1, 2), **arguments)
+
+
+def test_repeated_phases_show_no_distortion(model):
+    data = realised(model, 1, noise=0.1)
+    twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
+    with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
+        hj.estimate_htf(hj.ExperimentData(*twice, sections=N, periods=P), variance="total")
+
+
+def test_inputs_that_do_not_repeat(model):
+    data = realised(model, 1, 2)
+    u = data.u * np.linspace(1, 2, data.u.shape[1])[:, None]
+    with pytest.raises(hj.DefinitionError, match="the input does not repeat"):
+        hj.estimate_htf(hj.ExperimentData(u, data.y, sections=N, periods=P), repeats=2)
+
+
+def test_noise_by_its_ratio(model):
+    data = realised(model, 1, 4)
+    noisy = hj.add_noise(data, snr=20, seed=3)
+    ratio = np.var(noisy.y - data.y, axis=(0, 1)) / np.mean(data.y**2, axis=(0, 1))
+    np.testing.assert_allclose(ratio, 0.01, rtol=0.2)
+    for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
+        with pytest.raises(hj.DefinitionError):
+            hj.add_noise(data, **bad)
+    with pytest.raises(hj.DefinitionError, match="process_noise must be finite"):
+        realised(model, 1, process_noise=-1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 3), st.integers(1, 40), st.integers(0, 70), st.integers(1, 3))
+def test_any_record_is_estimated_or_refused(model, sections, periods, samples, repeats):
+    """Whatever N and P are said to be: a number for every line, or a sentence."""
+    rng = np.random.default_rng(samples)
+    u, y = rng.normal(size=(2, samples, 1)), rng.normal(size=(2, samples, 1))
+    try:
+        data = hj.ExperimentData(u, y, sections=sections, periods=periods)
+        estimate = hj.estimate_htf(data, repeats=repeats, half_integers="skip")
+    except hj.DefinitionError as error:
+        assert str(error).endswith(".") and len(str(error)) > 20
+    else:
+        assert np.isfinite(estimate.H).all()
