@@ -49,6 +49,8 @@ from .identify.nonparametric import (
     missing_frequencies as missing_frequencies,
 )
 from .identify.rational import RationalFit as RationalFit, fit_rational as fit_rational
+from .identify.records import Record as Record
+from .identify.series import SeriesFit as SeriesFit, fit_series as fit_series
 from .identify.structured import (
     StructuredFit as StructuredFit,
     fit_multipliers as fit_multipliers,

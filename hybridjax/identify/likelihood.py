@@ -129,27 +129,33 @@ def summarize(
         each = np.einsum("iaek,jaek->eij", found.jacobian, found.jacobian)
         np.add.at(shares, group.line, each)
     square = shares.sum(axis=0)
-    return Summary(*sandwich(square - noise, square, score, shares, errors), cost, left)
+    if errors == "variance":
+        found = sandwich(square - noise, square)
+    else:
+        found = sandwich(square - noise, score.T @ score, shares)
+    return Summary(*found, cost, left)
 
 
 def sandwich(
     curvature: Float[np.ndarray, "d d"],
-    square: Float[np.ndarray, "d d"],
-    score: Float[np.ndarray, "parts d"],
-    shares: Float[np.ndarray, "parts d d"],
-    errors: Literal["residuals", "variance"],
+    gradient: Float[np.ndarray, "d d"],
+    shares: Float[np.ndarray, "parts d d"] | None = None,
 ) -> tuple[Float[np.ndarray, "d d"], float]:
-    """Covariance of the coefficients and its degrees of freedom.
+    """Covariance of the coefficients, infinite if the curvature is not positive.
 
-    Those of the sum of squares of independent parts are the number of parts that contribute:
+    **Arguments:** `gradient`: the covariance of the gradient; `shares`, where it was estimated
+    from independent parts, what each is expected to add to it.
+
+    **Returns:** the covariance and its degrees of freedom: the number of parts that contribute,
     one over the sum of the squares of their shares (Satterthwaite 1946).
     """
     values, vectors = np.linalg.eigh(curvature)
     if not values[0] > 1e-12 * values[-1]:
         return np.full(curvature.shape, np.inf), np.inf
     inverse = vectors / values @ vectors.T
-    if errors == "variance":
-        return inverse @ square @ inverse, np.inf
-    half = np.linalg.inv(np.linalg.cholesky(square))
-    share = np.einsum("ij,ejk,ik->ei", half, shares, half)
-    return inverse @ (score.T @ score) @ inverse, float(1 / (share**2).sum(axis=0).mean())
+    freedom = np.inf
+    if shares is not None:
+        half = np.linalg.inv(np.linalg.cholesky(shares.sum(axis=0)))
+        share = np.einsum("ij,ejk,ik->ei", half, shares, half)
+        freedom = float(1 / (share**2).sum(axis=0).mean())
+    return inverse @ gradient @ inverse, freedom

@@ -1,0 +1,149 @@
+"""Recorded inputs and outputs, with gaps, laid out by record, cycle and section."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._core.errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..periodic._checks import names
+
+
+class Record(eqx.Module):
+    """One stretch of recorded inputs and outputs, of any length, with any input.
+
+    **Fields**, on the host:
+
+    - `u` (n, nu): inputs, held from sample i to i + 1. NaN where not known: the record is then
+      cut there, and the state after it is unknown.
+    - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
+      sample is missing or bad.
+    - `sections`: N. `start`: the section of sample 0. `inputs`, `outputs`: names.
+    """
+
+    u: Float[np.ndarray, "n nu"]
+    y: Float[np.ndarray, "n ny"]
+    sections: int = eqx.field(static=True)
+    start: int = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        u: Any,
+        y: Any,
+        *,
+        sections: int,
+        start: int = 0,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+    ):
+        """**Raises:** `DefinitionError` for shapes that do not fit together, or infinite values."""
+        self.u, self.y = _columns("u", u), _columns("y", y)
+        if len(self.u) != len(self.y) or 0 in self.u.shape + self.y.shape:
+            raise DefinitionError(
+                "u must have the shape (samples, inputs) and y (samples, outputs), not "
+                f"{self.u.shape} and {self.y.shape}."
+            )
+        if sections < 1 or not 0 <= start < sections:
+            raise DefinitionError(
+                f"a record needs sections >= 1 and a start from 0 to sections - 1, not {sections} "
+                f"and {start}."
+            )
+        self.sections, self.start = sections, start
+        self.inputs = names("inputs", inputs, self.u.shape[1])
+        self.outputs = names("outputs", outputs, self.y.shape[1])
+
+    def __repr__(self) -> str:
+        missing = int(np.isnan(self.y).any(axis=1).sum())
+        gaps = f", {missing} with gaps" if missing else ""
+        return (
+            f"Record({len(self.u)} samples from section {self.start}{gaps}; N = {self.sections}; "
+            f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+        )
+
+
+Recorded = ExperimentData | Record | Sequence[ExperimentData | Record]
+
+
+def _columns(name: str, values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    if values.dtype.kind not in "fiu" or values.ndim != 2:
+        raise DefinitionError(
+            f"{name} must hold real numbers on two axes, not {values.dtype} of shape "
+            f"{values.shape}."
+        )
+    bad = np.argwhere(np.isinf(values))
+    if len(bad):
+        raise DefinitionError(
+            f"{name} is infinite at sample {bad[0][0]}; put NaN where a sample is bad."
+        )
+    return values.astype(float)
+
+
+class Layout(NamedTuple):
+    """S records of T cycles: samples before the start, after the end and in gaps do not count."""
+
+    u: Float[np.ndarray, "S T N nu"]
+    """Zero where there is no record."""
+    y: Float[np.ndarray, "S T N ny"]
+    """NaN where there is no sample."""
+    inside: Bool[np.ndarray, "S T N"]
+    """From the first sample of a record to its last."""
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def lay_out(data: Recorded) -> Layout:
+    """All records as one array. Experiments that failed are left out.
+
+    **Raises:** `DefinitionError` if nothing is left, or records differ in N or names.
+    """
+    records = [r for part in _parts(data) for r in _records(part)]
+    if not records:
+        raise DefinitionError("there is no experiment that ran to its end.")
+    kinds = {(r.sections, r.inputs, r.outputs) for r in records}
+    if len(kinds) > 1:
+        a, b = sorted(kinds, key=str)[:2]
+        raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
+    ((N, inputs, outputs),) = kinds
+    pieces = [piece for record in records for piece in _pieces(record)]
+    if not pieces:
+        raise DefinitionError("the input is NaN at every sample.")
+    T = max(-(-(first + len(u)) // N) for first, u, _ in pieces)
+    U = np.zeros((len(pieces), T * N, len(inputs)))
+    Y = np.full((len(pieces), T * N, len(outputs)), np.nan)
+    inside = np.zeros((len(pieces), T * N), bool)
+    for s, (first, u, y) in enumerate(pieces):
+        place = slice(first, first + len(u))
+        U[s, place], Y[s, place], inside[s, place] = u, y, True
+
+    def cycles(x):
+        return x.reshape(len(pieces), T, N, *x.shape[2:])
+
+    return Layout(cycles(U), cycles(Y), cycles(inside), inputs, outputs)
+
+
+def _parts(data: Recorded) -> list[ExperimentData | Record]:
+    return [data] if isinstance(data, ExperimentData | Record) else list(data)
+
+
+def _records(part: ExperimentData | Record) -> list[Record]:
+    if isinstance(part, Record):
+        return [part]
+    about = {"sections": part.sections, "inputs": part.inputs, "outputs": part.outputs}
+    return [Record(part.u[s], part.y[s], **about) for s in np.flatnonzero(part.ok)]
+
+
+def _pieces(record: Record):
+    """Stretches of known input: the first sample's place in its cycle, u and y.
+
+    The output just at an unknown input counts as unknown, since it may feel it directly.
+    """
+    known = np.isfinite(record.u).all(axis=1)
+    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
+    for first, last in edges.reshape(-1, 2):
+        yield (record.start + first) % record.sections, record.u[first:last], record.y[first:last]

@@ -1,0 +1,251 @@
+"""Multipliers and transfer functions from recorded series with any input: output error."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.errors import DefinitionError
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..periodic.htf import HTF
+from ..periodic.ldtp import LDTP
+from ..periodic.transfer import check_harmonics
+from .estimate import MultiplierEstimate, roots_of
+from .likelihood import gauss_newton, sandwich
+from .projection import chi
+from .records import Layout, Recorded, lay_out
+from .regression import Linearisation, Problem, initial, linearise, rescale, set_up
+
+
+_PROBES = 4  # outputs of pure noise, from which the noise in the Jacobian is estimated
+
+
+class SeriesFit(MultiplierEstimate):
+    r"""A periodic system with one denominator in $q^{-N}$, fitted to recorded series.
+
+    $$\chi(q^{-N})\, y[n] = \sum_{r=0}^{R-1} b_{n \bmod N}[r]\, u[n-r], \qquad
+    \chi(q^{-N}) = 1 + c_1 q^{-N} + \ldots + c_d q^{-dN} = \prod_i (1 - \lambda_i q^{-N})$$
+
+    which is exact for a periodic system with d non-zero multipliers, if R is large enough.
+
+    **Fields:**
+
+    - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d.
+    - `covariance` (d, d): of the coefficients, estimated with `covariance_freedom` degrees of
+      freedom. `standard_errors`, `contains` and `ellipse` give what follows for multipliers.
+    - `numerators` (N, R, ny, nu): b at each section. Combinations of inputs that were not
+      excited have none.
+    - `slopes` (d, N, R, ny, nu): their derivatives with respect to c.
+    - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
+    - `noise` (ny,): standard deviation of what the model does not explain.
+    - `result`: code of `Result`, OK or NOT_CONVERGED.
+    - `sections`, `inputs`, `outputs`.
+    """
+
+    multipliers: Complex[np.ndarray, " d"]
+    coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    numerators: Float[np.ndarray, "N R ny nu"]
+    slopes: Float[np.ndarray, "d N R ny nu"]
+    roots: Float[np.ndarray, "N ny R nu r"]
+    noise: Float[np.ndarray, " ny"]
+    covariance_freedom: float = eqx.field(static=True)
+    result: int = eqx.field(static=True)
+    sections: int = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def impulse_response(self, n_lags: int) -> Float[np.ndarray, "N lags ny nu"]:
+        """Markov parameters: the response at section n to a unit input r sections earlier."""
+        if n_lags < 1:
+            raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
+        N, R = self.numerators.shape[:2]
+        h = np.zeros((N, max(n_lags, R), *self.numerators.shape[2:]))
+        h[:, :R] = self.numerators
+        for r in range(N, h.shape[1]):
+            for j, c in enumerate(self.coefficients[: r // N], 1):
+                h[:, r] -= c * h[:, r - j * N]
+        return h[:, :n_lags]
+
+    def htf(self, f: Any, harmonics: int | Sequence[int] | None = None) -> HTF:
+        r"""The harmonic transfer functions at frequencies f (cycles per period), with variances.
+
+        Only where the inputs had power; elsewhere the variance is large, or there is none at
+        all. It is that of white noise of the numerators, and of c as its covariance says.
+        """
+        f = np.atleast_1d(np.asarray(f, float))
+        harmonics = check_harmonics(harmonics, self.sections)
+        N, R, ny, nu = self.numerators.shape
+        powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(R))
+        lag = np.exp(-2j * np.pi * f)
+        below = chi(lag, self.coefficients)
+        n = np.arange(N)
+        turn = np.exp(-2j * np.pi * np.outer(harmonics, n) / N) / N
+
+        def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
+            G = np.einsum("fr,...nrij->...nfij", powers, b) / below[:, None, None]
+            return np.einsum("mn,...nfij->...mfij", turn, G)
+
+        H = sum_up(self.numerators)
+        delays = lag ** np.arange(1, len(self.coefficients) + 1)[:, None]
+        slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
+        by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()).real
+        spread = np.einsum("fr,nirjk->nfijk", powers, self.roots)
+        by_b = (np.abs(spread) ** 2).sum(axis=(0, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
+        variance = by_c + by_b * self.noise[:, None] ** 2
+        return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
+
+    def __repr__(self) -> str:
+        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
+        noise = ", ".join(f"{n} {x:.2e}" for n, x in zip(self.outputs, self.noise, strict=True))
+        return (
+            f"SeriesFit(multipliers {self.show_multipliers()}; noise {noise}; "
+            f"{self.sections} sections, {self.numerators.shape[1]} lags{state})"
+        )
+
+
+def fit_series(
+    data: Recorded,
+    order: int | LDTP,
+    *,
+    overhang: int | None = None,
+    start: Literal["free", "rest"] = "free",
+    errors: Literal["residuals", "white"] = "residuals",
+    max_steps: int = 50,
+) -> SeriesFit:
+    r"""Multipliers, HTFs and their uncertainty from series with any input.
+
+    Output error, with white noise of unknown variance in each output: the sum of squares of the
+    difference between measured and simulated outputs is minimised over all numerators, unknown
+    starts and c; all but c are solved for inside (variable projection, Golub and Pereyra 1973).
+    It starts from the periodic ARX problem, solved by total least squares. (Ljung, *System
+    Identification: Theory for the User*, treats both.)
+
+    **Arguments:**
+
+    - `data`: `ExperimentData` (all cycles are used, not only its window; failed experiments are
+      left out), a `Record`, which may have gaps and any length, or several of them.
+    - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
+    - `overhang`: lags of the numerators beyond d N; None means N.
+    - `start`: "free": whatever happened before a record, the state at its start is unknown.
+      That costs the information of its first d + 1 cycles. "rest": it starts on the limit
+      cycle, with no input before.
+    - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
+      cycle, so that it holds also where noise of successive cycles is dependent (process noise),
+      with the weights of Newey and West (1987). "white": from its size alone.
+    - `max_steps`: of Gauss and Newton's iteration.
+
+    **Raises:** `DefinitionError` for an order below 1, records that do not fit together, inputs
+    that are zero, or too few cycles (the message says how many are needed).
+    """
+    require_x64()
+    order = order.rank() if isinstance(order, LDTP) else order
+    layout = lay_out(data)
+    N = layout.y.shape[2]
+    overhang = N if overhang is None else overhang
+    if order < 1 or max_steps < 1 or overhang < 0:
+        raise DefinitionError(
+            "a fit needs order >= 1 (the number of non-zero multipliers), max_steps >= 1 and "
+            f"overhang >= 0, not {order}, {max_steps} and {overhang}."
+        )
+    _check(layout)
+    problem = set_up(layout, order, overhang, start == "rest")
+    c, found, converged = _minimise(problem, initial(problem, order), max_steps)
+    _check_freedom(found, order, problem)
+    problem = rescale(problem, _noise(found, order))  # the weights that the misfit suggests
+    c, found, converged = _minimise(problem, c, max_steps)
+    covariance, freedom = _covariance(problem, c, found, errors)
+
+    nu, ny = layout.u.shape[3], layout.y.shape[3]
+
+    def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
+        b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
+        return np.swapaxes(b, -1, -2)
+
+    widest = max(root.shape[1] for row in found.roots for root in row)
+    roots = np.zeros((N, ny, problem.lags * nu, widest))
+    for n, row in enumerate(found.roots):
+        for i, root in enumerate(row):
+            roots[n, i, :, : root.shape[1]] = root
+    return SeriesFit(
+        multipliers=roots_of(c),
+        coefficients=c,
+        covariance=covariance,
+        numerators=by_input(found.numerators),
+        slopes=by_input(found.slope),
+        roots=roots.reshape(N, ny, problem.lags, nu, widest),
+        noise=_noise(found, order) * problem.scale,
+        covariance_freedom=freedom,
+        result=Result.OK if converged else Result.NOT_CONVERGED,
+        sections=N,
+        inputs=layout.inputs,
+        outputs=layout.outputs,
+    )
+
+
+def _minimise(problem: Problem, start: np.ndarray, max_steps: int):
+    def normal(c):
+        found = linearise(problem, c)
+        return found.residual.ravel(), found.jacobian.reshape(len(c), -1).T
+
+    c, converged = gauss_newton(normal, start, max_steps)
+    return c, linearise(problem, c), converged
+
+
+def _noise(found: Linearisation, order: int) -> Float[np.ndarray, " ny"]:
+    """Standard deviation of each output's noise, in its units of the moment."""
+    square = (found.residual**2).sum(axis=(0, 1, 2, 4))
+    left = found.freedom.sum(axis=0) - order / found.freedom.shape[1]
+    return np.maximum(np.sqrt(square / left), 1e-15)
+
+
+def _covariance(problem: Problem, c, found: Linearisation, errors: str):
+    """Of c, and its degrees of freedom; by cycles, which may depend on their neighbours."""
+    d = len(c)
+    rng = np.random.default_rng(0)
+    probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.good[..., None]
+    noise = linearise(problem, c, probes).jacobian.reshape(d, -1)
+    noise = noise @ noise.T / _PROBES
+    parts = np.einsum("istnac,jstnac->stij", found.jacobian, found.jacobian)
+    square = parts.sum(axis=(0, 1))
+    if errors == "white":
+        return sandwich(square - noise, square)
+    # A residual is smaller than the error, by the share of its equation in the unknowns.
+    left = found.freedom / np.maximum(problem.good.sum(axis=(0, 1)), 1)
+    error = found.residual / np.sqrt(np.maximum(left, 1e-3))[..., None]
+    score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
+    gradient = np.einsum("sti,stj->ij", score, score)
+    slowest = np.clip(np.abs(roots_of(c)).max(), 1e-3, 0.99)
+    lags = int(min(np.ceil(np.log(0.1) / np.log(slowest)), problem.y.shape[1] // 4))
+    weights = 1 - np.arange(1, lags + 1) / (lags + 1)
+    for k, w in enumerate(weights, 1):
+        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
+        gradient += w * (product + product.T)
+    covariance, freedom = sandwich(square - noise, gradient, parts.reshape(-1, d, d))
+    return covariance, freedom / (1 + 2 * float((weights**2).sum()))
+
+
+def _check(layout: Layout) -> None:
+    for i, name in enumerate(layout.inputs):
+        if not layout.u[..., i].any():
+            raise DefinitionError(f"the input {name} is zero at every sample.")
+    for i, name in enumerate(layout.outputs):
+        seen = np.isfinite(layout.y[..., i])
+        if not layout.y[..., i][seen].any():
+            raise DefinitionError(f"the output {name} is zero or missing at every sample.")
+
+
+def _check_freedom(found: Linearisation, order: int, problem: Problem) -> None:
+    if (found.freedom > order).all():
+        return
+    n, i = np.argwhere(found.freedom <= order)[0]
+    sampled = int(problem.good[:, :, n, i].sum())
+    missing = order + 1 - int(found.freedom[n, i])
+    raise DefinitionError(
+        f"section {n} was sampled {sampled} times, too few for numerators of {problem.lags} lags "
+        f"and {problem.free} unknown cycles at the start of each record: {missing} or more cycles "
+        "are missing. Record more, or lower `order` or `overhang`."
+    )

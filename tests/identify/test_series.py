@@ -1,0 +1,147 @@
+"""Fits to recorded series: exact without noise, calibrated with it, gaps, unknown starts."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+
+from ..periodic.conftest import blocks_at_random
+from .test_uncertainty import covered
+
+
+def scaled(seed, dims, ny, nu, modulus=0.7):
+    """A random system whose largest multiplier has this modulus."""
+    A, B, C, D = blocks_at_random(seed, dims, ny, nu)
+    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers()[0])
+    factor = (modulus / size) ** (1 / len(dims))
+    return hj.LDTP.from_blocks([a * factor for a in A], B, C, D)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return scaled(3, (2, 3, 4, 2), 2, 1)
+
+
+def record(model, samples, seed=0, noise=0.0, start=0, x0=None):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(samples, len(model.inputs)))
+    y = np.array(model.simulate(u, x0, start))
+    y += noise * rng.normal(size=y.shape)
+    about = dict(inputs=model.inputs, outputs=model.outputs)
+    return hj.Record(u, y, sections=model.sections, start=start, **about)
+
+
+def test_the_hopper_is_found_exactly(hopper, multipliers):
+    fit = hj.fit_series(record(hopper, 32 * 120, x0=np.array([0.01, -0.02, 0.01, 0.0])), hopper)
+    assert fit.compare(multipliers).max_error < 1e-13
+    f = np.array([0.0, 0.3, 1.7, 16.0])
+    assert fit.htf(f).error(hopper.htf(f)).max() < 1e-12
+    np.testing.assert_allclose(fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12)
+    assert fit.result == hj.Result.OK and np.all(fit.noise < 1e-14)
+
+
+SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from(SHAPES), st.integers(0, 99), st.integers(0, 3))
+def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
+    """Two records of odd lengths, with bad outputs and inputs here and there."""
+    dims, ny, nu = shape
+    model, N = scaled(seed, dims, ny, nu), len(dims)
+    rng = np.random.default_rng(seed)
+    records = []
+    for k in range(2):
+        start = (first + k) % N
+        x0 = rng.normal(size=dims[start])
+        one = record(model, 60 * N + 1 + k, seed + k, start=start, x0=x0)
+        u, y = one.u.copy(), one.y.copy()
+        y[rng.random(y.shape) < 0.02] = np.nan
+        u[25 * N + 2, 0] = np.nan
+        about = dict(inputs=model.inputs, outputs=model.outputs)
+        records.append(hj.Record(u, y, sections=N, start=start, **about))
+    fit = hj.fit_series(records, model)
+    np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers()).real[1:], atol=1e-7)
+    lags = fit.numerators.shape[1]
+    np.testing.assert_allclose(fit.impulse_response(lags), model.impulse_response(lags), atol=1e-7)
+
+
+def test_regions_cover(small):
+    """Of multipliers and of the HTFs at fixed frequencies; the error is what is said."""
+    true, runs, f = small.multipliers(), 60, np.array([0.1, 0.9, 1.6])
+    exact = small.htf(f, (-1, 0, 1))
+    fits = [hj.fit_series(record(small, 4 * 120, seed, 0.3), 2) for seed in range(runs)]
+    assert covered(sum(fit.contains(true).all() for fit in fits), runs)
+    rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
+    said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
+    np.testing.assert_allclose(said, rms, rtol=0.25)
+    square = 0.0
+    for fit in fits:
+        estimate = fit.htf(f, (-1, 0, 1))
+        square += np.abs(estimate.H - exact.H) ** 2 / estimate.variance / runs
+    np.testing.assert_allclose(square, 1.0, atol=0.6)
+    assert abs(np.mean(square) - 1) < 0.15
+    np.testing.assert_allclose(np.mean([fit.noise for fit in fits], axis=0), 0.3, rtol=0.02)
+
+
+def test_process_noise_is_seen_in_the_residuals(small):
+    """A random input nobody recorded: regions from white errors would be too small."""
+    true, runs = small.multipliers(), 60
+    hits = 0
+    for seed in range(runs):
+        clean = record(small, 4 * 150, seed)
+        hidden = np.random.default_rng(1000 + seed).normal(size=clean.u.shape)
+        y = clean.y + 0.3 * np.asarray(small.simulate(hidden))
+        fit = hj.fit_series(hj.Record(clean.u, y, sections=4), 2)
+        hits += fit.contains(true).all()
+    assert covered(hits, runs)
+
+
+def test_experiments_are_used_from_their_start(hopper, multipliers):
+    """The transient that a window of periods avoids is information here."""
+    data = hj.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
+    data = hj.ExperimentData(
+        data.u, data.y, sections=32, periods=40, inputs="u", outputs=("yM", "vM"),
+        result=[0] * 19 + [hj.Result.BLOW_UP],
+    )  # fmt: skip
+    for start in ("free", "rest"):
+        fit = hj.fit_series(data, 2, start=start)
+        assert fit.compare(multipliers).max_error < 1e-8
+        assert "SeriesFit(multipliers -0.2489" in repr(fit)
+
+
+def test_a_chirp_will_do(hopper, multipliers):
+    n = np.arange(32 * 400)
+    u = 0.02 * np.cos(np.pi * 0.6 * n**2 / n[-1])[:, None]
+    fit = hj.fit_series(hj.Record(u, hopper.simulate(u), sections=32), 2)
+    assert fit.compare(multipliers).max_error < 1e-6
+
+
+def test_bad_records(small):
+    good = record(small, 400)
+    with pytest.raises(hj.DefinitionError, match="section 0 was sampled 10 times, too few"):
+        hj.fit_series(record(small, 40), 2)
+    with pytest.raises(hj.DefinitionError, match="order >= 1"):
+        hj.fit_series(good, 0)
+    with pytest.raises(hj.DefinitionError, match="input u is zero"):
+        hj.fit_series(hj.Record(0 * good.u, good.y, sections=4), 2)
+    with pytest.raises(hj.DefinitionError, match="output y1 is zero or missing"):
+        hj.fit_series(hj.Record(good.u, good.y * [1, np.nan], sections=4), 2)
+    with pytest.raises(hj.DefinitionError, match="do not belong together"):
+        hj.fit_series([good, hj.Record(good.u, good.y, sections=5)], 2)
+    with pytest.raises(hj.DefinitionError, match="input is NaN at every sample"):
+        hj.fit_series(hj.Record(good.u * np.nan, good.y, sections=4), 2)
+    with pytest.raises(hj.DefinitionError, match=r"not \(400, 1\) and \(399, 2\)"):
+        hj.Record(good.u, good.y[1:], sections=4)
+    with pytest.raises(hj.DefinitionError, match="start from 0 to sections - 1"):
+        hj.Record(good.u, good.y, sections=4, start=4)
+    with pytest.raises(hj.DefinitionError, match="y is infinite at sample 7"):
+        y = good.y.copy()
+        y[7] = np.inf
+        hj.Record(good.u, y, sections=4)
+    with pytest.raises(hj.DefinitionError, match="no experiment that ran to its end"):
+        hj.fit_series(
+            hj.ExperimentData(good.u[None], good.y[None], sections=4, periods=9, result=[5]), 2
+        )
+    assert "Record(400 samples from section 0; N = 4; u -> y0, y1)" == repr(good)
