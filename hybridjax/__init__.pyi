@@ -9,6 +9,7 @@ from ._core.errors import (
 )
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
+from .experiments.crest import optimise_phases as optimise_phases
 from .experiments.data import (
     ExperimentData as ExperimentData,
     simulate_experiments as simulate_experiments,
@@ -44,6 +45,11 @@ from .identify.bound import (
     multiplier_bound as multiplier_bound,
 )
 from .identify.compare import MultiplierComparison as MultiplierComparison
+from .identify.distortion import (
+    OutputLevels as OutputLevels,
+    output_levels as output_levels,
+)
+from .identify.leakage import predict_leakage as predict_leakage
 from .identify.nonparametric import (
     estimate_htf as estimate_htf,
     missing_frequencies as missing_frequencies,

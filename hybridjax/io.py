@@ -107,7 +107,9 @@ def load(path: str | os.PathLike) -> Saved:
     known = {f.name: f.metadata.get("static", False) for f in fields}
     if set(listed) != set(members):
         raise _damaged(path, "its arrays are not those that its header lists")
-    if set(static) != {n for n in known if known[n]} or any(known.get(n, True) for n in listed):
+    later = {f.name for f in fields if f.default is not dataclasses.MISSING}
+    given, all_static = set(static), {n for n in known if known[n]}
+    if not all_static - later <= given <= all_static or any(known.get(n, True) for n in listed):
         raise _damaged(path, f"its fields are not those of {kind.__name__}")
     absent = {name: None for name in known if not known[name] and name not in listed}
     values = {name: _tuples(value) for name, value in static.items()}

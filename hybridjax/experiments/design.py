@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from .._core.errors import DefinitionError
 from ..periodic._checks import names
-from .partition import check_sharing, is_real, needs_two_phases
+from .partition import check_sharing, is_real, meets_itself, regular
 
 
 Number = int | float
@@ -33,6 +33,7 @@ class Design(eqx.Module):
     - `channel`: index of the input it is applied to.
     - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
     - `sections`: N. `periods`: P. `experiments`: their number S. `input_names`.
+    - `highest_harmonic`: M, beyond which harmonics are taken as zero, or None for no assumption.
     """
 
     experiment: Int[np.ndarray, " K"]
@@ -44,6 +45,7 @@ class Design(eqx.Module):
     periods: int = eqx.field(static=True)
     experiments: int = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
+    highest_harmonic: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         self.check()
@@ -105,7 +107,10 @@ class Design(eqx.Module):
         """Check the rules under which the HTFs follow from the experiments uniquely (Sec. V).
 
         - every f lies in [0, N/2], amplitudes are positive, phases finite;
-        - in one experiment no two frequencies differ by, or add up to, an integer;
+        - in one experiment no two frequencies differ by, or add up to, an integer (with
+          `highest_harmonic` M: an integer up to 2 M, counted around the circle of N);
+        - a frequency that excites several inputs together does so in as many experiments, with
+          phases that tell them apart;
         - a frequency on a multiple of 1/2 (eq. 16) is excited in two experiments at least, with
           different phases; 0 and N/2 need only one phase, but not one with cos(phase) = 0.
 
@@ -124,14 +129,22 @@ class Design(eqx.Module):
         nu = len(self.input_names)
         outside = (self.channel < 0) | (self.channel >= nu)
         self._refuse(outside, f"is applied to an input that is not one of the {nu}")
-        check_sharing(self.experiment, self.line, P)
+        highest = None if self.highest_harmonic is None else 2 * self.highest_harmonic
+        # Several inputs may share a line, but none may have it twice.
+        entry = np.stack([self.experiment, self.line, self.channel], axis=1)
+        _, again = np.unique(entry, axis=0, return_counts=True)
+        if (again > 1).any():
+            check_sharing(self.experiment, self.line, P)
+        pair = np.unique(entry[:, :2], axis=0)
+        check_sharing(pair[:, 0], pair[:, 1], P, sections=N, highest=highest)
+        self._check_together(len(pair))
 
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
         power, square = np.bincount(group, np.abs(u) ** 2), u**2
         alike = np.hypot(np.bincount(group, square.real), np.bincount(group, square.imag)) / power
         self._refuse(
-            (needs_two_phases(self.line, P, N) & (alike > 1 - 1e-6)[group]),
+            (meets_itself(self.line, P, N, highest) & (alike > 1 - 1e-6)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (half_integers='two-phase' does so), or "
             "leave it out (half_integers='skip')",
@@ -139,6 +152,21 @@ class Design(eqx.Module):
         self._refuse(
             is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < 1e-3),
             "is zero at every section with this phase: give it the phase 0",
+        )
+
+    def _check_together(self, pairs: int) -> None:
+        """Lines that excite several inputs in one experiment: whether these can be told apart."""
+        if pairs == len(self.line):
+            return
+        nu = len(self.input_names)
+        lines, place = np.unique(self.line, return_inverse=True)
+        U = np.zeros((len(lines), self.experiments, nu), complex)
+        U[place, self.experiment, self.channel] = self.amplitude * np.exp(1j * self.phase)
+        gram = np.einsum("kei,kej->kij", U.conj(), U)
+        self._refuse(
+            ~regular(gram)[place] & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
+            "excites several inputs together, and its experiments cannot tell them apart: excite "
+            "it in as many experiments as inputs, with turned phases (excite='orthogonal')",
         )
 
     def _refuse(self, wrong: np.ndarray, reason: str) -> None:
@@ -266,12 +294,14 @@ class Design(eqx.Module):
     def __repr__(self) -> str:
         f, sizes = self.frequencies, np.bincount(self.experiment)
         crest, per = self.crest_factors(), self.expected_variance()
-        per = per[np.isfinite(per)]
+        per, M = per[np.isfinite(per)], self.highest_harmonic
+        assumed = "" if M is None else f", assuming that H_m = 0 for |m| > {M}"
         return (
             f"Design({_count(self.experiments, 'experiment')}, {len(f)} frequencies "
             f"{_span(f)} cycles per period in steps of 1/{self.periods}, "
             f"{_count(_span(sizes), 'cosine')} each of amplitude {_span(self.amplitude)}, "
-            f"crest factor {_span(crest)}, N = {self.sections}, P = {self.periods} periods, "
+            f"crest factor {_span(crest)}{assumed}, N = {self.sections}, "
+            f"P = {self.periods} periods, "
             f"inputs = {', '.join(self.input_names)}; {self.cycles(0)} cycles without those "
             f"discarded; output noise of std s gives each H_m a std of {_span(np.sqrt(per))} s)"
         )

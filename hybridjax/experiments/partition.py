@@ -14,7 +14,7 @@ Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Complex, Int
 
 from .._core.errors import DefinitionError
 
@@ -58,6 +58,15 @@ def _around(lines: Int[np.ndarray, " K"], periods: int, sections: int) -> Int[np
     return np.minimum(turns, sections - turns)
 
 
+def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
+    """Whether normal equations can be solved, whatever the sizes of the unknowns."""
+    size = np.sqrt(np.einsum("kii->ki", gram).real)
+    there = size.min(axis=1) > 1e-6 * size.max(axis=1)
+    size = np.where(there[:, None], size, 1.0)
+    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
+    return there & (least > 1e-6)
+
+
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
     """The exact minimum of experiments for these lines (repeated ones count as often)."""
     return int(np.bincount(line_class(line, periods)).max())
@@ -81,6 +90,56 @@ def assign(
         experiment[members] = least_full
         load[least_full] += 1
     return experiment
+
+
+def assign_apart(
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    sections: int,
+    highest: int,
+    rng: np.random.Generator,
+    experiments: int | None = None,
+) -> Int[np.ndarray, " K"]:
+    """A partition in which no harmonic up to `2 highest` leads from one line to another.
+
+    All lines of a class are integers k apart, if f = c + k and -f = c + k are both brought to the
+    form c + k. Lines with the same remainder of k modulo S share an experiment: then they are S or
+    more apart, also around the circle of N where that is so for the given S. Without `experiments`
+    the smallest such S from `2 highest + 1` on is taken.
+
+    **Raises:** `DefinitionError` for a number of experiments that does not do.
+    """
+    rest = line % periods
+    cell = np.where(2 * rest < periods, line // periods, -(line // periods) - 1)
+    classes = line_class(line, periods)
+    fewest = fewest_experiments(line, periods)
+    least = 2 * highest + 1
+    _, place = np.unique(classes, return_inverse=True)
+    for S in range(least, fewest) if experiments is None else [experiments]:
+        offsets = rng.integers(0, S, place.max() + 1)
+        experiment = (cell + offsets[place]) % S
+        try:
+            check_sharing(experiment, line, periods, sections=sections, highest=2 * highest)
+        except DefinitionError:
+            continue
+        return experiment
+    if experiments is None or experiments >= fewest:
+        return assign(line, periods, experiments or fewest, rng)
+    raise DefinitionError(
+        f"{experiments} experiments are too few for harmonics up to {highest}: lines of one "
+        f"experiment would be closer than {least} cycles per period (around the circle of N = "
+        f"{sections}); take at least {least}, or leave the number open."
+    )
+
+
+def two_adic(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """The power of two that divides j (at most that of P): 0 for odd lines."""
+    power = np.zeros(len(line), int)
+    step = 2
+    while periods % step == 0:
+        power += line % step == 0
+        step *= 2
+    return power
 
 
 def second_order_hits(classes: Int[np.ndarray, " k"], periods: int) -> int:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.partition import check_sharing, meets_itself
+from ..experiments.partition import check_sharing, meets_itself, regular
 from .phases import PhaseTest, examine_phases, no_phases
 
 
@@ -82,15 +82,15 @@ class Sums(NamedTuple):
         """Lines with responses to all inputs (and mirror images) that can be told apart."""
         out = np.zeros(len(self.line), bool)
         for rows in (np.flatnonzero(~self.mirrored), np.flatnonzero(self.mirrored)):
-            out[rows] = _regular(self.gram(phases, rows, bool(self.mirrored[rows].any())))
+            out[rows] = regular(self.gram(phases, rows, bool(self.mirrored[rows].any())))
         return out
 
     def one_phase(self, phases: Phases) -> Bool[np.ndarray, " K"]:
         """Lines that meet their mirror images and were excited with one phase only."""
         rows = np.flatnonzero(self.mirrored)
         out = np.zeros(len(self.line), bool)
-        out[rows] = _regular(self.gram(phases, rows, False))
-        out[rows] &= ~_regular(self.gram(phases, rows, True))
+        out[rows] = regular(self.gram(phases, rows, False))
+        out[rows] &= ~regular(self.gram(phases, rows, True))
         return out
 
 
@@ -125,15 +125,6 @@ def sums_of(data: ExperimentData | Iterable[ExperimentData], query: Query) -> Su
 
 def _about(data: ExperimentData) -> About:
     return About(data.sections, data.periods, data.inputs, data.outputs)
-
-
-def _regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
-    """Whether normal equations can be solved, whatever the sizes of the unknowns."""
-    size = np.sqrt(np.einsum("kii->ki", gram).real)
-    there = size.min(axis=1) > 1e-6 * size.max(axis=1)
-    size = np.where(there[:, None], size, 1.0)
-    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
-    return there & (least > 1e-6)
 
 
 def _sums(data: ExperimentData, query: Query, first: int) -> Sums:

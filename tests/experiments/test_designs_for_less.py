@@ -1,0 +1,207 @@
+"""Odd and 2-adic lines, few experiments, several inputs at once, crest factors, realisations."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+
+from ..periodic.conftest import blocks_at_random, hopper as hopper
+
+
+def own(design, experiment):
+    return design.line[design.experiment == experiment]
+
+
+def products(j, periods):
+    """Lines, modulo P and sign, where a quadratic distortion answers."""
+    both = np.concatenate([(j[:, None] + j).ravel(), (j[:, None] - j).ravel()]) % periods
+    return {min(x, periods - x) for x in both.tolist()}
+
+
+@pytest.mark.parametrize(
+    "lines, periods, count, frequencies",
+    [("odd", 64, 20, 320), ("odd", 128, 20, 640), ("2-adic", 64, 100, 620)],
+)
+def test_even_products_miss_the_lines(lines, periods, count, frequencies):
+    design = hj.multisine(periods=periods, lines=lines)
+    assert (design.experiments, len(design.frequencies)) == (count, frequencies)
+    for s in range(count):
+        j = own(design, s)
+        assert products(j, periods).isdisjoint(np.minimum(j % periods, -j % periods).tolist())
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(3, 24),
+    st.integers(2, 16),
+    st.integers(0, 12),
+    st.floats(0.3, 1.0),
+    st.integers(0, 9),
+)
+def test_lines_of_few_experiments_are_far_apart(N, P, M, part, seed):
+    try:
+        design = hj.multisine(N, P, part * N / 2, highest_harmonic=M, seed=seed)
+    except hj.DefinitionError as error:
+        assert "wider band" in str(error)
+        return
+    full = hj.multisine(N, P, part * N / 2)
+    np.testing.assert_array_equal(design.frequencies, full.frequencies)
+    assert design.experiments <= max(full.experiments, 1)
+    for s in range(design.experiments):
+        f = np.concatenate([own(design, s), -own(design, s)]) / P
+        for a in range(len(f) // 2):
+            distance = np.abs((np.delete(f, a) - f[a] + N / 2) % N - N / 2)
+            met = np.abs(distance - np.round(distance)) < 1e-9
+            assert not np.any(met & (distance < 2 * M + 0.5) & (distance > 0.5))
+
+
+def test_few_experiments_on_the_hopper(hopper):
+    """2 M + 1 experiments; where lines would meet around the circle of 32, more."""
+    counts = {M: hj.multisine(highest_harmonic=M).experiments for M in range(11)}
+    assert [counts[M] for M in (0, 1, 2, 6, 7)] == [1, 3, 5, 13, 15]
+    assert counts[8] == counts[9] == counts[10] == 20
+    design = hj.multisine(highest_harmonic=2)
+    assert "assuming that H_m = 0 for |m| > 2" in repr(design)
+    leakage = hj.predict_leakage(design, hopper, (0,))
+    assert np.all((leakage > 1e-5) & (leakage < 5e-3))
+    htf = hopper.htf(design.frequencies, range(-15, 16))
+    np.testing.assert_allclose(hj.predict_leakage(design, htf, (0,)), leakage, rtol=1e-2)
+    assert hj.predict_leakage(hj.multisine(), hopper).max() < 1e-12
+    with pytest.raises(hj.DefinitionError, match="the HTF has N = 32"):
+        hj.predict_leakage(hj.multisine(4, 4, 1.0), htf)
+    data = hj.simulate_experiments(hopper, design, start="periodic")
+    with pytest.raises(hj.DefinitionError, match="experiment 0: .* so their responses fall on"):
+        hj.estimate_htf(data)
+    with pytest.raises(hj.DefinitionError, match="beyond highest = 2 are taken as zero"):
+        hj.estimate_htf(data, 3, highest=2)
+    assert hj.estimate_htf(data, highest=2).harmonics == (-2, -1, 0, 1, 2)
+
+
+def test_a_system_without_high_harmonics_needs_few_experiments():
+    """Time-invariant, seen as periodic: one experiment for all frequencies."""
+    A, B, C = np.array([[0.5, 0.2], [-0.3, 0.4]]), np.eye(2)[:, :1], np.eye(2)[:1]
+    model = hj.LDTP(*(np.tile(x, (6, 1, 1)) for x in (A, B, C)))
+    design = hj.multisine(6, 10, 3.0, highest_harmonic=0)
+    assert design.experiments == 1
+    data = hj.simulate_experiments(model, design, start="periodic")
+    estimate = hj.estimate_htf(data, highest=0)
+    assert estimate.error(model.htf(estimate.f, 0)).max() < 1e-12
+
+
+@pytest.mark.parametrize("excite, lines", [("alone", 12), ("disjoint", 12), ("orthogonal", 12)])
+def test_several_inputs(excite, lines):
+    model = hj.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, 3))
+    design = hj.multisine(4, 8, 2.0, 1.0, inputs=3, excite=excite)
+    assert design.experiments == 3 * 4 and len(design.frequencies) == lines
+    together = np.abs(design.inputs()).max(axis=1) > 0
+    assert together.mean() == {"alone": 1 / 3, "orthogonal": 1.0}.get(excite, together.mean())
+    assert together.mean() > 0.6 or excite == "alone"
+    data = hj.simulate_experiments(model, design.realisations(2), start="periodic")
+    estimate = hj.estimate_htf(data)
+    assert len(estimate.f) == lines
+    assert np.abs(estimate.H - model.htf(estimate.f).H).max() < 1e-11
+    # As many experiments give nu times the power, and less variance.
+    power = 1 / design.expected_variance()
+    np.testing.assert_allclose(power, power[0, 0])
+    np.testing.assert_allclose(power[0, 0], (3 if excite == "orthogonal" else 1) * 4 * 8 / 4)
+
+
+def test_inputs_that_cannot_be_told_apart():
+    f, channels = [[0.25, 0.25]] * 2, [[0, 1]] * 2
+    with pytest.raises(hj.DefinitionError, match="excites several inputs together"):
+        hj.Design.from_lines(f, sections=8, periods=8, channels=channels, inputs=2)
+    phases = [[0, 0], [0, np.pi]]
+    hj.Design.from_lines(f, 0.1, phases, sections=8, periods=8, channels=channels, inputs=2)
+    with pytest.raises(hj.DefinitionError, match="f = 0.25 is excited twice"):
+        hj.Design.from_lines([[0.25, 0.25]], sections=8, periods=8)
+
+
+def test_crest_factors(hopper):
+    band = dict(periods=32, f_max=3.0, seed=1)
+    random, low = hj.multisine(**band), hj.multisine(**band, phases="optimised")
+    np.testing.assert_array_equal(low.line, random.line)
+    np.testing.assert_array_equal(low.amplitude, random.amplitude)
+    assert random.crest_factors().mean() > 2.9 and low.crest_factors().max() < 2.3
+    again = hj.Design.from_lines(
+        [own(low, s) / 32 for s in range(6)] * 2,
+        0.01,
+        [*(low.phase[low.experiment == s] for s in range(6)),
+         *(hj.optimise_phases(random, 5).phase[low.experiment == s] for s in range(6))],
+        periods=32,
+    )  # fmt: skip
+    data = hj.simulate_experiments(hopper, again, start="periodic", discard=32)
+    data = hj.add_noise(data, snr=20)
+    with pytest.raises(hj.DefinitionError, match="the phases are not random: 12 of 12 signals"):
+        hj.estimate_htf(data, 0, repeats=2, variance="total")
+    auto = hj.estimate_htf(data, 0, repeats=2)
+    assert auto.noise_variance is None
+    np.testing.assert_array_equal(auto.freedom, 2)
+    with pytest.raises(hj.DefinitionError, match="belong together in several experiments"):
+        hj.optimise_phases(hj.multisine(4, 8, 2.0, inputs=2, excite="orthogonal"))
+
+
+def test_realisations_pairs_and_scales():
+    design = hj.multisine(8, 6, 4.0, lambda f: 1 / (1 + f), half_integers="two-phase")
+    np.testing.assert_allclose(design.amplitude, 1 / (1 + design.f))
+    many = design.realisations(5, seed=2)
+    assert many.experiments == 5 * design.experiments and many.cycles(0) == 5 * design.cycles(0)
+    np.testing.assert_array_equal(many.f, np.tile(design.f, 5))
+    assert len(np.unique(many.phase)) > 4 * len(design.f) - 20
+    pairs = design.with_negatives().inputs()
+    np.testing.assert_allclose(pairs[::2], design.inputs(), atol=1e-14)
+    np.testing.assert_allclose(pairs[1::2], -design.inputs(), atol=1e-14)
+    rms = np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1))
+    np.testing.assert_allclose(rms, 0.3)
+    for bad in (lambda: design.scaled(0.0), lambda: design.realisations(0)):
+        with pytest.raises(hj.DefinitionError):
+            bad()
+
+
+def test_expected_variance_is_that_of_the_estimate():
+    """Noise of unit variance as output, many realisations."""
+    design = hj.multisine(4, 8, 2.0, 0.5, half_integers="skip")
+    many = design.realisations(400)
+    u = many.inputs()
+    y = np.random.default_rng(0).normal(size=(*u.shape[:2], 1))
+    estimate = hj.estimate_htf(hj.ExperimentData(u, y, sections=4, periods=8), 0)
+    expected = design.expected_variance()[:, 0] / 400
+    np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
+
+
+def test_distortion_stands_where_a_linear_system_is_silent(hopper):
+    design = hj.multisine(periods=8, f_max=2.0, lines="odd", experiments=6)
+    data = hj.simulate_experiments(hopper, design, start="periodic", discard=8)
+    linear = hj.output_levels(data, repeats=2)
+    assert np.all(linear.even < 1e-15) and np.all(linear.odd < 1e-15)
+    even = hj.ExperimentData(data.u, data.y + data.u**2, sections=32, periods=8)
+    odd = hj.ExperimentData(data.u, data.y + data.u**3, sections=32, periods=8)
+    assert np.all(hj.output_levels(even).even > 1e-7) and np.all(hj.output_levels(even).odd < 1e-15)
+    assert np.all(hj.output_levels(odd).odd > 1e-10) and np.all(hj.output_levels(odd).even < 1e-15)
+    noisy = hj.output_levels(hj.add_noise(data, std=0.1), repeats=2)
+    np.testing.assert_allclose(noisy.noise, noisy.even, rtol=0.1)
+    assert "excited" in repr(noisy)
+    with pytest.raises(hj.DefinitionError, match="is an even line"):
+        hj.output_levels(hj.simulate_experiments(hopper, hj.multisine(periods=8, f_max=2.0)))
+    with pytest.raises(hj.DefinitionError, match="an even number of periods"):
+        hj.output_levels(hj.simulate_experiments(hopper, hj.multisine(periods=5, f_max=2.0)))
+
+
+@pytest.mark.parametrize(
+    "message, arguments",
+    {
+        "lines must be 'all', 'odd' or '2-adic', not 'even'": dict(lines="even"),
+        "phases must be": dict(phases="zero"),
+        "excite must be": dict(excite="both"),
+        "exclude each other": dict(lines="2-adic", highest_harmonic=2),
+        "leave out `experiments`": dict(lines="2-adic", experiments=99),
+        "do not go together": dict(highest_harmonic=2, half_integers="two-phase"),
+        "an even number of periods, not 63": dict(lines="odd", periods=63),
+        "must not be negative": dict(highest_harmonic=-1),
+        "4 experiments are too few for harmonics up to 2": dict(highest_harmonic=2, experiments=4),
+    }.items(),
+)
+def test_bad_choices(message, arguments):
+    multisine = getattr(hj.multisine, "__wrapped__", hj.multisine)
+    with pytest.raises(hj.DefinitionError, match=message):
+        multisine(**arguments)
