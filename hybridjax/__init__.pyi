@@ -55,6 +55,7 @@ from .identify.nonparametric import (
     missing_frequencies as missing_frequencies,
 )
 from .identify.rational import RationalFit as RationalFit, fit_rational as fit_rational
+from .identify.realise import realise as realise
 from .identify.records import Record as Record
 from .identify.series import SeriesFit as SeriesFit, fit_series as fit_series
 from .identify.structured import (
