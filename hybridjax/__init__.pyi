@@ -40,9 +40,17 @@ from .flow.sections import (
     Sections as Sections,
 )
 from .flow.trajectory import Event as Event, Trajectory as Trajectory, simulate as simulate
+from .identify.amplitude import (
+    AmplitudeSweep as AmplitudeSweep,
+    amplitude_sweep as amplitude_sweep,
+)
 from .identify.bound import (
     MultiplierBound as MultiplierBound,
     multiplier_bound as multiplier_bound,
+)
+from .identify.coherence import (
+    Coherence as Coherence,
+    estimate_coherence as estimate_coherence,
 )
 from .identify.compare import MultiplierComparison as MultiplierComparison
 from .identify.distortion import (
@@ -66,6 +74,7 @@ from .identify.transient import (
     TransientFit as TransientFit,
     remove_transient as remove_transient,
 )
+from .identify.validate import Validation as Validation, validate as validate
 from .io import load as load, save as save
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
 from .orbits.linearize import linearize as linearize

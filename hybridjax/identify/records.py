@@ -84,6 +84,43 @@ def _columns(name: str, values: Any) -> np.ndarray:
     return values.astype(float)
 
 
+class Piece(NamedTuple):
+    """A stretch of known inputs, from some section on; y is NaN where there is no sample."""
+
+    start: int
+    u: Float[np.ndarray, "n nu"]
+    y: Float[np.ndarray, "n ny"]
+
+
+class Pieces(NamedTuple):
+    """All stretches of some data, and what they have in common."""
+
+    pieces: list[Piece]
+    sections: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def pieces_of(data: Recorded) -> Pieces:
+    """All records, cut where an input is unknown. Experiments that failed are left out.
+
+    The output just at an unknown input is not used, since it may feel it directly.
+
+    **Raises:** `DefinitionError` if nothing is left, or records differ in N or names.
+    """
+    records = [r for part in _parts(data) for r in _records(part)]
+    if not records:
+        raise DefinitionError("there is no experiment that ran to its end.")
+    kinds = {(r.sections, r.inputs, r.outputs) for r in records}
+    if len(kinds) > 1:
+        a, b = sorted(kinds, key=str)[:2]
+        raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
+    pieces = [piece for record in records for piece in _cut(record)]
+    if not pieces:
+        raise DefinitionError("the input is NaN at every sample.")
+    return Pieces(pieces, *kinds.pop())
+
+
 class Layout(NamedTuple):
     """S records of T cycles: samples before the start, after the end and in gaps do not count."""
 
@@ -98,21 +135,11 @@ class Layout(NamedTuple):
 
 
 def lay_out(data: Recorded) -> Layout:
-    """All records as one array. Experiments that failed are left out.
+    """All records as one array.
 
-    **Raises:** `DefinitionError` if nothing is left, or records differ in N or names.
+    **Raises:** `DefinitionError` as `pieces_of`.
     """
-    records = [r for part in _parts(data) for r in _records(part)]
-    if not records:
-        raise DefinitionError("there is no experiment that ran to its end.")
-    kinds = {(r.sections, r.inputs, r.outputs) for r in records}
-    if len(kinds) > 1:
-        a, b = sorted(kinds, key=str)[:2]
-        raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
-    ((N, inputs, outputs),) = kinds
-    pieces = [piece for record in records for piece in _pieces(record)]
-    if not pieces:
-        raise DefinitionError("the input is NaN at every sample.")
+    pieces, N, inputs, outputs = pieces_of(data)
     T = max(-(-(first + len(u)) // N) for first, u, _ in pieces)
     U = np.zeros((len(pieces), T * N, len(inputs)))
     Y = np.full((len(pieces), T * N, len(outputs)), np.nan)
@@ -138,12 +165,9 @@ def _records(part: ExperimentData | Record) -> list[Record]:
     return [Record(part.u[s], part.y[s], **about) for s in np.flatnonzero(part.ok)]
 
 
-def _pieces(record: Record):
-    """Stretches of known input: the first sample's place in its cycle, u and y.
-
-    The output just at an unknown input counts as unknown, since it may feel it directly.
-    """
+def _cut(record: Record):
     known = np.isfinite(record.u).all(axis=1)
     edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
     for first, last in edges.reshape(-1, 2):
-        yield (record.start + first) % record.sections, record.u[first:last], record.y[first:last]
+        start = int(record.start + first) % record.sections
+        yield Piece(start, record.u[first:last], record.y[first:last])

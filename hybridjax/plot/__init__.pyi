@@ -8,3 +8,4 @@ from .transfer import (
     harmonics as harmonics,
     magnitude as magnitude,
 )
+from .validation import amplitude as amplitude, validation as validation

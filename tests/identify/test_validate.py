@@ -1,0 +1,107 @@
+"""Validation: fits in percent, tests with the level that they state, amplitude sweeps."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import hybridjax as hj
+
+from .test_series import record, scaled
+from .test_uncertainty import covered
+
+
+@pytest.fixture(scope="module")
+def small():
+    return scaled(3, (2, 3, 4, 2), 2, 1)
+
+
+def test_the_true_model_leaves_white_noise(small):
+    """Both p-values are uniformly distributed, though starts are unknown and samples missing."""
+    p = []
+    for seed in range(60):
+        data = record(small, 4 * 100, seed, 0.3, start=1, x0=np.ones(3))
+        data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
+        found = hj.validate(small, data)
+        p.append([found.whiteness, found.independence])
+    for test in np.reshape(p, (60, 2, 2)).transpose(1, 2, 0).reshape(4, 60):
+        assert stats.kstest(test, "uniform").pvalue > 1e-3
+    assert covered(int((np.array(p) > 0.05).sum()), 240)
+
+
+def test_the_fit_is_the_share_explained(small):
+    data = record(small, 4 * 200, 0, 0.3)
+    found = hj.validate(small, data, start="rest")
+    clean = np.asarray(small.simulate(data.u))
+    np.testing.assert_allclose(found.simulated, clean, atol=1e-12)
+    left = np.sqrt(np.mean((data.y - clean) ** 2, axis=0))
+    np.testing.assert_allclose(found.noise, left)
+    np.testing.assert_allclose(found.fit, 100 * (1 - left / data.y.std(axis=0)))
+    assert found.white and found.independent
+    assert "with the input: no sign of it" in repr(found)
+
+
+def test_a_wrong_model_is_refused(small):
+    data = record(small, 4 * 200, 0, 0.3)
+    B = np.asarray(small.B).copy()
+    B[2] *= 1.3
+    wrong = hj.LDTP(small.A, B, small.C, small.D, small.dims, small.inputs, small.outputs)
+    found = hj.validate(wrong, data)
+    assert not found.independent and found.independence.min() < 1e-6
+    assert "with the input: yes" in repr(found)
+
+
+def test_process_noise_is_correlated_in_time_only(small):
+    data = record(small, 4 * 300, 0)
+    hidden = np.random.default_rng(1).normal(size=data.u.shape)
+    y = data.y + 0.3 * np.asarray(small.simulate(hidden))
+    found = hj.validate(small, hj.Record(data.u, y, sections=4))
+    assert not found.white and found.whiteness.max() < 1e-6
+
+
+def test_identified_beside_held_out_data(hopper):
+    """A model identified from one record explains another, but for the noise."""
+    train, test = record(hopper, 32 * 250, 0), record(hopper, 32 * 80, 1)
+    noisy = [
+        hj.Record(r.u, r.y + 0.01 * r.y.std(axis=0) * np.random.default_rng(k).normal(
+            size=r.y.shape), sections=32, outputs=("yM", "vM"))
+        for k, r in enumerate((train, test))
+    ]  # fmt: skip
+    model = hj.realise(hj.fit_series(noisy[0], 2), order=2)
+    found = hj.validate(model, noisy[1])
+    np.testing.assert_allclose(found.fit, 99.0, atol=0.4)
+
+
+def test_amplitudes(small):
+    """A cubic nonlinearity: the misfit grows with the square of the amplitude."""
+
+    def run(u):
+        y = np.stack([np.asarray(small.simulate(x + 0.01 * x**3)) for x in u])
+        result = [0] if np.abs(u).max() < 30 else [hj.Result.BLOW_UP]
+        return hj.ExperimentData(u, y, sections=4, periods=9, outputs=("y0", "y1"), result=result)
+
+    u = np.random.default_rng(0).normal(size=(1, 400, 1))
+    sweep = hj.amplitude_sweep(run, small, u, [0.1, 1.0, 3.0, 100.0])
+    np.testing.assert_allclose(sweep.misfit[1] / sweep.misfit[0], 100, rtol=0.1)
+    assert sweep.failed[-1] == 1 and np.isnan(sweep.misfit[-1]).all()
+    worst = sweep.misfit[0].max()
+    np.testing.assert_allclose(sweep.limit(4 * worst), 0.2, rtol=0.05)
+    assert sweep.limit(1e9) == 3.0
+    with pytest.raises(hj.DefinitionError, match="smallest amplitude tried has a misfit"):
+        sweep.limit(worst / 2)
+    assert repr(sweep).splitlines()[-1].split()[-1] == "1"
+    with pytest.raises(hj.DefinitionError, match="positive numbers"):
+        hj.amplitude_sweep(run, small, u, [0.0, 1.0])
+
+
+def test_bad_requests(small, hopper):
+    data = record(small, 4 * 50)
+    with pytest.raises(hj.DefinitionError, match="different sections: 32 and 4"):
+        hj.validate(hopper, data)
+    with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
+        hj.validate(small, record(small, 20))
+    with pytest.raises(hj.DefinitionError, match="level must lie between"):
+        hj.validate(small, data, level=5.0)
+    with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
+        hj.validate(small, hj.Record(data.u, data.y * [0, 1], sections=4))
+    with pytest.raises(hj.DefinitionError, match="lags must be at least 1"):
+        hj.validate(small, data, lags=0)

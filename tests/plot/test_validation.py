@@ -1,0 +1,37 @@
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+@pytest.fixture(scope="module")
+def found(hopper):
+    u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
+    y = np.asarray(hopper.simulate(u))
+    y = y + 0.1 * y.std(axis=0) * np.random.default_rng(1).normal(size=y.shape)
+    return hj.validate(hopper, hj.Record(u, y, sections=32, outputs=("yM", "vM")))
+
+
+def test_validation_draws_signals_and_correlations(found):
+    figure = hj.plot.validation(found, cycles=2, labels={"vM": "speed"})
+    grid = np.reshape(figure.axes, (2, 3))
+    simulated, measured = grid[1, 0].get_lines()
+    np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
+    np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
+    np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    assert grid[1, 0].get_ylabel() == r"$\delta$ speed"
+    assert grid[0, 0].get_title() == f"fit {found.fit[0]:.2f} %"
+    for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
+        heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]
+        np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
+
+
+def test_amplitude_marks_the_limit():
+    sweep = hj.AmplitudeSweep(
+        np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
+        ("u",), ("y",),
+    )  # fmt: skip
+    ax = hj.plot.amplitude(sweep, misfit=1e-2)
+    assert [line.get_label() for line in ax.get_lines()][0] == "y"
+    assert ax.get_lines()[-1].get_xdata()[0] == pytest.approx(10**-0.5)
+    assert ax.get_lines()[1].get_xdata()[0] == 1.0
