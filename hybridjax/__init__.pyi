@@ -52,6 +52,10 @@ from .identify.coherence import (
     Coherence as Coherence,
     estimate_coherence as estimate_coherence,
 )
+from .identify.coherence import (
+    Coherence as Coherence,
+    estimate_coherence as estimate_coherence,
+)
 from .identify.compare import MultiplierComparison as MultiplierComparison
 from .identify.distortion import (
     OutputLevels as OutputLevels,

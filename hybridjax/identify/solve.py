@@ -20,6 +20,8 @@ class Solution(NamedTuple):
     """Variance of noise and its freedom, from repeated windows; or two None."""
     realisations: Int[np.ndarray, " F"]
     """How many experiments there are beyond those that the unknowns need."""
+    coherence: Float[np.ndarray, "M F ny"]
+    """The part of the power at each output line that H explains; NaN without realisations."""
     why_not: str
     """Why realisations do not tell the distortion, or nothing."""
 
@@ -87,7 +89,12 @@ def solve(sums: Sums, rows: Int[np.ndarray, " F"]) -> Solution:
     elif repeated:
         total, freedom = noise
     H = H.transpose(2, 0, 3, 1)
-    return Solution(H, total, of_noise, freedom, noise, realisations, why_not)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lost = left / np.maximum(realisations, 0)[:, None, None]
+        coherence = 1 - lost / (sums.energy[rows] / count[:, None, None])
+    coherence = np.where((realisations > 0)[:, None, None], np.maximum(coherence, 0), np.nan)
+    coherence = coherence.transpose(1, 0, 2)
+    return Solution(H, total, of_noise, freedom, noise, realisations, coherence, why_not)
 
 
 def _why_not(sums: Sums, rows: Int[np.ndarray, " F"]) -> str:

@@ -32,7 +32,8 @@ def magnitude(
     """|H_m| of one output against the input frequency, on a logarithmic scale.
 
     One colour per |m|, dashed for negative m. Exact HTFs lie as broad pale lines under the
-    estimates, wherever they stand in the arguments.
+    estimates, wherever they stand in the arguments. HTFs with a variance have a band that holds
+    the true value at each frequency with a probability of 95 %.
 
     **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest
     value the scale reaches. `labels`: texts for the names. `ax`: by default a new figure.
@@ -47,7 +48,9 @@ def magnitude(
             f, order = _sorted(htf)
             for m in harmonics:
                 size = np.abs(np.asarray(htf.harmonic(m))[order, i, j])
-                ax.plot(f, size, **_line(htf, _harmonic_style(m, harmonics), _name(m)))
+                line = _line(htf, _harmonic_style(m, harmonics), _name(m))
+                ax.plot(f, size, **line)
+                _band(ax, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
         name = label_of(htf.outputs[i], labels)
         ax.set(yscale="log", xlabel=_FREQUENCY, ylabel=f"$|H_m|$, {name}")
         _frequency_limits(ax, f)
@@ -107,7 +110,9 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: exact ones lie as broad pale lines under the estimates.
+    - `htfs`: exact ones lie as broad pale lines under the estimates, and those with a variance
+      have bands that hold the true values with a probability of 95 %; their phase is drawn where
+      it is known, which it is not where the band reaches down to zero.
     - `fits`: of this harmonic, drawn over the band of the HTFs.
     - `outputs`: names; by default all. One colour each.
     - `axes`: two Axes, for magnitude and phase; by default a new figure.
@@ -137,7 +142,14 @@ def bode(
             i, j = _index(htf.outputs, name), _index(htf.inputs, input)
             values = np.asarray(htf.harmonic(harmonic))[order, i, j]
             line = _line(htf, {"color": color}, label_of(name, labels))
-            reference = _curve(upper, lower, f, values, reference, **line)
+            size, radius = np.abs(values), _radius(htf, harmonic, order, i, j)
+            known = np.full(len(f), True) if radius is None else radius < size
+            reference = _curve(upper, lower, f, values, reference, known, **line)
+            _band(upper, f, size, radius, line, 0.3 * np.min(size))
+            if radius is not None:
+                turn = np.degrees(np.arcsin(radius[known] / size[known]))
+                phase, turn = (_spread(known, x, len(f)) for x in (reference[1], turn))
+                _band(lower, f, phase, turn, line)
         for fit in fits:
             values = _evaluate(fit, f, harmonic, name, input)
             line = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5)), "zorder": 5}
@@ -246,15 +258,39 @@ def _line(htf: HTF, line: dict, label: str) -> dict:
     return {**line, "lw": 0.9, "zorder": 3, "label": label}
 
 
-def _curve(upper: Axes, lower: Axes, f, values, reference, **line):
-    """Draw magnitude and phase; whole turns of phase are chosen as in the curve before."""
-    phase = np.degrees(np.unwrap(np.angle(values)))
-    if reference is not None:
-        turns = np.median(np.interp(f, *reference) - phase) / 360
+def _radius(htf: HTF, m: int, order, i: int, j: int) -> np.ndarray | None:
+    """Of the discs that hold the true values, or None if that is not known."""
+    if htf.variance is None:
+        return None
+    return np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
+
+
+def _band(ax: Axes, f, middle, radius, line: dict, floor: float = -np.inf) -> None:
+    if radius is None:
+        return
+    known = np.isfinite(radius)
+    low = np.where(known, np.maximum(middle - radius, floor), np.nan)
+    high = np.where(known, middle + radius, np.nan)
+    ax.fill_between(f, low, high, color=line["color"], alpha=0.25, lw=0, zorder=2)
+
+
+def _curve(upper: Axes, lower: Axes, f, values, reference, known=slice(None), **line):
+    """Draw magnitude and phase, where it is known; whole turns of phase are chosen as in the curve
+    before."""
+    phase = np.degrees(np.unwrap(np.angle(values[known])))
+    if reference is not None and len(phase) and len(reference[0]):
+        turns = np.median(np.interp(f[known], *reference) - phase) / 360
         phase = phase + 360 * np.round(turns)
     upper.plot(f, np.abs(values), **line)
-    lower.plot(f, phase, **line)
-    return f, phase
+    lower.plot(f, _spread(known, phase, len(f)), **line)
+    return f[known], phase
+
+
+def _spread(known, values, count: int) -> np.ndarray:
+    """Values where they are known, NaN elsewhere, so that lines have gaps."""
+    out = np.full(count, np.nan)
+    out[known] = values
+    return out
 
 
 def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.ndarray:

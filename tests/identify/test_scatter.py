@@ -162,6 +162,19 @@ def test_noise_by_its_ratio(model):
         realised(model, 1, process_noise=-1.0)
 
 
+def test_coherence_is_one_but_for_noise(model):
+    """Power that goes to other harmonics is explained; noise of a known ratio is not."""
+    clean = realised(model, 6)
+    np.testing.assert_allclose(hj.estimate_coherence(clean).values, 1.0, atol=1e-9)
+    noisy = hj.estimate_coherence(hj.add_noise(realised(model, 60), std=1.0), 0)
+    # White noise: |Y|^2 = N P; signal: (N P a / 2)^2 |H|^2.
+    signal = (N * P * 0.1 / 2 * np.abs(model.htf(noisy.f, 0)[0][..., 0])) ** 2
+    np.testing.assert_allclose(noisy.values[0], signal / (signal + N * P), atol=0.2)
+    assert np.all((noisy.total > noisy.values[0].min(axis=0)) & (noisy.total < 1))
+    with pytest.raises(hj.DefinitionError, match="no line was measured in several"):
+        hj.estimate_coherence(realised(model, 1))
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 3), st.integers(1, 40), st.integers(0, 70), st.integers(1, 3))
 def test_any_record_is_estimated_or_refused(model, sections, periods, samples, repeats):

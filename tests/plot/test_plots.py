@@ -207,3 +207,20 @@ def test_global_settings_stay(estimate):
     with hj.plot.style():
         assert matplotlib.rcParams["font.size"] == 8
     assert dict(matplotlib.rcParams) == before
+
+
+def test_bands_hold_the_values(estimate):
+    """Where there is a variance; the phase is drawn where it is known."""
+    sure = hj.HTF(
+        estimate.f, estimate.H, estimate.harmonics, estimate.sections, estimate.inputs,
+        estimate.outputs, variance=np.full(estimate.H.shape, 1e-6),
+    )  # fmt: skip
+    assert not hj.plot.magnitude(estimate).collections
+    ax = hj.plot.magnitude(sure, harmonics=(0,))
+    radius = float(sure.confidence_radius().max())
+    top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
+    np.testing.assert_allclose(top, np.abs(sure[0][:, 0, 0]).max() + radius)
+    upper, lower = hj.plot.bode(sure, outputs="yM").axes
+    known = np.isfinite(lower.get_lines()[0].get_ydata())
+    np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
+    assert len(upper.collections) == len(lower.collections) == 1
