@@ -130,6 +130,28 @@ class HTF(eqx.Module):
         variance, noise = (None if v is None else v[rows] for v in self._variances)
         return self._with(self.f, self.H[rows], harmonics, variance, noise, self.freedom)
 
+    def at(self, f: Any) -> "HTF":
+        """The same at fewer frequencies (F,), in this order (host side).
+
+        **Raises:** `DefinitionError` for a frequency that was not measured.
+        """
+        if is_traced(self.f, f):
+            raise DefinitionError("`at` must know `f`: call it outside of jit.")
+        wanted, known = np.atleast_1d(np.asarray(f, float)), np.asarray(self.f)
+        distance = np.abs(known - wanted[:, None])
+        nearest = np.argmin(distance, axis=1)
+        lost = ~(distance.min(axis=1) < _SAME)
+        if lost.any():
+            raise DefinitionError(
+                f"f = {wanted[lost][0]:.10g} was not excited or not measured; the nearest one is "
+                f"{known[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
+            )
+        variance, noise = (None if v is None else v[:, nearest] for v in self._variances)
+        freedom = None if self.freedom is None else self.freedom[nearest]
+        return self._with(
+            self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom
+        )
+
     def confidence_radius(self, level: float = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
