@@ -1,0 +1,178 @@
+"""How well experiments identify the hopper, the paper's protocol beside: designs, starts, noise.
+
+Printed, as `name value` lines: errors of estimated H_m over all lines, the largest, relative to the
+largest modulus of the exact H_0 of that output (`H0`), or, for every m = -2..2 by itself, of the
+exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.output`.
+
+- `paper`: 80 experiments of 84 cycles from the limit cycle, the first 20 discarded.
+- `full`: 620 lines (P = 64), 20 experiments; `odd`: 640 lines (f = odd/128), 20 experiments. Both
+  without discarded cycles, from the start that the linearisation predicts (`predicted`) and from
+  the nonlinear periodic response (`steady`).
+- `unknown`: 20 experiments of 84 cycles that start on the limit cycle and know nothing: with the
+  first 20 cycles discarded, with the transient fitted and removed, and with it interpolated between
+  lines that are not excited, by local polynomials (odd lines, all 84 cycles). All 620 lines or odd
+  ones.
+- `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
+- `coverage`: 1000 runs at 20 dB, each four realisations of 20 experiments (P = 32, 300 lines) with
+  new phases and new noise. How often the 95 % discs of H_0, H_1 and H_-1 at ten fixed frequencies
+  hold the best linear approximation, the mean over 2000 realisations without noise. `p`: the
+  smallest binomial p-value times the number of tests (60, for each family and amplitude), which is
+  above 0.01 where the discs are right. `distortion`: the part of the variance that is not noise.
+  `bias`: the best linear approximation less the exact H_0, at these frequencies.
+
+    python benchmarks/estimation.py [--skip coverage ...] [--runs 1000]
+"""
+
+import argparse
+
+import numpy as np
+from scipy import stats
+from second_order import OUTPUTS, sections
+
+import hybridjax as hj
+
+
+HARMONICS = (-2, -1, 0, 1, 2)
+N = 32
+STEPS = ("crest", "leakage", "periodic", "unknown", "coverage")
+# rms of the inputs where distortion is a small and a large part of the variance.
+RMS = {"isochron": (0.005, 1.0), "kinematic": (0.005, 0.2)}
+
+
+class Family:
+    """The hopper between the sections of one family."""
+
+    def __init__(self, name: str, cycle, definition):
+        self.name, self.cycle = name, cycle
+        self.placed = hj.place_sections(cycle, definition)
+        self.model = hj.linearize(cycle, self.placed, OUTPUTS)
+
+    def run(self, design, **options):
+        data = hj.run_experiments(self.cycle, self.placed, design, OUTPUTS, **options)
+        assert data.ok.all(), data.summary()
+        return data
+
+    def report(self, name: str, data) -> None:
+        estimate = hj.estimate_htf(data, HARMONICS)
+        exact = self.model.htf(estimate.f, HARMONICS)
+        error = np.abs(estimate.H - exact.H).max(axis=(1, 3))
+        own = np.abs(exact.H).max(axis=(1, 3))
+        for k, output in enumerate(OUTPUTS):
+            self.show(f"{name}.H0.{output}", error[2, k] / own[2, k])
+            self.show(f"{name}.each.{output}", np.max(error[:, k] / own[:, k]))
+
+    def show(self, name: str, value) -> None:
+        print(f"estimation.{self.name}.{name} {value:.2e}", flush=True)
+
+
+def periodic(family: Family) -> None:
+    """Nothing is random here but the design."""
+    full, odd = hj.multisine(), hj.multisine(periods=128, lines="odd")
+    for rms in (0.002, 0.02, 0.06):
+        family.report(f"paper.{rms}", family.run(hj.paper_design().scaled(rms)))
+        for name, design in (("full", full), ("odd", odd)):
+            for label, start in (("predicted", "periodic"), ("steady", "steady")):
+                data = family.run(design.scaled(rms), start=start)
+                family.report(f"{name}.{label}.{rms}", data)
+
+
+def unknown(family: Family) -> None:
+    """Records of 84 cycles that begin on the limit cycle."""
+    rms = 0.002
+    for name, lines in (("full", "all"), ("odd", "odd")):
+        data = family.run(hj.multisine(lines=lines).scaled(rms), discard=20)
+        family.report(f"unknown.{name}.discarded.{rms}", data)
+        fit = hj.remove_transient(data)
+        family.report(f"unknown.{name}.removed.{rms}", fit.data)
+        error = np.abs(fit.multipliers - family.cycle.multipliers[0]).min()
+        family.show(f"unknown.{name}.removed.{rms}.multiplier", error)
+    data = family.run(hj.multisine(periods=84, lines="odd").scaled(rms), discard=0)
+    for degree in (2, 4):
+        family.report(f"unknown.odd.local_polynomial_{degree}.{rms}", interpolated(data, degree))
+
+
+def interpolated(data, degree: int):
+    """The transient at odd lines by a local polynomial through the even lines around them."""
+    Y = np.fft.fft(data.y, axis=1)
+    offsets = np.arange(-degree - 1, degree + 2, 2)
+    powers = offsets[:, None] ** np.arange(degree + 1)
+    weights = np.linalg.pinv(powers)[0]
+    transient = sum(w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True))
+    y = np.fft.ifft(Y - transient, axis=1).real
+    return hj.ExperimentData(data.u, y, sections=N, periods=data.periods, outputs=OUTPUTS)
+
+
+def crest() -> None:
+    random, low = hj.multisine(), hj.multisine(phases="optimised")
+    for name, design in (("random", random), ("optimised", low)):
+        factors = design.crest_factors()
+        print(f"estimation.crest.{name}.mean {factors.mean():.2f}")
+        print(f"estimation.crest.{name}.max {factors.max():.2f}")
+
+
+def leakage(family: Family) -> None:
+    design = hj.multisine(highest_harmonic=2)
+    for output, value in zip(
+        OUTPUTS, hj.predict_leakage(design, family.model, (0,))[0], strict=True
+    ):
+        family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
+
+
+def coverage(family: Family, rms: float, runs: int) -> None:
+    design = hj.multisine(periods=32, seed=1).scaled(rms)
+    chosen = design.frequencies[np.linspace(0, len(design.frequencies) - 1, 10).astype(int)]
+
+    def chunk(count, seed):
+        return family.run(design.realisations(count, seed), start="periodic", discard=32)
+
+    truth = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), (-1, 0, 1))
+    truth = np.asarray(truth.at(chosen).H)
+    hits, variances, each, part = np.zeros(truth.shape), [], 4, 25
+    for first in range(0, runs, part):
+        data = chunk(each * part, first)
+        size = each * design.experiments
+        for k in range(part):
+            rows = slice(k * size, (k + 1) * size)
+            one = hj.ExperimentData(
+                data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
+            )
+            noisy = hj.add_noise(one, snr=20, seed=first + k)
+            estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
+            hits = hits + (np.abs(np.asarray(estimate.H) - truth) <= estimate.confidence_radius())
+            variances.append((estimate.variance, estimate.noise_variance))
+    exact = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H)
+    name = f"coverage.{rms}"
+    tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
+    family.show(f"{name}.mean", hits.mean() / runs)
+    family.show(f"{name}.least", hits.min() / runs)
+    family.show(f"{name}.most", hits.max() / runs)
+    family.show(f"{name}.p", min(tests.min() * tests.size, 1.0))
+    total, noise = np.mean(variances, axis=0)
+    family.show(f"{name}.distortion", np.mean(1 - noise / total))
+    for k, output in enumerate(OUTPUTS):
+        bias = np.abs(truth - exact)[1, :, k].max() / np.abs(exact)[1, :, k].max()
+        family.show(f"{name}.bias.H0.{output}", bias)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=1000, help="for coverage, a multiple of 25")
+    parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
+    options = parser.parse_args()
+    hj.enable_x64()
+    hj.enable_compilation_cache()
+    if "crest" not in options.skip:
+        crest()
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    for name, definition in sections().items():
+        family = Family(name, cycle, definition)
+        for step in (leakage, periodic, unknown):
+            if step.__name__ not in options.skip:
+                step(family)
+        if "coverage" not in options.skip:
+            for rms in RMS[name]:
+                coverage(family, rms, options.runs)
+
+
+if __name__ == "__main__":
+    main()
