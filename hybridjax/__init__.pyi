@@ -40,6 +40,7 @@ from .flow.sections import (
     Sections as Sections,
 )
 from .flow.trajectory import Event as Event, Trajectory as Trajectory, simulate as simulate
+from .identify.aaa import AAAFit as AAAFit, fit_aaa as fit_aaa
 from .identify.amplitude import (
     AmplitudeSweep as AmplitudeSweep,
     amplitude_sweep as amplitude_sweep,
@@ -47,10 +48,6 @@ from .identify.amplitude import (
 from .identify.bound import (
     MultiplierBound as MultiplierBound,
     multiplier_bound as multiplier_bound,
-)
-from .identify.coherence import (
-    Coherence as Coherence,
-    estimate_coherence as estimate_coherence,
 )
 from .identify.coherence import (
     Coherence as Coherence,
@@ -65,6 +62,10 @@ from .identify.leakage import predict_leakage as predict_leakage
 from .identify.nonparametric import (
     estimate_htf as estimate_htf,
     missing_frequencies as missing_frequencies,
+)
+from .identify.order import (
+    OrderSelection as OrderSelection,
+    select_order as select_order,
 )
 from .identify.rational import RationalFit as RationalFit, fit_rational as fit_rational
 from .identify.realise import realise as realise

@@ -8,7 +8,7 @@ from ..periodic.htf import HTF
 from ..periodic.ldtp import LDTP
 from .estimate import MultiplierEstimate
 from .projection import evaluate, groups_of
-from .structured import check_freedom, check_values, weights_of
+from .values import check_freedom, check_values, weights_of
 
 
 class MultiplierBound(MultiplierEstimate):

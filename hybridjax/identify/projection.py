@@ -112,7 +112,7 @@ def evaluate(group: Group, c: Float[np.ndarray, " d"], noise: bool = False) -> E
     leverage = (np.abs(q) ** 2).sum(axis=1)
     leverage = leverage.reshape(2, rows) if group.real else np.stack([leverage, leverage])
     residual = group.components(target - inside)
-    return Evaluation(residual, np.stack(columns), own, leverage)
+    return Evaluation(residual, np.reshape(columns, (d, *residual.shape)), own, leverage)
 
 
 def delayed(group: Group, c: Float[np.ndarray, " d"]):

@@ -1,7 +1,6 @@
 """Floquet multipliers from the exact structure of the harmonic transfer functions."""
 
 from collections.abc import Sequence
-from itertools import count
 from typing import Literal
 
 import equinox as eqx
@@ -16,7 +15,9 @@ from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
 from .likelihood import maximum_likelihood, noise_levels, summarize
-from .projection import chi, groups_of, numerators
+from .order import largest_of_noise, noise_ratios
+from .projection import Group, chi, groups_of, numerators
+from .values import check_freedom, check_values, weights_of
 
 
 class StructuredFit(MultiplierEstimate):
@@ -84,6 +85,7 @@ class StructuredFit(MultiplierEstimate):
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         return (
             f"StructuredFit(multipliers {self.show_multipliers()}; residual {misfit}; "
+            f"{self.cost / self.freedom:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state})"
         )
 
@@ -97,7 +99,8 @@ def fit_multipliers(
     harmonics: int | Sequence[int] | None = None,
     *,
     overhang: int | None = None,
-    errors: Errors | None = None,
+    errors: Errors = "residuals",
+    check: bool = True,
     max_steps: int = 50,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
@@ -122,11 +125,13 @@ def fit_multipliers(
       at each frequency, so that it holds also where the errors of different harmonics are
       dependent (process noise, distortion) or the variances are only roughly known (White 1980).
       `"variance"`: from the variances, which must then be right.
+    - `check`: refuse an order that the data do not carry (a rank test at the level of 1 %): beside
+      those that they carry, the other multipliers would be invented by noise.
     - `max_steps`: of Gauss and Newton's iteration.
 
     **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, variances that are not
-    positive, a harmonic that `htf` does not hold, or too few frequencies for so many coefficients
-    (the message says how many).
+    positive, a harmonic that `htf` does not hold, too few frequencies for so many coefficients
+    (the message says how many), or an order that the data do not carry.
     """
     order = order.rank() if isinstance(order, LDTP) else order
     N = htf.sections
@@ -136,8 +141,6 @@ def fit_multipliers(
             "a structured fit needs order >= 1 (the number of non-zero multipliers), max_steps "
             f">= 1 and overhang >= 0, not {order}, {max_steps} and {overhang}."
         )
-    if errors not in (None, "residuals", "variance"):
-        raise DefinitionError(f"errors must be 'residuals' or 'variance', not {errors!r}.")
     if harmonics is not None:
         htf = htf.select(harmonics)
     rms = check_values(htf)
@@ -155,7 +158,9 @@ def fit_multipliers(
         noise = np.maximum(noise_levels(groups, c, len(rms)), 1e-15)
         groups = groups_of(htf, weights_of(htf, rms * noise), unknowns)
         c, converged = maximum_likelihood(groups, order, max_steps, c)
-    summary = summarize(groups, c, "residuals" if errors is None else errors)
+    if check:
+        _refuse_invented(groups, order)
+    summary = summarize(groups, c, errors)
 
     B = np.zeros((len(htf.harmonics), unknowns, len(htf.outputs), len(htf.inputs)), complex)
     for group in groups:
@@ -184,79 +189,14 @@ def fit_multipliers(
     return eqx.tree_at(lambda fit: fit.residual, fit, residual)
 
 
-def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
-    """The rms of each output's HTFs.
-
-    **Raises:** `DefinitionError` for NaN, an output that is zero, bad variances.
-    """
-    H = np.asarray(htf.H)
-    if not np.isfinite(H).all():
-        raise DefinitionError("the HTFs hold NaN or infinity.")
-    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
-    if (rms == 0).any():
-        name = htf.outputs[int(np.argmin(rms))]
-        raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
-    if htf.variance is not None:
-        bad = np.argwhere(~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0)))
-        if len(bad):
-            m, k, i, _ = (int(x) for x in bad[0])
-            raise DefinitionError(
-                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = "
-                f"{float(htf.f[k]):g} is not a positive number; leave this frequency out, or give "
-                "HTFs without variances."
-            )
-    return rms
-
-
-def weights_of(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, "M F ny nu"]:
-    """One over the standard deviation of real and imaginary part, known or supposed.
-
-    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
-    by the nearest product of a factor for each frequency and one for each harmonic, up to its
-    sign (which is what white noise and any spectrum of the input give).
-    """
-    rounding = (1e-15 * rms[:, None]) ** 2
-    if htf.variance is None:
-        return np.broadcast_to(1 / rms[:, None], htf.H.shape)
-    variance = np.asarray(htf.variance)
-    if htf.freedom is not None:
-        variance = _smooth(variance, np.asarray(htf.harmonics), np.asarray(htf.freedom))
-    return np.sqrt(2 / np.maximum(variance, rounding))
-
-
-def _smooth(variance, harmonics, freedom):
-    """The product of factors of frequency and harmonic with the same sums (gamma likelihood)."""
-    if not variance.all():
-        return variance
-    _, same = np.unique(np.abs(harmonics), return_inverse=True)
-    share = freedom / freedom.sum()
-    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
-    for _ in range(20):
-        by_line = (variance / size[same]).mean(axis=0)
-        each = np.tensordot(share, variance / by_line, axes=(0, 1))
-        size = np.stack([each[same == k].mean(axis=0) for k in range(len(size))])[:, None]
-    return size[same] * by_line
-
-
-def check_freedom(htf: HTF, order: int, unknowns: int) -> None:
-    frequencies = len(htf.f)
-    if freedom(htf, frequencies, unknowns) < order:
-        needed = next(F for F in count(1) if freedom(htf, F, unknowns) >= order)
+def _refuse_invented(groups: list[Group], order: int) -> None:
+    """All but one combination of z^-jN H, j = 0..d, must rise above the noise."""
+    values, spread = noise_ratios(groups, np.zeros(order))
+    deviations = (values - 1) / spread
+    carried = sum(deviations[k] > largest_of_noise(k + 1) for k in range(1, len(values)))
+    if carried < order:
         raise DefinitionError(
-            f"{frequencies} frequencies are too few for numerators of {unknowns} coefficients and "
-            f"{order} multipliers: {needed} or more are needed. Measure more, or lower `order` or "
-            "`overhang`."
+            f"the data carry {carried} multipliers, not {order}: the weakest is "
+            f"{np.sqrt(values[1]):.3g} times the noise, which may be noise alone. Lower `order` "
+            "(`select_order` shows what speaks for each), measure longer, or pass check=False."
         )
-
-
-def freedom(htf: HTF, frequencies: int, unknowns: int) -> int:
-    """Real equations that so many frequencies leave when the numerators are gone."""
-    places = {m % htf.sections for m in htf.harmonics}
-    total = 0
-    for m in places:
-        if (-m) % htf.sections not in places:
-            equations, coefficients = 2 * frequencies, 2 * unknowns
-        else:  # half of a pair, or a harmonic that is its own mirror image
-            equations, coefficients = 2 * frequencies, unknowns
-        total += max(equations - coefficients, 0)
-    return total * len(htf.outputs) * len(htf.inputs)

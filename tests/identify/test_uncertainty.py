@@ -47,7 +47,7 @@ def covered(hits, runs, level=0.95):
     return stats.binomtest(hits, runs, level).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("correlation, errors", [(0, "variance"), (0.7, None)])
+@pytest.mark.parametrize("correlation, errors", [(0, "variance"), (0.7, "residuals")])
 def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small

@@ -1,0 +1,69 @@
+"""The number of multipliers: found by rank and by criteria, refused where it is too high; AAA."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from .test_uncertainty import covered, noisy, small as small, variance as variance, with_variance
+
+
+@pytest.mark.parametrize("size", [1.0, 100.0])
+def test_two_multipliers_are_two(size, small, variance):
+    _, htf = small
+    data = noisy(htf, size * variance, np.random.default_rng(0))
+    found = hj.select_order(data, 4)
+    assert (found.by_rank, found.order) == (2, 2)
+    assert np.all(found.deviation[:2] > 10) and np.all(np.abs(found.strength[2:] - 1) < 0.2)
+    np.testing.assert_allclose(found.cost[2:] / found.freedom[2:], 1.0, atol=0.2)
+    blind = hj.select_order(with_variance(htf, data.H, None), 4)
+    assert blind.by_rank == 2
+    assert found.by_mdl == blind.by_mdl == blind.order == 2
+    assert "by rank: 2" in repr(found) and len(repr(found).splitlines()) == 7
+
+
+def test_without_noise(exact):
+    found = hj.select_order(exact.select((-1, 0, 1)), 3)
+    assert (found.by_rank, found.by_mdl, found.order) == (2, 2, 2)
+
+
+def test_the_level_of_the_rank_test(small, variance):
+    """In 1 % of cases noise looks like one more multiplier, which fits refuse in the others."""
+    _, htf = small
+    htf, runs, wrong, refused = htf.select((-1, 0, 1)), 80, 0, 0
+    for seed in range(runs):
+        data = noisy(htf, variance[1:], np.random.default_rng(seed))
+        try:
+            hj.fit_multipliers(data, 3, max_steps=5)
+        except hj.DefinitionError as error:
+            refused += "the data carry 2 multipliers, not 3" in str(error)
+        if seed < 30:
+            wrong += hj.select_order(data, 3, max_steps=3).by_rank != 2
+    assert covered(30 - wrong, 30, 0.99) and covered(refused, runs, 0.98)
+    hj.fit_multipliers(data, 3, check=False)
+
+
+def test_what_noise_hides_is_not_reported(small, variance):
+    _, htf = small
+    with pytest.raises(hj.DefinitionError, match="the data carry [01] multipliers, not 2"):
+        hj.fit_multipliers(noisy(htf, 1e6 * variance, np.random.default_rng(0)), 2)
+
+
+def test_bad_requests(small):
+    _, htf = small
+    with pytest.raises(hj.DefinitionError, match="max_order must be at least 1"):
+        hj.select_order(htf, 0)
+    with pytest.raises(hj.DefinitionError, match="80 frequencies are too few"):
+        hj.select_order(htf, 60)
+
+
+def test_aaa_finds_the_roots_of_the_multipliers(exact, multipliers):
+    """All 64 poles of H_0, from twice that many coefficients."""
+    fit = hj.fit_aaa(exact)
+    assert [c.max_error < 1e-6 for c in fit.compare(multipliers)] == [True, True]
+    assert np.all(fit.residual < 1e-11)
+    assert fit.outputs == ("yM", "vM") and "poles, residual" in repr(fit)
+    with pytest.raises(hj.DefinitionError, match="no input 'v'"):
+        hj.fit_aaa(exact, input="v")
+    with pytest.raises(hj.DefinitionError, match="H_1 holds NaN"):
+        hj.fit_aaa(hj.HTF(exact.f, exact.H * np.nan, exact.harmonics, 32), 1)
