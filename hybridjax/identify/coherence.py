@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
 from ..experiments.data import ExperimentData
-from ..periodic.transfer import check_harmonics
+from .nonparametric import choose_harmonics
 from .solve import solve
 from .sums import Query, sums_of
 
@@ -38,6 +38,7 @@ def estimate_coherence(
     harmonics: int | Sequence[int] | None = None,
     *,
     repeats: int = 1,
+    highest: int | None = None,
     threshold: float = 1e-6,
 ) -> Coherence:
     """The coherence of inputs with the outputs that they cause at shifted frequencies.
@@ -52,8 +53,8 @@ def estimate_coherence(
     **Raises:** `DefinitionError` as `estimate_htf`, and for lines measured in one realisation only.
     """
     require_x64()
-    choose = functools.partial(check_harmonics, harmonics)
-    sums = sums_of(data, Query(choose, threshold, None, repeats))
+    choose = functools.partial(choose_harmonics, harmonics, highest)
+    sums = sums_of(data, Query(choose, threshold, highest, repeats))
     rows = np.flatnonzero(sums.solvable(sums.ran))
     solution = solve(sums, rows)
     seen = solution.realisations > 0

@@ -78,7 +78,7 @@ def estimate_htf(
     if highest is not None and highest < 0:
         raise DefinitionError(f"highest is a harmonic, 0 or more, not {highest}.")
     require_x64()
-    choose = functools.partial(_choose, harmonics, highest)
+    choose = functools.partial(choose_harmonics, harmonics, highest)
     sums = sums_of(data, Query(choose, threshold, highest, repeats))
     unsolved = sums.one_phase(sums.tried)
     if unsolved.any() and half_integers == "error":
@@ -116,18 +116,24 @@ def estimate_htf(
 
 
 def missing_frequencies(
-    data: ExperimentData | Iterable[ExperimentData], threshold: float = 1e-6
+    data: ExperimentData | Iterable[ExperimentData],
+    threshold: float = 1e-6,
+    *,
+    highest: int | None = None,
 ) -> Float[np.ndarray, " F"]:
     """Frequencies (cycles per period) that were excited but that `estimate_htf` has to leave out.
 
     Because their experiments failed, or not all inputs were applied at them, or because they lie
-    on a multiple of 1/2 and one phase is all there is.
+    on a multiple of 1/2 and one phase is all there is. `highest` as for `estimate_htf`.
     """
-    sums = sums_of(data, Query(lambda sections: (), threshold))
+    sums = sums_of(data, Query(lambda sections: (), threshold, highest))
     return sums.line[~sums.solvable(sums.ran)] / sums.about.periods
 
 
-def _choose(harmonics, highest: int | None, sections: int) -> tuple[int, ...]:
+def choose_harmonics(
+    harmonics: int | Sequence[int] | None, highest: int | None, sections: int
+) -> tuple[int, ...]:
+    """The harmonics to estimate: those asked for, or all up to `highest`."""
     if highest is None:
         return check_harmonics(harmonics, sections)
     known = check_harmonics(None, sections)

@@ -76,6 +76,7 @@ def test_few_experiments_on_the_hopper(hopper):
     with pytest.raises(hj.DefinitionError, match="beyond highest = 2 are taken as zero"):
         hj.estimate_htf(data, 3, highest=2)
     assert hj.estimate_htf(data, highest=2).harmonics == (-2, -1, 0, 1, 2)
+    assert len(hj.missing_frequencies(data, highest=2)) == 0
 
 
 def test_a_system_without_high_harmonics_needs_few_experiments():
