@@ -30,12 +30,14 @@ from ._core.tracing import is_traced
 from .experiments.data import ExperimentData
 from .experiments.design import Design
 from .identify.rational import RationalFit
+from .identify.records import Record
+from .identify.series import SeriesFit
 from .identify.structured import StructuredFit
 from .periodic.htf import HTF
 from .periodic.ldtp import LDTP
 
 
-Saved = Design | ExperimentData | HTF | LDTP | RationalFit | StructuredFit
+Saved = Design | ExperimentData | HTF | LDTP | RationalFit | Record | SeriesFit | StructuredFit
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 _FORMAT, _VERSION = "hybridjax", 1
@@ -50,7 +52,8 @@ def save(path: str | os.PathLike, thing: Any) -> None:
     **Arguments:**
 
     - `path`: ends in `.npz`; its folder must exist.
-    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit` or `StructuredFit`.
+    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit`, `Record`, `SeriesFit`
+      or `StructuredFit`.
 
     **Raises:** `DefinitionError` for other objects, traced or batched ones, another suffix, and
     where the file cannot be written; `PrecisionError` in single precision.

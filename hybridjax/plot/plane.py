@@ -10,8 +10,8 @@ from matplotlib.patches import Circle
 
 from .._core.errors import DefinitionError
 from ..identify.compare import compare_multipliers
+from ..identify.estimate import MultiplierEstimate
 from ..identify.rational import RationalFit
-from ..identify.structured import StructuredFit
 from ..orbits.cycle import LimitCycle
 from ..periodic.ldtp import LDTP
 from .look import (
@@ -43,12 +43,13 @@ def multipliers(
 
     The legend gives each estimate's largest distance |Δλ| from the true ones, and an inset
     enlarges the surroundings of the leading multiplier so that the estimates can be told apart.
+    Estimates that know their uncertainty get the borders of their 95 % regions.
 
     **Arguments:**
 
     - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them.
-    - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`, or
-        multipliers.
+    - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
+        `SeriesFit` or `MultiplierBound`, or multipliers.
     - `zoom`: draw the inset. `labels`: texts for the outputs by name.
 
     **Raises:** `DefinitionError` if there are no multipliers.
@@ -57,6 +58,7 @@ def multipliers(
     if true.size == 0:
         raise DefinitionError("there is no multiplier to draw.")
     series = _series(estimates or {}, labels)
+    borders = _borders(estimates or {})
     own = ax is None
     with axes_or_new(ax, height=3.5 + 0.15 * len(series)) as ax:
         _unit_circle(ax)
@@ -65,7 +67,7 @@ def multipliers(
         ax.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
         ax.locator_params(nbins=5)
         if zoom and series:
-            boxes.append(_zoom(ax, true, series))
+            boxes.append(_zoom(ax, true, series, borders))
         for box in boxes:
             box.plot(true.real, true.imag, "+", ms=9, mew=1.2, color="black", label="exact", ls="")
             for k, (label, z) in enumerate(series.items()):
@@ -75,6 +77,8 @@ def multipliers(
                     color=CYCLE[k % len(CYCLE)],
                     label=rf"{label}: $|\Delta\lambda|$ = {_power(error)}",
                 )  # fmt: skip
+                for border in borders.get(label, ()):
+                    box.plot(border.real, border.imag, lw=0.7, color=CYCLE[k % len(CYCLE)])
         _complex_axes(ax, r"\lambda")
         if own and series:
             shown = ax.get_legend_handles_labels()
@@ -144,7 +148,7 @@ def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _values(source: Any) -> np.ndarray:
-    if isinstance(source, LimitCycle | StructuredFit):
+    if isinstance(source, LimitCycle | MultiplierEstimate):
         source = source.multipliers
     values = np.asarray(source)
     if values.dtype.kind not in "fciu":
@@ -163,11 +167,23 @@ def _series(estimates: Mapping[str, Any], labels) -> dict[str, np.ndarray]:
     return series
 
 
-def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray]) -> Axes:
+def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
+    """Where covariances are finite: the borders of the confidence regions by label."""
+    return {
+        label: [fit.ellipse(i) for i in range(len(fit.multipliers))]
+        for label, fit in estimates.items()
+        if isinstance(fit, MultiplierEstimate) and np.isfinite(fit.covariance).all()
+    }
+
+
+def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes:
     """An inset around the leading true multiplier, at a place that is free of markers."""
     leading = true[np.lexsort((-true.imag, -np.abs(true)))[0]]
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
-    reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest)])
+    far = [np.abs(z - leading) for z in nearest]
+    for one in borders.values():  # of the region next to the leading multiplier, all of it
+        far.append(min(np.abs(border - leading).max() for border in one))
+    reach = 1.35 * max([1e-12, *far])
     side = 0.36
     points = (np.concatenate([true, *series.values()]) / ax.get_xlim()[1] + 1 + 1j) / 2
     places = [0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j]

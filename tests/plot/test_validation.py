@@ -35,3 +35,17 @@ def test_amplitude_marks_the_limit():
     assert [line.get_label() for line in ax.get_lines()][0] == "y"
     assert ax.get_lines()[-1].get_xdata()[0] == pytest.approx(10**-0.5)
     assert ax.get_lines()[1].get_xdata()[0] == 1.0
+
+
+def test_regions_are_drawn_around_estimates(hopper):
+    true = hopper.multipliers()
+    c = np.poly(true).real[1:]
+    estimate = hj.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
+    ax = hj.plot.multipliers(hopper, {"fit": estimate})
+    (inset,) = ax.child_axes
+    drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]
+    np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
+    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    border = estimate.ellipse(0)
+    assert left < border.real.min() < border.real.max() < right
+    assert low < border.imag.min() < border.imag.max() < high

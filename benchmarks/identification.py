@@ -1,0 +1,174 @@
+"""How well the hopper's multipliers are identified, and how honest the regions are.
+
+Printed, as `name value` lines: distances of the estimated first multiplier from the true one (for
+fits with several estimates of it, the closest).
+
+- `paper`: the paper's own 80 experiments (amplitude 0.01, 84 cycles, 20 discarded), without noise:
+  the structured fit of all harmonics, the rational fit of H_0 (two poles, one zero), AAA, and the
+  output-error fit of the first 20 experiments with all of their cycles.
+- `small`: 20 experiments of 64 cycles at amplitude 0.001 from the predicted periodic start, with
+  all 620 lines and with the odd ones.
+- `noise.S`: 20 experiments of 84 cycles (odd lines, rms 0.02, predicted periodic start) with white
+  noise at S dB, `--seeds` draws of it. `bound`: the Cramer-Rao bound of the rms error with all
+  numerators unknown. `rms`: of the structured fit, which is told no variances; `bias`: the error
+  without noise; `said`: the rms of its standard errors; `covered`: how often its 95 % region holds
+  the true multiplier. `ratio`: rms / bound.
+- `white`: 300 cycles of white input (rms 0.002) from the limit cycle: output error without noise
+  and at 20 dB, `--series` draws.
+- `coverage`: as in estimation.py, of the multiplier: `--runs` runs at 20 dB, each four realisations
+  of 20 experiments with new phases and noise; the truth is the fit to the mean over 2000
+  realisations without noise. `p`: that of the binomial test, times the number of tests (4).
+- `realised`: error of H_0 of the state-space model found from the series at 20 dB, relative to
+  max |H_0|, and its fit in percent to noise-free validation data.
+
+    python benchmarks/identification.py [--seeds 200] [--series 50] [--runs 1000] [--skip STEP ...]
+"""
+
+import argparse
+
+import numpy as np
+from estimation import RMS, Family, N
+from scipy import stats
+from second_order import OUTPUTS, sections
+
+import hybridjax as hj
+
+
+STEPS = ("paper", "noise", "white", "coverage")
+BAND = (-4, -3, -2, -1, 0, 1, 2, 3, 4)  # further harmonics tell nothing more about multipliers
+
+
+class Identification(Family):
+    @property
+    def true(self) -> np.ndarray:
+        return np.asarray(self.model.multipliers())[:1]
+
+    def error(self, estimate) -> float:
+        return float(np.abs(np.asarray(estimate.multipliers) - self.true).min())
+
+    def show(self, name: str, value) -> None:
+        print(f"identification.{self.name}.{name} {value:.2e}", flush=True)
+
+
+def paper(family: Identification) -> None:
+    data = family.run(hj.paper_design())
+    estimate = hj.estimate_htf(data)
+    family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
+    rational, aaa = hj.fit_rational(estimate), hj.fit_aaa(estimate, tolerance=1e-4)
+    for k, output in enumerate(OUTPUTS):
+        for name, fit in (("rational", rational), ("aaa", aaa)):
+            family.show(f"paper.{name}.{output}", np.nanmin(abs(fit.multipliers[k] - family.true)))
+    some = hj.ExperimentData(
+        data.u[:20], data.y[:20], sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
+    )
+    family.show("paper.series", family.error(hj.fit_series(some, 2, start="rest")))
+    for lines in ("all", "odd"):
+        data = family.run(hj.multisine(lines=lines, amplitude=0.001), start="periodic")
+        family.show(f"small.{lines}", family.error(hj.fit_multipliers(hj.estimate_htf(data), 2)))
+
+
+def noise(family: Identification, seeds: int) -> None:
+    design = hj.multisine(periods=84, lines="odd").scaled(0.02)
+    data = family.run(design, start="periodic")
+    clean = hj.fit_multipliers(hj.estimate_htf(data, BAND), 2)
+    family.show("noise.bias", family.error(clean))
+    for snr in (40, 20, 0):
+        noisy = [hj.add_noise(data, snr=snr, seed=seed) for seed in range(seeds)]
+        sigma = np.std(data.y, axis=(0, 1)) * 10 ** (-snr / 20)
+        exact = family.model.htf(design.frequencies, BAND)
+        a = design.amplitude[0]
+        variance = np.broadcast_to(
+            4 * sigma[:, None] ** 2 / (N * design.periods * a**2), exact.H.shape
+        )
+        bound = hj.multiplier_bound(
+            family.model,
+            hj.HTF(exact.f, exact.H, BAND, N, data.inputs, OUTPUTS, variance=variance),
+        ).standard_errors[0]
+        fits = [hj.fit_multipliers(hj.estimate_htf(one, BAND), 2) for one in noisy]
+        report(family, f"noise.{snr}", fits, bound)
+
+
+def report(family: Identification, name: str, fits, bound=None) -> None:
+    errors = np.array([family.error(fit) for fit in fits])
+    rms = np.sqrt(np.mean(errors**2))
+    if bound is not None:
+        family.show(f"{name}.bound", bound)
+        family.show(f"{name}.ratio", rms / bound)
+    family.show(f"{name}.rms", rms)
+    family.show(f"{name}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])))
+    family.show(f"{name}.covered", np.mean([f.contains(family.true).all() for f in fits]))
+
+
+def white(family: Identification, draws: int) -> None:
+    rng = np.random.default_rng(0)
+    u = 0.002 * rng.normal(size=(draws + 2, 300 * N, 1))
+    data = family.run(u, start="cycle", discard=0)
+
+    def one(s, y):
+        return hj.Record(data.u[s], y[s], sections=N, inputs=data.inputs, outputs=OUTPUTS)
+
+    family.show("white.clean", family.error(hj.fit_series(one(0, data.y), 2)))
+    noisy = hj.add_noise(data, snr=20, seed=0)
+    fits = [hj.fit_series(one(s, noisy.y), 2) for s in range(draws)]
+    report(family, "white.20", fits)
+    model = hj.realise(fits[0], order=2)
+    f = np.arange(0.05, 10, 0.1)
+    exact = family.model.htf(f, 0)
+    for k, error in enumerate(np.asarray(model.htf(f, 0).error(exact))):
+        family.show(f"realised.20.H0.{OUTPUTS[k]}", error)
+    for k, fit in enumerate(hj.validate(model, one(draws + 1, data.y)).fit):
+        family.show(f"realised.20.fit.{OUTPUTS[k]}", fit)
+
+
+def coverage(family: Identification, rms: float, runs: int) -> None:
+    design = hj.multisine(periods=32, seed=1).scaled(rms)
+    chosen = (-1, 0, 1)
+
+    def chunk(count, seed):
+        return family.run(design.realisations(count, seed), start="periodic", discard=32)
+
+    mean = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), chosen)
+    plain = hj.HTF(mean.f, mean.H, chosen, N, mean.inputs, mean.outputs)
+    truth = hj.fit_multipliers(plain, 2).multipliers[:1]
+    hits, each, part = 0, 4, 25
+    for first in range(0, runs, part):
+        data = chunk(each * part, first)
+        size = each * design.experiments
+        for k in range(part):
+            rows = slice(k * size, (k + 1) * size)
+            one = hj.ExperimentData(
+                data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
+            )
+            noisy = hj.add_noise(one, snr=20, seed=first + k)
+            fit = hj.fit_multipliers(hj.estimate_htf(noisy, chosen, repeats=2), 2)
+            hits += int(fit.contains(truth).all())
+    family.show(f"coverage.{rms}.multiplier", hits / runs)
+    family.show(f"coverage.{rms}.p", min(4 * stats.binomtest(hits, runs, 0.95).pvalue, 1.0))
+    family.show(f"coverage.{rms}.bias", abs(truth - family.true)[0])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=200)
+    parser.add_argument("--series", type=int, default=50)
+    parser.add_argument("--runs", type=int, default=1000, help="for coverage, a multiple of 25")
+    parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
+    options = parser.parse_args()
+    hj.enable_x64()
+    hj.enable_compilation_cache()
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    for name, definition in sections().items():
+        family = Identification(name, cycle, definition)
+        if "paper" not in options.skip:
+            paper(family)
+        if "noise" not in options.skip:
+            noise(family, options.seeds)
+        if "white" not in options.skip:
+            white(family, options.series)
+        if "coverage" not in options.skip:
+            for rms in RMS[name]:
+                coverage(family, rms, options.runs)
+
+
+if __name__ == "__main__":
+    main()
