@@ -151,63 +151,63 @@ def groups_of(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], unknowns: int) -
     Positive and negative frequencies are used, since H_m(-w) = conj H_{-m}(w); where m and -m
     are the same harmonic the numerators are real.
     """
-    f, N = np.asarray(htf.f), htf.sections
-    H = np.asarray(htf.H)
-    place = {m % N: row for row, m in enumerate(htf.harmonics)}
-    own = [row for m, row in place.items() if -m % N == m]
-    pairs = [(row, place[-m % N]) for m, row in place.items() if 0 < m < N / 2 and -m % N in place]
-    rest = [row for m, row in place.items() if -m % N not in place]
-
-    powers, lag = (
-        np.exp(-2j * np.pi / N * f[:, None] * np.arange(unknowns)),
-        np.exp(-2j * np.pi * f),
-    )
+    place = {m % htf.sections: row for row, m in enumerate(htf.harmonics)}
+    mirror = {row: place.get(-m % htf.sections) for m, row in place.items()}
+    own = [row for row, other in mirror.items() if other == row]
+    pairs = [(row, other) for row, other in mirror.items() if other is not None and row < other]
+    rest = [row for row, other in mirror.items() if other is None]
     found = []
-    for real, chosen in ((True, [own]), (False, list(zip(*pairs, strict=True))), (False, [rest])):
-        if not chosen or not chosen[0]:
-            continue
-        rows = np.array(chosen[0])
-        mirror = np.array(chosen[1]) if len(chosen) == 2 else None
-        turn = (lambda x: x) if mirror is None else (lambda x: np.concatenate([x, x.conj()]))
+    if own:
+        found += _groups(htf, weight, unknowns, np.array(own), None, real=True)
+    if pairs:
+        negative, positive = np.array(pairs).T
+        found += _groups(htf, weight, unknowns, positive, negative, real=False)
+    if rest:
+        found += _groups(htf, weight, unknowns, np.array(rest), None, real=False)
+    return found
 
-        def series(values, rows=rows, mirror=mirror):
-            values = (
-                values[rows]
-                if mirror is None
-                else np.concatenate([values[rows], values[mirror].conj()], axis=1)
+
+def _groups(htf: HTF, weight, unknowns: int, rows, mirror, real: bool) -> list[Group]:
+    """Harmonics whose numerators solve the same kind of problem; one group for each weight."""
+    f = np.asarray(htf.f)
+    F, ny, nu = len(f), len(htf.outputs), len(htf.inputs)
+
+    def both(values, conjugate):  # negative frequencies after the positive ones
+        return values if mirror is None else np.concatenate([values, conjugate])
+
+    def series(values):  # (M, F, ny, nu) -> (E, K)
+        columns = [values[rows]] + ([] if mirror is None else [values[mirror].conj()])
+        return np.moveaxis(np.concatenate(columns, axis=1), 1, 0).reshape(-1, len(rows) * ny * nu)
+
+    powers = np.exp(-2j * np.pi / htf.sections * f[:, None] * np.arange(unknowns))
+    powers, lag = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
+    split = np.concatenate([powers.real, powers.imag]) if real else powers
+    u, s, vh = np.linalg.svd(split, full_matrices=False)
+    kept = s > RANK * s[0]
+    basis, to_powers = u[:, kept], vh[kept].conj().T / s[kept]
+
+    weights, data = series(weight), series(np.asarray(htf.H))
+    scale = weights[0]
+    shape = weights / scale
+    _, first, which = np.unique(np.round(shape, 9), axis=1, return_index=True, return_inverse=True)
+    number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
+    columns, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
+    found = []
+    for k, one in enumerate(first):
+        same = np.flatnonzero(which.ravel() == k)
+        found.append(
+            Group(
+                rows=rows[number[same]],
+                mirror=None if mirror is None else mirror[number[same]],
+                columns=columns[same],
+                real=real,
+                line=line,
+                lag=both(lag, lag.conj()),
+                basis=basis,
+                to_powers=to_powers,
+                weight=shape[:, one],
+                scale=scale[same],
+                data=data[:, same] * scale[same],
             )
-            return np.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
-
-        all_powers = turn(powers)
-        split = np.concatenate([all_powers.real, all_powers.imag]) if real else all_powers
-        u, s, vh = np.linalg.svd(split, full_matrices=False)
-        kept = s > RANK * s[0]
-        basis, to_powers = u[:, kept], vh[kept].conj().T / s[kept]
-        line = np.arange(len(f)) if mirror is None else np.tile(np.arange(len(f)), 2)
-        weights, data = series(weight), series(H)
-        scale = weights[0] if (weights[0] > 0).all() else np.ones(weights.shape[1])
-        shape = weights / scale
-        _, first, which = np.unique(
-            np.round(shape, 9), axis=1, return_index=True, return_inverse=True
         )
-        ny, nu = H.shape[2:]
-        number, column = np.divmod(np.arange(weights.shape[1]), ny * nu)
-        columns = np.stack(np.divmod(column, nu), axis=1)
-        for k, one in enumerate(first):
-            same = np.flatnonzero(which.ravel() == k)
-            found.append(
-                Group(
-                    rows[number[same]],
-                    None if mirror is None else mirror[number[same]],
-                    columns[same],
-                    real,
-                    line,
-                    turn(lag),
-                    basis,
-                    to_powers,
-                    shape[:, one],
-                    scale[same],
-                    data[:, same] * scale[same],
-                )
-            )
     return found
