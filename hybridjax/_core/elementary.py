@@ -183,6 +183,8 @@ _OURS = {
     primitives.asin_p: arcsin,
     primitives.acos_p: arccos,
 }
+# Up to so many of them, a vector is concatenated.
+_FEW = 1
 # Primitives whose inner programs are replaced too. Functions with derivative rules of their own
 # are left alone.
 _OUTER = ("jit", "pjit", "cond", "while", "scan")
@@ -208,12 +210,47 @@ def vectorised(function: Callable) -> Callable:
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
         program, shapes = trace(*arguments)
-        program = program.replace(jaxpr=_replaced(program.jaxpr))
+        jaxpr = _replaced(program.jaxpr)
+        if _number(program.jaxpr) > _FEW:
+            jaxpr = _row_by_row(jaxpr)
+        program = program.replace(jaxpr=jaxpr)
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
         return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
 
     return call
+
+
+def _number(jaxpr: jex.Jaxpr) -> int:
+    """How many of our functions there are in a program."""
+    own = sum(eqn.primitive in _OURS for eqn in jaxpr.eqns)
+    inner = [eqn.params.values() for eqn in jaxpr.eqns if eqn.primitive.name in _OUTER]
+    items = [x for values in inner for value in values for x in _as_tuple(value)]
+    return own + sum(_number(x.jaxpr) for x in items if isinstance(x, jex.ClosedJaxpr))
+
+
+def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
+    """A program that puts the numbers of a vector in their places one after the other.
+
+    What is concatenated is compiled into one loop. With more than a few of our functions in it,
+    XLA does not find vector instructions for that loop.
+    """
+    eqns = []
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name in ("stack", "concatenate") and eqn.outvars[0].aval.ndim == 1:
+            rows = _equation(_rows, tuple(v.aval for v in eqn.invars))
+            eqn = rows.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
+        eqns.append(eqn)
+    return jaxpr.replace(eqns=eqns)
+
+
+@jax.jit
+def _rows(*parts):
+    out, start = jnp.zeros(sum(x.size for x in parts), jnp.result_type(*parts)), 0
+    for x in map(jnp.atleast_1d, parts):
+        out = jax.lax.dynamic_update_slice(out, x, (start,))
+        start += len(x)
+    return out
 
 
 def _replaced(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
@@ -239,11 +276,15 @@ def _replaced_equation(eqn: jex.JaxprEqn) -> jex.JaxprEqn:
 def _replaced_parameter(value: Any) -> Any:
     if isinstance(value, jex.ClosedJaxpr):
         return _replaced_program(value)
-    if type(value) is tuple and any(isinstance(item, jex.ClosedJaxpr) for item in value):
+    if any(isinstance(item, jex.ClosedJaxpr) for item in _as_tuple(value)):
         items = tuple(_replaced_program(item) for item in value)
         same = all(new is old for new, old in zip(items, value, strict=True))
         return value if same else items
     return value
+
+
+def _as_tuple(value: Any) -> tuple:
+    return value if type(value) is tuple else (value,)
 
 
 # JAX traces an inner jit once and keeps it: what becomes of it is kept as well, since JAX's caches

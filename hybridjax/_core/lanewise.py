@@ -39,7 +39,8 @@ def shared(tree: Any) -> Any:
 def by_lane(function: Callable, *trees: Any) -> Callable:
     """Vectorise `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
-    Of a tree that is a `PerLane`, each lane gets its own part.
+    Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
+    others have more is the same for all of them, and what depends on nothing else is computed once.
     """
     arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
@@ -48,8 +49,11 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
         return function(*eqx.combine(arrays, rest), *arguments)
 
     def call(*arguments):
-        in_axes = (axes, *[-1] * len(arguments))
-        many = arguments[0].shape[-1] >= _MANY
+        lanes = max(x.shape[-1] for x in arguments)
+        common = [x.shape[-1] < lanes for x in arguments]
+        arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
+        in_axes = (axes, *[None if c else -1 for c in common])
+        many = lanes >= _MANY
         work = vectorised(one) if many else one
         return jax.vmap(work, in_axes=in_axes, out_axes=-1)(arrays, *arguments)
 

@@ -80,8 +80,13 @@ def attempt(
     atol: Float[Array, "*#L"],
     span: Float[Array, " L"],
     unroll: bool,
+    in_step: bool,
 ) -> Attempt:
-    """Let the lanes of `mask` step, and land those that come close to the zero they aim at."""
+    """Let the lanes of `mask` step, and land those that come close to the zero they aim at.
+
+    With `in_step`, all lanes are thought to go equally far from the same time, to no zero; then
+    what depends on time only is computed once.
+    """
     L = lanes.t.shape[0]
     zero, no, yes = jnp.zeros(L), jnp.zeros(L, bool), jnp.ones(L, bool)
     empty = Attempt(lanes.q, nothing(s, L), zero, zero, no, no, no, yes)
@@ -90,6 +95,8 @@ def attempt(
         n = s.dims[a]
         t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
         tau = jnp.where(here, aim.step, 0.0)
+        if in_step:
+            t, tau = t[:1], aim.step[jnp.argmax(here)][None]
         some = here.any()
         step = jax.lax.cond(
             some,
@@ -108,12 +115,15 @@ def attempt(
         before = take(seen, rows)
         index, which = only(here, target.index), jnp.where(here, aim.which, -1)
         go = t, uu, index, tau, aim.reach, span
-        home = jax.lax.cond(
-            (which >= 0).any(),
-            lambda: _go_home(s, a, target, rows, before, which, step, tolerance, *go),
-            lambda: _Home(step.q, step.f1, zero, no, zero),
-        )
-        moved = tau + jnp.where(home.lands, home.past, 0.0)
+        home = _Home(step.q, step.f1, zero, no, zero)
+        moved = tau
+        if not in_step:
+            home = jax.lax.cond(
+                (which >= 0).any(),
+                lambda: _go_home(s, a, target, rows, before, which, step, tolerance, *go),
+                lambda: home,
+            )
+            moved = tau + jnp.where(home.lands, home.past, 0.0)
         value, rate = jax.lax.cond(
             some,
             lambda: values(s, a, target, t + moved, home.q, uu, index, home.f),
@@ -135,7 +145,8 @@ def attempt(
         armed = jnp.stack([ready[row] for row in rows])
         far = jnp.where(armed, low > NEAR * scale, high <= 0)
         fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
-        slow = (own & (ends[3] > -SLOW * fastest)).any(axis=0)
+        # (By rounding, the zero may lie a little before the start.)
+        slow = (own & (jnp.abs(moved) * rate > -SLOW * fastest)).any(axis=0)
         return Attempt(
             out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
             write(out.seen, rows, here, Watch(value, rate)),

@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float
 TOUCH = 1e-10
 # ... and within this fraction a near miss, which a shorter step must settle.
 NEAR = 1e-2
+# Newton steps to the zero: enough to tell apart guards that fall almost together.
+_NEWTON = 10
 
 
 class Crossing(NamedTuple):
@@ -65,15 +67,12 @@ def first_crossing(
     hi = jnp.where(first, sa, jnp.where(second, sb, 1.0))
     found = first | second | third
 
-    def newton(_, carry):
-        """A Newton step, kept inside the shrinking bracket."""
-        s, lo, hi = carry
+    s = 0.5 * (lo + hi)
+    for _ in range(_NEWTON):  # kept inside the shrinking bracket
         value = cubic(s)
         lo, hi = jnp.where(value > 0, s, lo), jnp.where(value > 0, hi, s)
         guess = s - _divide(value, slope(s))
-        return jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi)), lo, hi
-
-    s, *_ = jax.lax.fori_loop(0, 10, newton, (0.5 * (lo + hi), lo, hi))
+        s = jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
     touch = near = jnp.zeros_like(armed)

@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.lanewise import shared
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .attempt import SLOW, Aim, Attempt, attempt
 from .events import apply_resets, arm, enabled, keep_pace, next_schedule, rearm, width
-from .hermite import first_crossing
+from .hermite import Crossing, first_crossing
 from .lanes import Lanes
 from .stride import Stride
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape, blank_tape, write_row
@@ -29,6 +30,8 @@ from .watch import Watch, watch
 
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
+# A guard's zero is aimed at if Newton's guess places it within this fraction of the step.
+_SURE = 0.7
 # Attempts to land on a crossing before the step in which it was seen is halved.
 _TRIES = 8
 
@@ -128,12 +131,12 @@ def search(
     def active(state):
         return ~state.arrived & (state.result == Result.OK)
 
-    def attempted(state, unroll=False):
+    def attempted(state, unroll=False, in_step=False):
         """Aims, ways, and an attempt in all active lanes, and which of them it leaves calm."""
         aim, way = _take_aim(s, state, active(state), target, stride)
         ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
         here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
-        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll)
+        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll, in_step)
         calm = new.calm & (new.error <= stride.slack) & ~state.approach.on & (way.schedule < 0)
         calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
         return calm, aim, way, new
@@ -164,9 +167,18 @@ def search(
 
     if not glide:
         return all_the_way()
-    calm, aim, way, new = attempted(state, unroll=True)
+    levels = shared(target.levels)
+    clock = levels is None or not any(levels.present(s, a) for a in range(len(s.charts)))
+    calm, aim, way, new = attempted(state, unroll=True, in_step=clock)
     home = calm & (new.lands | way.last)
+    if clock:
+        home = home & _alike(state.lanes.t, active(state)) & _alike(aim.step, active(state))
     return jax.lax.cond((home | ~active(state)).all(), in_one_step, all_the_way)
+
+
+def _alike(x: Float[Array, " L"], mask: Bool[Array, " L"]) -> Bool[Array, " L"]:
+    """Which lanes have the same number as the first lane of `mask`."""
+    return x == x[jnp.argmax(mask)]
 
 
 def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _Way]:
@@ -189,7 +201,8 @@ def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _W
     guess = value / jnp.where(rate < 0, -rate, jnp.inf)
     guess = guess.at[-1].multiply(jnp.where(state.i == 0, stride.lead, 1.0))
     level = jnp.arange(len(value))[:, None] == len(s.transitions)
-    sure = ready & (guess > 0) & (guess <= step) & (level | (state.i == 0))
+    new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
+    sure = ready & (guess > 0) & (guess <= jnp.where(level, 1.0, _SURE) * step) & (level | new)
     guess = jnp.where(sure & ~approach.on & (stride.lead > 0), guess, jnp.inf)
     nearest = jnp.min(guess, axis=0)
     homing = jnp.isfinite(nearest)
@@ -252,14 +265,14 @@ def _eventfully(
 
     # 2. What was crossed on the way.
     ready = jnp.concatenate([lanes.armed, state.aimed[None]])
-    crossing = first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+    fresh = active & ~approach.on & near
+    crossing = _crossing(fresh | lands, seen, end, moved, ready)
     zero = width(t, span, end.rate)
     chosen = lands & (jnp.arange(G + 1)[:, None] == aim.which)
     old = lands & (jnp.abs(end.value) <= zero)
     s_first = jnp.where(chosen | old, jnp.inf, crossing.s)
     which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
     first = jnp.min(s_first, axis=0)
-    fresh = active & ~approach.on & near
     bent = fresh & new.bent
     crosses = ((fresh | lands) & jnp.isfinite(first)) & ~bent
     refine = bent | ((fresh | lands) & ~crosses & (crossing.near & ~chosen).any(axis=0))
@@ -326,6 +339,19 @@ def _eventfully(
     error = state.error + jnp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
     return _State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
+
+
+def _crossing(some, seen: Watch, end: Watch, moved, ready) -> Crossing:
+    """What was crossed on the way. (In a branch, so that it is not computed anew by every user.)"""
+
+    def look():
+        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+
+    def nothing():
+        no = jnp.zeros_like(ready)
+        return Crossing(jnp.full_like(end.value, jnp.inf), no, no)
+
+    return jax.lax.cond(some.any(), look, nothing)
 
 
 def _next_step(h, step, error):

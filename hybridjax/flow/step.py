@@ -41,16 +41,17 @@ class Step(NamedTuple):
 
 def rk_step(
     field: LaneField,
-    t: Float[Array, " L"],
+    t: Float[Array, " #L"],
     q: Float[Array, "n L"],
-    h: Float[Array, " L"],
+    h: Float[Array, " #L"],
     unroll: bool = False,
 ) -> Step:
-    """One step of Verner's 7(6) pair from (t, q) over h.
+    """One step of Verner's 7(6) pair from (t, q) over h. Both t and h may be the same for all
+    lanes, as arrays of one.
 
     With `unroll`, or for many lanes, the stages are written out: faster, and slower to compile.
     """
-    unroll = unroll or t.shape[0] >= _MANY
+    unroll = unroll or q.shape[1] >= _MANY
     K = (_written_out if unroll else _in_a_loop)(field, t, q, h)
     if unroll:
         end, error = (_combine(w, K) for w in (VERNER76.b_sol, VERNER76.b_error))

@@ -277,3 +277,17 @@ def test_errors_of_the_function_come_through():
 def test_off_away_from_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert left(vectorised(plain), 0.3, 0.7) == left(plain, 0.3, 0.7)
+
+
+def test_vectors_of_several_functions_are_put_together_row_by_row():
+    def field(t, q):
+        a, b = jnp.sin(t) + q[0], jnp.cos(2 * t) * q[1]
+        return jnp.stack([a, q[0], a * b, jnp.tan(b)]), jnp.concatenate([q, jnp.array([t])])
+
+    t, q = jnp.asarray(0.7), jnp.array([0.3, -1.2])
+    program = str(jax.make_jaxpr(vectorised(field))(t, q))
+    assert "stack[" not in program.replace("_stack[", "") and "concatenate[" not in program
+    for new, old in zip(vectorised(field)(t, q), field(t, q), strict=True):
+        np.testing.assert_allclose(new, old, rtol=1e-15)
+    new, old = (jax.jacfwd(f)(t, q)[0] for f in (vectorised(field), field))
+    np.testing.assert_allclose(new, old, rtol=1e-14)

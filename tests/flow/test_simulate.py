@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 import hybridjax as hj
 
@@ -109,6 +109,7 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, or
 
 
 @settings(max_examples=30, deadline=None)
+@example(gap=2e-12, sign=1, k=1.0)  # the later one is found first, then the other is behind
 @given(
     gap=st.floats(-12.0, -2.0).map(lambda x: 10**x),
     sign=st.sampled_from([-1, 1]),
