@@ -175,3 +175,20 @@ def largest_of_noise(size: int) -> float:
     draws = np.random.default_rng(0).normal(size=(20000, size, size))
     symmetric = (draws + draws.swapaxes(1, 2)) / 2
     return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 0.99))
+
+
+def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:
+    """Of the d + 1 ratios of a fit of order d, ascending, one may be noise: that of chi itself.
+
+    **Raises:** `DefinitionError` if more of them may be.
+    """
+    order = len(values) - 1
+    deviations = (values - 1) / spread
+    carried = sum(deviations[k] > largest_of_noise(k + 1) for k in range(1, order + 1))
+    if carried < order:
+        raise DefinitionError(
+            f"the data carry {carried} multipliers, not {order}: the weakest is "
+            f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
+            "`order` (`select_order` shows what speaks for each), measure longer, or pass "
+            "check=False."
+        )

@@ -191,13 +191,18 @@ def _starts(problem: Problem, c: Coefficients, n: int) -> Float[np.ndarray, "S T
     return along_cycles(c, impulses)
 
 
-def initial(problem: Problem, order: int) -> Coefficients:
-    """chi y = B u by total least squares, which white noise does not bias.
+class Delayed(NamedTuple):
+    """What inputs leave of the outputs 0, 1, ..., d cycles earlier."""
 
-    Only from rows whose lagged outputs are all known.
-    """
-    S, T, N, ny = problem.y.shape
-    gram = np.zeros((order + 1, order + 1))
+    gram: Float[np.ndarray, "d1 d1"]
+    freedom: int
+    """The number of independent rows; noise of variance 1 makes the Gram matrix that large."""
+
+
+def delayed_outputs(problem: Problem, order: int) -> Delayed:
+    """Only from rows whose lagged inputs and outputs are all known."""
+    _, T, N, ny = problem.y.shape
+    gram, freedom = np.zeros((order + 1, order + 1)), 0
     cycle = np.arange(T)[:, None]
     for n in range(N):
         V = lagged(problem.u, n, problem.lags) @ problem.maps[n]
@@ -209,7 +214,13 @@ def initial(problem: Problem, order: int) -> Coefficients:
             X, Z = V[rows], np.stack([p[rows] for p in past], axis=1)
             Z = Z - X @ np.linalg.lstsq(X, Z)[0]
             gram += Z.T @ Z
-    null = np.linalg.eigh(gram)[1][:, 0]
+            freedom += max(len(X) - X.shape[1], 0)
+    return Delayed(gram, freedom)
+
+
+def initial(problem: Problem, order: int) -> Coefficients:
+    """chi y = B u by total least squares, which white noise does not bias."""
+    null = np.linalg.eigh(delayed_outputs(problem, order).gram)[1][:, 0]
     if abs(null[0]) < 1e-8 * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])

@@ -15,9 +15,18 @@ from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
 from .likelihood import gauss_newton, sandwich
+from .order import refuse_invented
 from .projection import chi
 from .records import Layout, Recorded, lay_out
-from .regression import Linearisation, Problem, initial, linearise, rescale, set_up
+from .regression import (
+    Linearisation,
+    Problem,
+    delayed_outputs,
+    initial,
+    linearise,
+    rescale,
+    set_up,
+)
 
 
 _PROBES = 4  # outputs of pure noise, from which the noise in the Jacobian is estimated
@@ -114,6 +123,7 @@ def fit_series(
     overhang: int | None = None,
     start: Literal["free", "rest"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
+    check: bool = True,
     max_steps: int = 50,
 ) -> SeriesFit:
     r"""Multipliers, HTFs and their uncertainty from series with any input.
@@ -136,10 +146,12 @@ def fit_series(
     - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
       cycle, so that it holds also where noise of successive cycles is dependent (process noise),
       with the weights of Newey and West (1987). "white": from its size alone.
+    - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
     **Raises:** `DefinitionError` for an order below 1, records that do not fit together, inputs
-    that are zero, or too few cycles (the message says how many are needed).
+    that are zero, too few cycles (the message says how many are needed), or an order that the data
+    do not carry.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
@@ -157,6 +169,10 @@ def fit_series(
     _check_freedom(found, order, problem)
     problem = rescale(problem, _noise(found, order))  # the weights that the misfit suggests
     c, found, converged = _minimise(problem, c, max_steps)
+    if check:
+        delayed = delayed_outputs(rescale(problem, _noise(found, order)), order)
+        rows = max(delayed.freedom, 1)
+        refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
     covariance, freedom = _covariance(problem, c, found, errors)
 
     nu, ny = layout.u.shape[3], layout.y.shape[3]

@@ -15,8 +15,8 @@ from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
 from .likelihood import maximum_likelihood, noise_levels, summarize
-from .order import largest_of_noise, noise_ratios
-from .projection import Group, chi, groups_of, numerators
+from .order import noise_ratios, refuse_invented
+from .projection import chi, groups_of, numerators
 from .values import check_freedom, check_values, weights_of
 
 
@@ -159,7 +159,7 @@ def fit_multipliers(
         groups = groups_of(htf, weights_of(htf, rms * noise), unknowns)
         c, converged = maximum_likelihood(groups, order, max_steps, c)
     if check:
-        _refuse_invented(groups, order)
+        refuse_invented(*noise_ratios(groups, np.zeros(order)))
     summary = summarize(groups, c, errors)
 
     B = np.zeros((len(htf.harmonics), unknowns, len(htf.outputs), len(htf.inputs)), complex)
@@ -187,16 +187,3 @@ def fit_multipliers(
     misfit = np.abs(np.asarray(fit.evaluate(htf.f).H) - np.asarray(htf.H)) ** 2
     residual = np.sqrt(np.mean(misfit, axis=(0, 1, 3))) / rms
     return eqx.tree_at(lambda fit: fit.residual, fit, residual)
-
-
-def _refuse_invented(groups: list[Group], order: int) -> None:
-    """All but one combination of z^-jN H, j = 0..d, must rise above the noise."""
-    values, spread = noise_ratios(groups, np.zeros(order))
-    deviations = (values - 1) / spread
-    carried = sum(deviations[k] > largest_of_noise(k + 1) for k in range(1, len(values)))
-    if carried < order:
-        raise DefinitionError(
-            f"the data carry {carried} multipliers, not {order}: the weakest is "
-            f"{np.sqrt(values[1]):.3g} times the noise, which may be noise alone. Lower `order` "
-            "(`select_order` shows what speaks for each), measure longer, or pass check=False."
-        )

@@ -118,6 +118,20 @@ def test_a_chirp_will_do(hopper, multipliers):
     assert fit.compare(multipliers).max_error < 1e-6
 
 
+def test_multipliers_that_noise_would_invent_are_refused(small):
+    """But for 1 % of cases."""
+    refused, runs = 0, 25
+    for seed in range(runs):
+        data = record(small, 400, seed, 0.3)
+        try:
+            hj.fit_series(data, 3, max_steps=5)
+        except hj.DefinitionError as error:
+            assert "the data carry 2 multipliers, not 3" in str(error)
+            refused += 1
+    assert covered(refused, runs, 0.98)
+    assert len(hj.fit_series(data, 3, check=False).multipliers) == 3
+
+
 def test_bad_records(small):
     good = record(small, 400)
     with pytest.raises(hj.DefinitionError, match="section 0 was sampled 10 times, too few"):
