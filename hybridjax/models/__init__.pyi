@@ -1,4 +1,13 @@
 from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
+from .buck import BuckConverter as BuckConverter
+from .compass import CompassGait as CompassGait
+from .flap import RotorFlap as RotorFlap
+from .hopf import HopfOscillator as HopfOscillator
 from .hopper import VerticalHopper as VerticalHopper
+from .juggler import PaddleJuggler as PaddleJuggler
+from .mathieu import Mathieu as Mathieu
+from .slip import SLIPRunner as SLIPRunner
 from .vanderpol import VanDerPol as VanDerPol
+from .walker import SimplestWalker as SimplestWalker
+from .wheel import RimlessWheel as RimlessWheel
