@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..systems.structure import Structure
+from .aim import Aim
 from .hermite import NEAR, control_points, root_near_end
 from .lanes import Lanes, for_each_chart, only
 from .step import Step, rk_step
@@ -23,17 +24,6 @@ _BEND = 2e-3
 _SHORT = 0.25
 # and if the last correction is at most this fraction of the way from the step's start.
 _FINE = 1e-6
-
-
-class Aim(NamedTuple):
-    """What lanes go for."""
-
-    which: Int[Array, " L"]
-    """The watched function on whose zero they mean to land; -1 for none."""
-    step: Float[Array, " L"]
-    """How far they go."""
-    reach: Float[Array, " L"]
-    """Length of the step in which that zero is thought to be."""
 
 
 class Attempt(NamedTuple):

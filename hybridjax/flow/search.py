@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.lanewise import shared
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
-from ..systems.transition import Scheduled
-from .attempt import SLOW, Aim, Attempt, attempt
-from .events import apply_resets, arm, enabled, keep_pace, next_schedule, rearm, width
+from .aim import Aim, Approach, State, Way, take_aim
+from .attempt import SLOW, Attempt, attempt
+from .events import apply_resets, arm, enabled, keep_pace, rearm, width
 from .hermite import Crossing, first_crossing
 from .lanes import Lanes
 from .stride import Stride
@@ -30,8 +30,6 @@ from .watch import Watch, watch
 
 # Steps below this fraction of the time allowed are not taken.
 _TINY = 1e-13
-# A guard's zero is aimed at if Newton's guess places it within this fraction of the step.
-_SURE = 0.7
 # Attempts to land on a crossing before the step in which it was seen is halved.
 _TRIES = 8
 
@@ -46,46 +44,6 @@ class Moved(NamedTuple):
     """Sum of the steps' error estimates, relative to the tolerance."""
     result: Int[Array, " L"]
     """`Result` codes. A lane that failed stands where it failed."""
-
-
-class _Approach(NamedTuple):
-    """Lanes that have seen a crossing in a step and are about to land on it."""
-
-    on: Bool[Array, " L"]
-    which: Int[Array, " L"]
-    """The watched function that crosses."""
-    tau: Float[Array, " L"]
-    """Where the crossing is thought to be, as a time from where the lane is."""
-    reach: Float[Array, " L"]
-    """Length of the step in which it was seen."""
-    rate: Float[Array, " L"]
-    """The largest rate of that function at the ends of that step."""
-    tries: Int[Array, " L"]
-
-
-class _State(NamedTuple):
-    lanes: Lanes
-    seen: Watch
-    """The watched functions where the lanes are."""
-    aimed: Array
-    """Whether the target's level would end the flow at its next falling zero."""
-    approach: _Approach
-    h: Array
-    error: Array
-    result: Array
-    arrived: Array
-    i: Array
-
-
-class _Way(NamedTuple):
-    """The known times ahead of each lane, and what it does about them."""
-
-    known: Array
-    """The next known time."""
-    schedule: Array
-    """The transition that is due at the end of this step; -1 for none."""
-    last: Array
-    """Whether this step ends there."""
 
 
 def search(
@@ -115,11 +73,11 @@ def search(
     span = target.limit - lanes.t
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
     none = jnp.zeros(L, jnp.int32)
-    state = _State(
+    state = State(
         arm(s, lanes, seen, span) if new_input else lanes,
         seen,
         _aims(seen, span),
-        _Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
+        Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
         stride.h,
         jnp.zeros(L),
         result,
@@ -133,7 +91,7 @@ def search(
 
     def attempted(state, unroll=False, in_step=False):
         """Aims, ways, and an attempt in all active lanes, and which of them it leaves calm."""
-        aim, way = _take_aim(s, state, active(state), target, stride)
+        aim, way = take_aim(s, state, active(state), target, stride)
         ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
         here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
         new = attempt(s, *here, aim, *where, rtol, atol, span, unroll, in_step)
@@ -181,43 +139,9 @@ def _alike(x: Float[Array, " L"], mask: Bool[Array, " L"]) -> Bool[Array, " L"]:
     return x == x[jnp.argmax(mask)]
 
 
-def _take_aim(s, state: _State, active, target, stride: Stride) -> tuple[Aim, _Way]:
-    """Where to each lane goes next."""
-    lanes, approach = state.lanes, state.approach
-    # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    known, schedule = target.time, jnp.full_like(lanes.chart, -1)
-    if _has_schedules(s):
-        scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
-        known = jnp.minimum(target.time, scheduled)
-        schedule = jnp.where(scheduled <= target.time, which, -1)
-    rest = jnp.maximum(known - lanes.t, 0.0)
-    pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / state.h, 2.0) - 1e-9)
-    last = (pieces <= 1) & ~approach.on
-    step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), state.h)
-    which = jnp.where(approach.on, approach.which, -1)
-    # A zero that Newton's guess places within the first step is aimed at, where the way is known.
-    value, rate = state.seen
-    ready = jnp.concatenate([lanes.armed, state.aimed[None]])
-    guess = value / jnp.where(rate < 0, -rate, jnp.inf)
-    guess = guess.at[-1].multiply(jnp.where(state.i == 0, stride.lead, 1.0))
-    level = jnp.arange(len(value))[:, None] == len(s.transitions)
-    new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
-    sure = ready & (guess > 0) & (guess <= jnp.where(level, 1.0, _SURE) * step) & (level | new)
-    guess = jnp.where(sure & ~approach.on & (stride.lead > 0), guess, jnp.inf)
-    nearest = jnp.min(guess, axis=0)
-    homing = jnp.isfinite(nearest)
-    step = jnp.where(homing, nearest, step)
-    which = jnp.where(homing, jnp.argmin(guess, axis=0).astype(jnp.int32), which)
-    last = last & ~homing
-    last = last & active
-    step = jnp.where(active, jnp.where(approach.on, approach.tau, step), 0.0)
-    reach = jnp.where(approach.on, approach.reach, step)
-    return Aim(which, step, reach), _Way(known, jnp.where(last, schedule, -1), last)
-
-
 def _calmly(
-    state: _State, active, aim: Aim, way: _Way, new: Attempt, target, stride
-) -> tuple[_State, Tape]:
+    state: State, active, aim: Aim, way: Way, new: Attempt, target, stride
+) -> tuple[State, Tape]:
     """Nothing happened to any lane, except perhaps that it arrived."""
     lanes = state.lanes
     level, on_time = active & new.lands, way.last
@@ -230,7 +154,7 @@ def _calmly(
     code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
     code = jnp.where(active, code, IDLE).astype(jnp.int32)
     row = Tape(moved, code, t, new.q, new.q, lanes.chart)
-    end = _State(
+    end = State(
         lanes,
         _merge(active, new.seen, state.seen),
         state.aimed,
@@ -245,8 +169,8 @@ def _calmly(
 
 
 def _eventfully(
-    s, state: _State, active, aim: Aim, way: _Way, new: Attempt, u, target, stride, span
-) -> tuple[_State, Tape]:
+    s, state: State, active, aim: Aim, way: Way, new: Attempt, u, target, stride, span
+) -> tuple[State, Tape]:
     """Find out what happened to each lane, and let it happen."""
     lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
     G = len(s.transitions)
@@ -311,7 +235,7 @@ def _eventfully(
 
     # 4. The next step, and reasons to stop.
     fastest = jnp.maximum(jnp.abs(_row(state.seen.rate, which)), jnp.abs(_row(end.rate, which)))
-    approach = _Approach(
+    approach = Approach(
         crosses | closer,
         jnp.where(crosses, which, approach.which),
         jnp.where(crosses, first * moved, jnp.clip(tau, 0.0, approach.reach)),
@@ -338,7 +262,7 @@ def _eventfully(
     row = Tape(moved, code.astype(jnp.int32), t, new.q, after.q, after.chart)
     error = state.error + jnp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
-    return _State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
+    return State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
 
 
 def _crossing(some, seen: Watch, end: Watch, moved, ready) -> Crossing:
@@ -390,10 +314,6 @@ def _merge(mask, new: Watch, old: Watch) -> Watch:
 
 def _row(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
     return jnp.take_along_axis(x, which[None], axis=0)[0]
-
-
-def _has_schedules(s: Structure) -> bool:
-    return any(isinstance(tr.guard, Scheduled) for tr in s.transitions)
 
 
 def _expected(order, events, fired):
