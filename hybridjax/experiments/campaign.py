@@ -116,7 +116,7 @@ class Campaign:
     def _start(self, u) -> Float[np.ndarray, "n S"]:
         """Times and states in which the experiments begin, at section 0."""
         lanes = self.placed.lanes
-        on_cycle = np.concatenate([lanes.t[None], lanes.q])[:, :1]
+        on_cycle = np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
         if self.model is None:
             return np.repeat(on_cycle, len(u), axis=1)
         embed = np.asarray(self.placed.frames()[0][0])[:, : self.model.A.shape[1]]
