@@ -6,8 +6,8 @@ fits with several estimates of it, the closest).
 - `paper`: the paper's own 80 experiments (amplitude 0.01, 84 cycles, 20 discarded), without noise:
   the structured fit of all harmonics, the rational fit of H_0 (two poles, one zero), AAA, and the
   output-error fit of the first 20 experiments with all of their cycles.
-- `small`: 20 experiments of 64 cycles at amplitude 0.001 from the predicted periodic start, with
-  all 620 lines and with the odd ones.
+- `small`: 20 experiments of 64 cycles at amplitude 0.001, with all 620 lines and with the odd ones,
+  from the periodic start that the linearisation predicts and from the nonlinear one (`steady`).
 - `noise.S`: 20 experiments of 84 cycles (odd lines, rms 0.02, predicted periodic start) with white
   noise at S dB, `--seeds` draws of it. `bound`: the Cramer-Rao bound of the rms error with all
   numerators unknown. `rms`: of the structured fit, which is told no variances; `bias`: the error
@@ -17,7 +17,8 @@ fits with several estimates of it, the closest).
   and at 20 dB, `--series` draws.
 - `coverage`: as in estimation.py, of the multiplier: `--runs` runs at 20 dB, each four realisations
   of 20 experiments with new phases and noise; the truth is the fit to the mean over 2000
-  realisations without noise. `p`: that of the binomial test, times the number of tests (4).
+  realisations without noise, with the mean variances of the runs. `p`: that of the binomial test,
+  times the number of tests (4). `bias`: the truth less the multiplier for small inputs.
 - `realised`: error of H_0 of the state-space model found from the series at 20 dB, relative to
   max |H_0|, and its fit in percent to noise-free validation data.
 
@@ -43,8 +44,9 @@ class Identification(Family):
     def true(self) -> np.ndarray:
         return np.asarray(self.model.multipliers())[:1]
 
-    def error(self, estimate) -> float:
-        return float(np.abs(np.asarray(estimate.multipliers) - self.true).min())
+    def error(self, estimate, true=None) -> float:
+        true = self.true if true is None else true
+        return float(np.abs(np.asarray(estimate.multipliers) - true).min())
 
     def show(self, name: str, value) -> None:
         print(f"identification.{self.name}.{name} {value:.2e}", flush=True)
@@ -63,8 +65,10 @@ def paper(family: Identification) -> None:
     )
     family.show("paper.series", family.error(hj.fit_series(some, 2, start="rest")))
     for lines in ("all", "odd"):
-        data = family.run(hj.multisine(lines=lines, amplitude=0.001), start="periodic")
-        family.show(f"small.{lines}", family.error(hj.fit_multipliers(hj.estimate_htf(data), 2)))
+        for label, start in (("predicted", "periodic"), ("steady", "steady")):
+            data = family.run(hj.multisine(lines=lines, amplitude=0.001), start=start)
+            error = family.error(hj.fit_multipliers(hj.estimate_htf(data), 2))
+            family.show(f"small.{lines}.{label}", error)
 
 
 def noise(family: Identification, seeds: int) -> None:
@@ -128,9 +132,7 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
         return family.run(design.realisations(count, seed), start="periodic", discard=32)
 
     mean = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), chosen)
-    plain = hj.HTF(mean.f, mean.H, chosen, N, mean.inputs, mean.outputs)
-    truth = hj.fit_multipliers(plain, 2).multipliers[:1]
-    hits, each, part = 0, 4, 25
+    fits, variances, each, part = [], [], 4, 25
     for first in range(0, runs, part):
         data = chunk(each * part, first)
         size = each * design.experiments
@@ -140,10 +142,22 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
                 data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
             )
             noisy = hj.add_noise(one, snr=20, seed=first + k)
-            fit = hj.fit_multipliers(hj.estimate_htf(noisy, chosen, repeats=2), 2)
-            hits += int(fit.contains(truth).all())
+            estimate = hj.estimate_htf(noisy, chosen, repeats=2)
+            fits.append(hj.fit_multipliers(estimate, 2))
+            variances.append(estimate.variance)
+    # Where distortion matters the HTFs are not of the structure exactly, and the fit to them
+    # depends on the weights: the truth has those of the runs.
+    weighted = hj.HTF(
+        mean.f, mean.H, chosen, N, mean.inputs, mean.outputs,
+        variance=np.mean(variances, axis=0), freedom=estimate.freedom,
+    )  # fmt: skip
+    truth = hj.fit_multipliers(weighted, 2).multipliers[:1]
+    hits = sum(int(fit.contains(truth).all()) for fit in fits)
+    errors = np.array([family.error(fit, truth) for fit in fits])
     family.show(f"coverage.{rms}.multiplier", hits / runs)
     family.show(f"coverage.{rms}.p", min(4 * stats.binomtest(hits, runs, 0.95).pvalue, 1.0))
+    family.show(f"coverage.{rms}.rms", np.sqrt(np.mean(errors**2)))
+    family.show(f"coverage.{rms}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])))
     family.show(f"coverage.{rms}.bias", abs(truth - family.true)[0])
 
 

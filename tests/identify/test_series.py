@@ -44,7 +44,7 @@ def test_the_hopper_is_found_exactly(hopper, multipliers):
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.sampled_from(SHAPES), st.integers(0, 99), st.integers(0, 3))
 def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     """Two records of odd lengths, with bad outputs and inputs here and there."""
@@ -69,7 +69,7 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
 
 def test_regions_cover(small):
     """Of multipliers and of the HTFs at fixed frequencies; the error is what is said."""
-    true, runs, f = small.multipliers(), 60, np.array([0.1, 0.9, 1.6])
+    true, runs, f = small.multipliers(), 40, np.array([0.1, 0.9, 1.6])
     exact = small.htf(f, (-1, 0, 1))
     fits = [hj.fit_series(record(small, 4 * 120, seed, 0.3), 2) for seed in range(runs)]
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
@@ -80,17 +80,17 @@ def test_regions_cover(small):
     for fit in fits:
         estimate = fit.htf(f, (-1, 0, 1))
         square += np.abs(estimate.H - exact.H) ** 2 / estimate.variance / runs
-    np.testing.assert_allclose(square, 1.0, atol=0.6)
+    np.testing.assert_allclose(square, 1.0, atol=0.7)
     assert abs(np.mean(square) - 1) < 0.15
     np.testing.assert_allclose(np.mean([fit.noise for fit in fits], axis=0), 0.3, rtol=0.02)
 
 
 def test_process_noise_is_seen_in_the_residuals(small):
     """A random input nobody recorded: regions from white errors would be too small."""
-    true, runs = small.multipliers(), 60
+    true, runs = small.multipliers(), 40
     hits = 0
     for seed in range(runs):
-        clean = record(small, 4 * 150, seed)
+        clean = record(small, 4 * 100, seed)
         hidden = np.random.default_rng(1000 + seed).normal(size=clean.u.shape)
         y = clean.y + 0.3 * np.asarray(small.simulate(hidden))
         fit = hj.fit_series(hj.Record(clean.u, y, sections=4), 2)
@@ -120,7 +120,7 @@ def test_a_chirp_will_do(hopper, multipliers):
 
 def test_multipliers_that_noise_would_invent_are_refused(small):
     """But for 1 % of cases."""
-    refused, runs = 0, 25
+    refused, runs = 0, 15
     for seed in range(runs):
         data = record(small, 400, seed, 0.3)
         try:

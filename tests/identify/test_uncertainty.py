@@ -51,7 +51,7 @@ def covered(hits, runs, level=0.95):
 def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
-    true, runs = model.multipliers(), 100
+    true, runs = model.multipliers(), 60
     bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
     fits = [
         hj.fit_multipliers(
@@ -62,9 +62,9 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
     rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
     said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
-    np.testing.assert_allclose(said, rms, rtol=0.2)
+    np.testing.assert_allclose(said, rms, rtol=0.25)
     if not correlation:
-        np.testing.assert_allclose(rms, bound, rtol=0.2)
+        np.testing.assert_allclose(rms, bound, rtol=0.25)
         freedom = np.sqrt(2 * fits[0].freedom * runs)
         assert abs(sum(fit.cost - fit.freedom for fit in fits)) < 4 * freedom
 
@@ -73,7 +73,7 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
     model, htf = small
     true = model.multipliers()
     square = np.zeros(2)
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance, rng)
         rough = variance * rng.gamma(2.0, 0.5, variance.shape)
@@ -81,7 +81,7 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(true).error[0] ** 2 for f in (fit, raw)]
     bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors[0]
-    assert np.sqrt(square[0] / 40) < 1.3 * bound < np.sqrt(square[1] / 40)
+    assert np.sqrt(square[0] / 25) < 1.2 * bound < np.sqrt(square[1] / 25)
 
 
 def test_without_variances_the_misfit_tells(small):
