@@ -35,8 +35,9 @@ import hybridjax as hj
 HARMONICS = (-2, -1, 0, 1, 2)
 N = 32
 STEPS = ("crest", "leakage", "periodic", "unknown", "coverage")
+SEED = {"isochron": 16 * 10**6, "kinematic": 18 * 10**6}
 # rms of the inputs where distortion is a small and a large part of the variance.
-RMS = {"isochron": (0.005, 1.0), "kinematic": (0.005, 0.2)}
+RMS = {"isochron": (0.005, 2.0), "kinematic": (0.005, 0.6, 0.2)}
 
 
 class Family:
@@ -118,37 +119,44 @@ def leakage(family: Family) -> None:
         family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
 
 
-def coverage(family: Family, rms: float, runs: int) -> None:
+def coverage(family: Family, rms: float, runs: int, seed: int) -> None:
     design = hj.multisine(periods=32, seed=1).scaled(rms)
-    chosen = design.frequencies[np.linspace(0, len(design.frequencies) - 1, 10).astype(int)]
+    f = design.frequencies
+    chosen = [f[np.argmin(np.abs(f - x))] for x in np.geomspace(0.06, 9.9, 10)]
 
     def chunk(count, seed):
         return family.run(design.realisations(count, seed), start="periodic", discard=32)
 
-    truth = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), (-1, 0, 1))
+    truth = hj.estimate_htf((chunk(100, seed + 10**5 + k) for k in range(20)), (-1, 0, 1))
     truth = np.asarray(truth.at(chosen).H)
     hits, variances, each, part = np.zeros(truth.shape), [], 4, 25
     for first in range(0, runs, part):
-        data = chunk(each * part, first)
+        data = chunk(each * part, seed + first)
         size = each * design.experiments
         for k in range(part):
             rows = slice(k * size, (k + 1) * size)
             one = hj.ExperimentData(
                 data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
             )
-            noisy = hj.add_noise(one, snr=20, seed=first + k)
+            noisy = hj.add_noise(one, snr=20, seed=seed + first + k)
             estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
-            hits = hits + (np.abs(np.asarray(estimate.H) - truth) <= estimate.confidence_radius())
-            variances.append((estimate.variance, estimate.noise_variance))
+            error = np.abs(np.asarray(estimate.H) - truth)
+            hits += error <= np.asarray(estimate.confidence_radius())
+            variances.append(np.stack([estimate.variance, estimate.noise_variance]))
     exact = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H)
     name = f"coverage.{rms}"
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
     family.show(f"{name}.mean", hits.mean() / runs)
     family.show(f"{name}.least", hits.min() / runs)
+    m, i, k, _ = np.unravel_index(np.argmin(hits), hits.shape)
+    worst = (m, i, k, 0)
+    print(f"# least: H_{m - 1} of {OUTPUTS[k]} at f = {chosen[i]}", flush=True)
     family.show(f"{name}.most", hits.max() / runs)
     family.show(f"{name}.p", min(tests.min() * tests.size, 1.0))
     total, noise = np.mean(variances, axis=0)
-    family.show(f"{name}.distortion", np.mean(1 - noise / total))
+    family.show(f"{name}.distortion.mean", np.mean(1 - noise / total))
+    family.show(f"{name}.distortion.most", np.max(1 - noise / total))
+    family.show(f"{name}.distortion.least_covered", (1 - noise / total)[worst])
     for k, output in enumerate(OUTPUTS):
         bias = np.abs(truth - exact)[1, :, k].max() / np.abs(exact)[1, :, k].max()
         family.show(f"{name}.bias.H0.{output}", bias)
@@ -170,8 +178,8 @@ def main() -> None:
             if step.__name__ not in options.skip:
                 step(family)
         if "coverage" not in options.skip:
-            for rms in RMS[name]:
-                coverage(family, rms, options.runs)
+            for k, rms in enumerate(RMS[name]):
+                coverage(family, rms, options.runs, SEED[name] + 10**6 * k)
 
 
 if __name__ == "__main__":
