@@ -53,10 +53,10 @@ def remove_transient(
     """Fit the decay of whatever the experiments started with, and subtract it.
 
     Needs no model. The input has the period P over all of the record, which is longer than P
-    periods, by `skip` at least. If it is longer by several (20, say), everything that repeats after P periods is told
-    from the decay, distortion included, and any design will do. With fewer, only the response at
-    lines that are excited is, so that a design is needed that leaves out half of them
-    (`multisine(lines="odd")`).
+    periods, by `skip` at least. If it is longer by several (20, say), everything that repeats after
+    P periods is told from the decay, distortion included, and any design will do. With fewer, only
+    the response at lines that are excited is, so that a design is needed that leaves out half of
+    them (`multisine(lines="odd")`).
 
     **Arguments:**
 
