@@ -127,9 +127,15 @@ AT_REST = {"flap, 12", "flap, 8", "Mathieu, 1"}
 NOT_RIGHT = pytest.mark.xfail(reason="multipliers of a cycle that is rest: 1e-7", strict=True)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=NOT_RIGHT if x in AT_REST else ()) for x in CASES]
-)
+# The others compile for as long again.
+QUICK = {"wheel, 8 spokes", "walker, long gait", "compass gait", "juggler", "buck, 20 V"}
+
+
+def marks(name):
+    return [NOT_RIGHT] * (name in AT_REST) + [pytest.mark.slow] * (name not in QUICK)
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=marks(x)) for x in CASES])
 def test_cycle_and_multipliers(name):
     case = CASES[name]()
     cycle = hj.find_limit_cycle(case.system, case.guess, section=case.section)
@@ -151,6 +157,7 @@ def test_closed_forms():
     np.testing.assert_allclose(multipliers, expected, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_energy_is_conserved_in_running():
     """The whole family of cycles is reported, and not one of them as if it stood alone."""
     runner = m.SLIPRunner()
