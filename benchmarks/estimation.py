@@ -13,7 +13,7 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
   lines that are not excited, by local polynomials (odd lines, all 84 cycles). All 620 lines or odd
   ones.
 - `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
-- `coverage`: 1000 runs at 20 dB, each four realisations of 20 experiments (P = 32, 300 lines) with
+- `coverage`: 1000 runs at 20 dB, each some realisations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % discs of H_0, H_1 and H_-1 at ten fixed frequencies
   hold the best linear approximation, the mean over 2000 realisations without noise. `p`: the
   smallest binomial p-value times the number of tests (60, for each family and amplitude), which is
@@ -36,8 +36,11 @@ HARMONICS = (-2, -1, 0, 1, 2)
 N = 32
 STEPS = ("crest", "leakage", "periodic", "unknown", "coverage")
 SEED = {"isochron": 16 * 10**6, "kinematic": 18 * 10**6}
-# rms of the inputs where distortion is a small and a large part of the variance.
-RMS = {"isochron": (0.005, 2.0), "kinematic": (0.005, 0.6, 0.2)}
+# rms of the inputs where distortion is a small and a large part of the variance, and realisations.
+COVERAGE = {
+    "isochron": ((0.005, 4), (2.0, 4)),
+    "kinematic": ((0.005, 4), (0.6, 4), (0.2, 4), (0.2, 8)),
+}
 
 
 class Family:
@@ -119,7 +122,7 @@ def leakage(family: Family) -> None:
         family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
 
 
-def coverage(family: Family, rms: float, runs: int, seed: int) -> None:
+def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> None:
     design = hj.multisine(periods=32, seed=1).scaled(rms)
     f = design.frequencies
     chosen = [f[np.argmin(np.abs(f - x))] for x in np.geomspace(0.06, 9.9, 10)]
@@ -129,7 +132,7 @@ def coverage(family: Family, rms: float, runs: int, seed: int) -> None:
 
     truth = hj.estimate_htf((chunk(100, seed + 10**5 + k) for k in range(20)), (-1, 0, 1))
     truth = np.asarray(truth.at(chosen).H)
-    hits, variances, each, part = np.zeros(truth.shape), [], 4, 25
+    hits, variances, part = np.zeros(truth.shape), [], 25
     for first in range(0, runs, part):
         data = chunk(each * part, seed + first)
         size = each * design.experiments
@@ -144,7 +147,7 @@ def coverage(family: Family, rms: float, runs: int, seed: int) -> None:
             hits += error <= np.asarray(estimate.confidence_radius())
             variances.append(np.stack([estimate.variance, estimate.noise_variance]))
     exact = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H)
-    name = f"coverage.{rms}"
+    name = f"coverage.{rms}.{each}_realisations"
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
     family.show(f"{name}.mean", hits.mean() / runs)
     family.show(f"{name}.least", hits.min() / runs)
@@ -178,8 +181,8 @@ def main() -> None:
             if step.__name__ not in options.skip:
                 step(family)
         if "coverage" not in options.skip:
-            for k, rms in enumerate(RMS[name]):
-                coverage(family, rms, options.runs, SEED[name] + 10**6 * k)
+            for k, (rms, realisations) in enumerate(COVERAGE[name]):
+                coverage(family, rms, realisations, options.runs, SEED[name] + 10**6 * k)
 
 
 if __name__ == "__main__":
