@@ -1,16 +1,17 @@
-"""Execute paper.py (jupytext's percent format) and write paper.ipynb with its outputs.
+"""Execute the notebooks' sources (jupytext's percent format): NAME.py becomes NAME.ipynb.
 
-pip install jupytext nbclient ipykernel && python notebooks/build.py
+pip install jupytext nbclient ipykernel && python notebooks/build.py [NAME ...]
 """
 
 import pathlib
+import sys
 
 import jupytext
 import nbclient
 import nbformat
 
 
-HERE = pathlib.Path(__file__).parent
+HERE = pathlib.Path(__file__).resolve().parent
 SETUP = """
 get_ipython().run_line_magic("matplotlib", "inline")
 get_ipython().run_line_magic("config", "InlineBackend.print_figure_kwargs = {'dpi': 75}")
@@ -38,4 +39,6 @@ def build(source: pathlib.Path, target: pathlib.Path) -> None:
 
 
 if __name__ == "__main__":
-    build(HERE / "paper.py", HERE / "paper.ipynb")
+    sources = sorted(set(HERE.glob("*.py")) - {pathlib.Path(__file__).resolve()})
+    for name in sys.argv[1:] or [source.stem for source in sources]:
+        build(HERE / f"{name}.py", HERE / f"{name}.ipynb")

@@ -1,4 +1,4 @@
-"""The notebook's source runs, and the executed notebook belongs to it."""
+"""The notebooks' sources run, and the executed notebooks belong to them."""
 
 import json
 import pathlib
@@ -11,6 +11,7 @@ from matplotlib import pyplot
 
 
 NOTEBOOKS = pathlib.Path(__file__).parents[1] / "notebooks"
+NAMES = sorted(path.stem for path in NOTEBOOKS.glob("*.ipynb"))
 
 
 def cells(source):
@@ -20,21 +21,39 @@ def cells(source):
             if "markdown" not in kind]  # fmt: skip
 
 
-def test_the_executed_notebook_has_the_code_of_its_source():
-    notebook = json.loads((NOTEBOOKS / "paper.ipynb").read_text())
+def test_every_source_was_executed():
+    assert NAMES == sorted(path.stem for path in NOTEBOOKS.glob("*.py") if path.stem != "build")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_executed_notebook_has_the_code_of_its_source(name):
+    notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text())
     code = ["".join(c["source"]).strip() for c in notebook["cells"] if c["cell_type"] == "code"]
-    assert code == cells((NOTEBOOKS / "paper.py").read_text())
+    assert code == cells((NOTEBOOKS / f"{name}.py").read_text())
     printed = json.dumps([c.get("outputs") for c in notebook["cells"]])
     assert "Traceback" not in printed and "Warning" not in printed and "stderr" not in printed
 
 
+def paper(found):
+    for fit in found.structured.values():
+        assert fit.compare(found.cycle.multipliers).max_error < 5e-5
+
+
+def strides(found):
+    for fit in (found.fit, found.series):
+        assert fit.contains(found.truth, 0.999).all()
+
+
+CHECKS = {"paper": paper, "strides": strides}
+
+
 @pytest.mark.slow
-def test_the_notebook_runs(monkeypatch):
+@pytest.mark.parametrize("name", NAMES)
+def test_the_notebook_runs(name, monkeypatch):
     """As it is: nearly all of the time goes into compiling, whatever the number of experiments."""
-    code = (NOTEBOOKS / "paper.py").read_text()
-    module = types.ModuleType("notebook")
+    code = (NOTEBOOKS / f"{name}.py").read_text()
+    module = types.ModuleType(name)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec(compile(code, "paper.py", "exec"), vars(module))
+    exec(compile(code, f"{name}.py", "exec"), vars(module))
     pyplot.close("all")
-    for fit in module.structured.values():
-        assert fit.compare(module.cycle.multipliers).max_error < 5e-5
+    CHECKS[name](module)

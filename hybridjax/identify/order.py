@@ -24,7 +24,8 @@ class OrderSelection(eqx.Module):
     - `strength`: the singular value that an order beyond this one would have to explain, in units
       of the noise: 1 where there is nothing left but noise. `deviation`: how many standard
       deviations it lies above 1, and `threshold` what noise alone exceeds in 1 % of cases.
-    - `cost`, `freedom`: the misfit of the best fit, and what it is expected to be.
+    - `cost`, `freedom`: the misfit of the best fit, and what it is expected to be (somewhat more
+      where the variances were estimated).
     - `aic`, `mdl`: Akaike's and Rissanen's criteria, which punish each real coefficient, those of
       the numerators too, by 2 and by the logarithm of the number of data. The smallest is best.
     - `by_rank`, `by_aic`, `by_mdl`: the order that each chooses.
@@ -129,9 +130,10 @@ def select_order(
         freedom[d] = sum(group.freedom * group.data.shape[1] for group in groups) - d
         parameters.append(sum((2 * len(g.lag) - g.freedom) * g.data.shape[1] for g in groups) + d)
     data = int(freedom[0] + parameters[0])
-    likelihood = cost if htf.variance is not None else data * np.log(np.maximum(cost, 1e-300))
+    level, tails = estimated_noise(htf, cost[-1] / freedom[-1])
+    likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
     parameters = np.array(parameters)
-    left = values[::-1]
+    left, spread = values[::-1] / level, tails * spread
     return OrderSelection(
         orders=np.arange(max_order + 1),
         strength=np.sqrt(left),
@@ -163,6 +165,24 @@ def noise_ratios(groups: list[Group], c: Float[np.ndarray, " d"]):
         weight = 1 / np.abs(chi(group.lag, c)) ** 2
         total, square = total + share * weight.sum(), square + share * (weight**2).sum()
     return values, float(np.sqrt(2 * square) / total)
+
+
+def estimated_noise(htf: HTF, misfit: float) -> tuple[float, float]:
+    r"""What noise looks like in units of variances that were themselves estimated.
+
+    With $\nu$ complex degrees of freedom $|\varepsilon|^2 / v$ has Fisher's distribution with 2 and
+    $2 \nu$: its mean is $L = \nu / (\nu - 1)$, its standard deviation $L \sqrt{L / (2 - L)}$.
+    Weights that are pooled have more degrees of freedom than each variance, so that L is taken
+    from the misfit of a fit, as far as $\nu$ allows.
+
+    **Returns:** L, and how much wider than noise of known variance it scatters.
+    """
+    if htf.freedom is None:
+        return 1.0, 1.0
+    freedom = float(np.median(htf.freedom))
+    most = freedom / (freedom - 1) if freedom > 1 else np.inf
+    level = float(np.clip(misfit, 1.0, most))
+    return level, np.sqrt(level / (2 - level)) if level < 2 else np.inf
 
 
 @functools.lru_cache

@@ -22,6 +22,8 @@ class Record(eqx.Module):
     - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
       sample is missing or bad.
     - `sections`: N. `start`: the section of sample 0. `inputs`, `outputs`: names.
+    - `lead`: y[i] may depend on inputs up to `u[i + lead]`: smoothing, or sections that were placed
+      by what came later.
     """
 
     u: Float[np.ndarray, "n nu"]
@@ -30,6 +32,7 @@ class Record(eqx.Module):
     start: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+    lead: int = eqx.field(static=True, default=0)
 
     def __init__(
         self,
@@ -40,6 +43,7 @@ class Record(eqx.Module):
         start: int = 0,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
+        lead: int = 0,
     ):
         """**Raises:** `DefinitionError` for shapes that do not fit together, or infinite values."""
         self.u, self.y = _columns("u", u), _columns("y", y)
@@ -53,7 +57,9 @@ class Record(eqx.Module):
                 f"a record needs sections >= 1 and a start from 0 to sections - 1, not {sections} "
                 f"and {start}."
             )
-        self.sections, self.start = sections, start
+        if lead < 0:
+            raise DefinitionError(f"lead must not be negative, but is {lead}.")
+        self.sections, self.start, self.lead = sections, start, lead
         self.inputs = names("inputs", inputs, self.u.shape[1])
         self.outputs = names("outputs", outputs, self.y.shape[1])
 
@@ -99,19 +105,21 @@ class Pieces(NamedTuple):
     sections: int
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    lead: int
 
 
 def pieces_of(data: Recorded) -> Pieces:
     """All records, cut where an input is unknown. Experiments that failed are left out.
 
-    The output just at an unknown input is not used, since it may feel it directly.
+    The output just at an unknown input is not used, since it may feel it directly, nor are those
+    `lead` samples earlier.
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N or names.
     """
     records = [r for part in _parts(data) for r in _records(part)]
     if not records:
         raise DefinitionError("there is no experiment that ran to its end.")
-    kinds = {(r.sections, r.inputs, r.outputs) for r in records}
+    kinds = {(r.sections, r.inputs, r.outputs, r.lead) for r in records}
     if len(kinds) > 1:
         a, b = sorted(kinds, key=str)[:2]
         raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
@@ -132,6 +140,7 @@ class Layout(NamedTuple):
     """From the first sample of a record to its last."""
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    lead: int
 
 
 def lay_out(data: Recorded) -> Layout:
@@ -139,7 +148,7 @@ def lay_out(data: Recorded) -> Layout:
 
     **Raises:** `DefinitionError` as `pieces_of`.
     """
-    pieces, N, inputs, outputs = pieces_of(data)
+    pieces, N, inputs, outputs, lead = pieces_of(data)
     T = max(-(-(first + len(u)) // N) for first, u, _ in pieces)
     U = np.zeros((len(pieces), T * N, len(inputs)))
     Y = np.full((len(pieces), T * N, len(outputs)), np.nan)
@@ -151,7 +160,7 @@ def lay_out(data: Recorded) -> Layout:
     def cycles(x):
         return x.reshape(len(pieces), T, N, *x.shape[2:])
 
-    return Layout(cycles(U), cycles(Y), cycles(inside), inputs, outputs)
+    return Layout(cycles(U), cycles(Y), cycles(inside), inputs, outputs, lead)
 
 
 def _parts(data: Recorded) -> list[ExperimentData | Record]:
@@ -170,4 +179,6 @@ def _cut(record: Record):
     edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
     for first, last in edges.reshape(-1, 2):
         start = int(record.start + first) % record.sections
-        yield Piece(start, record.u[first:last], record.y[first:last])
+        y = record.y[first:last].copy()
+        y[max(len(y) - record.lead, 0) :] = np.nan
+        yield Piece(start, record.u[first:last], y)

@@ -33,7 +33,8 @@ class Problem(NamedTuple):
     first: Int[np.ndarray, "S N"]
     """The cycle in which a record first meets a section."""
     lags: int
-    """R: numerators have the lags 0..R-1."""
+    """R: numerators have the lags -lead..R-1-lead."""
+    lead: int
     free: int
     """K: the cycles at the start of each record in which g is free."""
     maps: list[Float[np.ndarray, "columns r"]]
@@ -43,14 +44,14 @@ class Problem(NamedTuple):
 
 def set_up(layout: Layout, order: int, overhang: int, rest: bool) -> Problem:
     N = layout.y.shape[2]
-    lags = order * N + overhang + 1
+    lags = layout.lead + order * N + overhang + 1
     free = 0 if rest else order + -(-overhang // N)
     good, first = np.isfinite(layout.y), np.argmax(layout.inside, axis=1)
     cycle = np.arange(layout.y.shape[1])
     maps = []
     for n in range(N):
         tells = good[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
-        rows = lagged(layout.u, n, lags)[tells]
+        rows = lagged(layout.u, n, lags, layout.lead)[tells]
         _, s, vh = np.linalg.svd(rows, full_matrices=False)
         kept = s > _RANK * s.max(initial=0)
         maps.append(vh[kept].T / s[kept])
@@ -61,6 +62,7 @@ def set_up(layout: Layout, order: int, overhang: int, rest: bool) -> Problem:
         good,
         first,
         lags,
+        layout.lead,
         free,
         maps,
         scale,
@@ -72,11 +74,13 @@ def rescale(problem: Problem, noise: Float[np.ndarray, " ny"]) -> Problem:
     return problem._replace(y=problem.y / noise, scale=problem.scale * noise)
 
 
-def lagged(u: Float[np.ndarray, "S T N nu"], n: int, lags: int) -> Float[np.ndarray, "S T columns"]:
-    """u[pN + n - r] for all cycles p, zero before the start; the lag r varies slowest."""
+def lagged(
+    u: Float[np.ndarray, "S T N nu"], n: int, lags: int, lead: int
+) -> Float[np.ndarray, "S T columns"]:
+    """u[pN + n - r] for all cycles p and lags r = -lead, ..., which vary slowest; zero outside."""
     S, T, N, nu = u.shape
-    before = np.zeros((S, lags - 1, nu))
-    row = np.concatenate([before, u.reshape(S, T * N, nu)], axis=1)
+    before, after = np.zeros((S, lags - 1 - lead, nu)), np.zeros((S, lead, nu))
+    row = np.concatenate([before, u.reshape(S, T * N, nu), after], axis=1)
     windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)[:, n::N]
     return windows[..., ::-1].swapaxes(2, 3).reshape(S, T, lags * nu)
 
@@ -161,7 +165,7 @@ def linearise(
     b, slope = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
     v = along_cycles(c, problem.u)
     for n in range(N):
-        V = lagged(v, n, problem.lags) @ problem.maps[n]
+        V = lagged(v, n, problem.lags, problem.lead) @ problem.maps[n]
         E = _starts(problem, c, n)
         regression = None
         for i in range(ny):
@@ -205,7 +209,7 @@ def delayed_outputs(problem: Problem, order: int) -> Delayed:
     gram, freedom = np.zeros((order + 1, order + 1)), 0
     cycle = np.arange(T)[:, None]
     for n in range(N):
-        V = lagged(problem.u, n, problem.lags) @ problem.maps[n]
+        V = lagged(problem.u, n, problem.lags, problem.lead) @ problem.maps[n]
         known = (cycle >= problem.first[:, n] + problem.free).T
         for i in range(ny):
             good, y = problem.good[:, :, n, i], problem.y[:, :, n, i]

@@ -51,7 +51,8 @@ class SeriesFit(MultiplierEstimate):
     - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
     - `noise` (ny,): standard deviation of what the model does not explain.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
-    - `sections`, `inputs`, `outputs`.
+    - `sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, where the
+      records say so.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -66,18 +67,19 @@ class SeriesFit(MultiplierEstimate):
     sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+    lead: int = eqx.field(static=True, default=0)
 
     def impulse_response(self, n_lags: int) -> Float[np.ndarray, "N lags ny nu"]:
         """Markov parameters: the response at section n to a unit input r sections earlier."""
         if n_lags < 1:
             raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
         N, R = self.numerators.shape[:2]
-        h = np.zeros((N, max(n_lags, R), *self.numerators.shape[2:]))
+        h = np.zeros((N, max(self.lead + n_lags, R), *self.numerators.shape[2:]))
         h[:, :R] = self.numerators
         for r in range(N, h.shape[1]):
             for j, c in enumerate(self.coefficients[: r // N], 1):
                 h[:, r] -= c * h[:, r - j * N]
-        return h[:, :n_lags]
+        return h[:, self.lead : self.lead + n_lags]
 
     def htf(self, f: Any, harmonics: int | Sequence[int] | None = None) -> HTF:
         r"""The harmonic transfer functions at frequencies f (cycles per period), with variances.
@@ -88,7 +90,7 @@ class SeriesFit(MultiplierEstimate):
         f = np.atleast_1d(np.asarray(f, float))
         harmonics = check_harmonics(harmonics, self.sections)
         N, R, ny, nu = self.numerators.shape
-        powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(R))
+        powers = np.exp(-2j * np.pi / N * f[:, None] * (np.arange(R) - self.lead))
         lag = np.exp(-2j * np.pi * f)
         below = chi(lag, self.coefficients)
         n = np.arange(N)
@@ -199,6 +201,7 @@ def fit_series(
         sections=N,
         inputs=layout.inputs,
         outputs=layout.outputs,
+        lead=layout.lead,
     )
 
 

@@ -15,7 +15,7 @@ from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
 from .likelihood import maximum_likelihood, noise_levels, summarize
-from .order import noise_ratios, refuse_invented
+from .order import estimated_noise, noise_ratios, refuse_invented
 from .projection import chi, groups_of, numerators
 from .values import check_freedom, check_values, weights_of
 
@@ -158,9 +158,11 @@ def fit_multipliers(
         noise = np.maximum(noise_levels(groups, c, len(rms)), 1e-15)
         groups = groups_of(htf, weights_of(htf, rms * noise), unknowns)
         c, converged = maximum_likelihood(groups, order, max_steps, c)
-    if check:
-        refuse_invented(*noise_ratios(groups, np.zeros(order)))
     summary = summarize(groups, c, errors)
+    if check:
+        level, tails = estimated_noise(htf, summary.cost / summary.freedom)
+        values, spread = noise_ratios(groups, np.zeros(order))
+        refuse_invented(values / level, tails * spread)
 
     B = np.zeros((len(htf.harmonics), unknowns, len(htf.outputs), len(htf.inputs)), complex)
     for group in groups:

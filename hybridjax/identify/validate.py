@@ -111,7 +111,7 @@ def validate(
     """
     if not 0 < level < 1:
         raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
-    pieces, N, inputs, outputs = pieces_of(data)
+    pieces, N, inputs, outputs, _ = pieces_of(data)
     check_model(model, N, inputs, outputs)
     simulated = [simulate_piece(model, piece, start == "free") for piece in pieces]
     seen = np.concatenate([np.isfinite(p.y) for p in pieces])

@@ -43,6 +43,25 @@ def test_the_level_of_the_rank_test(small, variance):
     hj.fit_multipliers(data, 3, check=False)
 
 
+@pytest.mark.parametrize("freedom", [3.0, 8.0])
+def test_variances_from_few_realisations(freedom, small, variance):
+    """They make noise look larger than it is, and its tails longer; not like more multipliers."""
+    _, htf = small
+    runs, wrong, refused = 12, 0, 0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        data = noisy(htf, variance, rng)
+        rough = variance * rng.gamma(freedom, 1 / freedom, variance.shape)
+        data = with_variance(htf, data.H, rough, np.full(80, freedom))
+        found = hj.select_order(data, 4, max_steps=5)
+        wrong += found.by_rank != 2
+        try:
+            hj.fit_multipliers(data, 3, max_steps=5)
+        except hj.DefinitionError:
+            refused += 1
+    assert covered(runs - wrong, runs, 0.99) and covered(refused, runs, 0.98)
+
+
 def test_what_noise_hides_is_not_reported(small, variance):
     _, htf = small
     with pytest.raises(hj.DefinitionError, match="the data carry [01] multipliers, not 2"):
