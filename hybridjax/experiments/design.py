@@ -295,21 +295,23 @@ class Design(eqx.Module):
         f, sizes = self.frequencies, np.bincount(self.experiment)
         crest, per = self.crest_factors(), self.expected_variance()
         per, M = per[np.isfinite(per)], self.highest_harmonic
-        assumed = "" if M is None else f", assuming that H_m = 0 for |m| > {M}"
-        return (
-            f"Design({_count(self.experiments, 'experiment')}, {len(f)} frequencies "
-            f"{_span(f)} cycles per period in steps of 1/{self.periods}, "
-            f"{_count(_span(sizes), 'cosine')} each of amplitude {_span(self.amplitude)}, "
-            f"crest factor {_span(crest)}{assumed}, N = {self.sections}, "
-            f"P = {self.periods} periods, "
-            f"inputs = {', '.join(self.input_names)}; {self.cycles(0)} cycles without those "
-            f"discarded; output noise of std s gives each H_m a std of {_span(np.sqrt(per))} s)"
-        )
+        rows = [
+            f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
+            f"{self.sections} sections, inputs {', '.join(self.input_names)})",
+            f"  frequencies  {len(f)}, {_span(f)} cycles per period in steps of 1/{self.periods}",
+            f"  each         {_count(_span(sizes), 'cosine')} of amplitude {_span(self.amplitude)}"
+            f", crest factor {_span(crest)}",
+            f"  cost         {self.cycles(0)} cycles, without those discarded",
+            f"  noise        of std s in an output gives H_m a std of {_span(np.sqrt(per))} s",
+        ]
+        if M is not None:
+            rows.append(f"  assumes      H_m = 0 for |m| > {M}")
+        return "\n".join(rows)
 
 
 def _span(values: np.ndarray) -> str:
-    low, high = float(np.min(values)), float(np.max(values))
-    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+    low, high = f"{float(np.min(values)):.4g}", f"{float(np.max(values)):.4g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _count(number: int | str, noun: str) -> str:

@@ -62,7 +62,7 @@ def test_few_experiments_on_the_hopper(hopper):
     assert [counts[M] for M in (0, 1, 2, 6, 7)] == [1, 3, 5, 13, 15]
     assert counts[8] == counts[9] == counts[10] == 20
     design = hj.multisine(highest_harmonic=2)
-    assert "assuming that H_m = 0 for |m| > 2" in repr(design)
+    assert "assumes      H_m = 0 for |m| > 2" in repr(design)
     leakage = hj.predict_leakage(design, hopper, (0,))
     assert np.all((leakage > 1e-5) & (leakage < 5e-3))
     htf = hopper.htf(design.frequencies, range(-15, 16))
