@@ -79,7 +79,7 @@ def test_the_numbers_of_the_paper():
     assert set(np.bincount(smallest.experiment)) == {31}
     assert (len(both.frequencies), both.experiments) == (641, 21)
     assert paper.cycles() == 80 * 84
-    assert "80 experiments, 620 frequencies" in repr(paper)
+    assert "80 experiments of 64 periods" in repr(paper) and "620, 0.01562" in repr(paper)
     with pytest.raises(hj.DefinitionError, match="need at least 20"):
         hj.multisine(experiments=19)
 
