@@ -24,6 +24,9 @@ _BEND = 2e-3
 _SHORT = 0.25
 # and if the last correction is at most this fraction of the way from the step's start.
 _FINE = 1e-6
+# The error of a derivative is seen by a step that starts aside, by this part of the state's size in
+# a direction that no system is made for.
+_ASIDE = 1e-4
 
 
 class Attempt(NamedTuple):
@@ -71,11 +74,13 @@ def attempt(
     span: Float[Array, " L"],
     unroll: bool,
     in_step: bool,
+    tangents: bool,
 ) -> Attempt:
     """Let the lanes of `mask` step, and land those that come close to the zero they aim at.
 
     With `in_step`, all lanes are thought to go equally far from the same time, to no zero; then
-    what depends on time only is computed once.
+    what depends on time only is computed once. With `tangents`, errors are also those of a
+    derivative: where the state rests, it has none of its own.
     """
     L = lanes.t.shape[0]
     zero, no, yes = jnp.zeros(L), jnp.zeros(L, bool), jnp.ones(L, bool)
@@ -95,6 +100,14 @@ def attempt(
         )
         tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
+        if tangents:
+            aside = _ASIDE * jnp.cos(1.0 + jnp.arange(n))[:, None] * tolerance / rtol
+            field = chart_field(s, a, uu)
+            near = jax.lax.cond(
+                some, lambda: rk_step(field, t, q + aside, tau, unroll).error, lambda: q
+            )
+            change = jnp.max(jnp.abs(near - step.error) / tolerance, axis=0, initial=0.0) / _ASIDE
+            error = jnp.maximum(error, jnp.where(jnp.isfinite(change), change, 0.0))
         finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
         error = jnp.where(finite, error, jnp.inf)
         if not watched(s, a, target):

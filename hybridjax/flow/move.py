@@ -43,6 +43,7 @@ class _How(NamedTuple):
     tape: bool
     glide: bool
     new_input: bool
+    tangents: bool
 
 
 def move(
@@ -64,7 +65,7 @@ def move(
     `setout` is the first step, or a `Stride`: then one step is thought to be enough for most.
     With `new_input`, the guards are armed anew; otherwise the lanes go on as they are.
     """
-    how = _How(False, isinstance(setout, Stride), new_input)
+    how = _How(False, isinstance(setout, Stride), new_input, False)
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     return _move(system, lanes, u, target, setout, result, settings, how)
 
@@ -78,11 +79,15 @@ def record(
     setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
     new_input: bool = True,
+    tangents: bool = False,
 ) -> tuple[Moved, Tape]:
-    """As `move`, with a record of every step, and without derivatives."""
+    """As `move`, with a record of every step, and without derivatives.
+
+    With `tangents`, steps are short enough for the derivatives, too, that a replay will have.
+    """
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     arguments = system, lanes, u, target, setout, result
-    return _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input))
+    return _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input, tangents))
 
 
 def follow(
@@ -143,7 +148,8 @@ def _move(system, lanes, u, target, setout, result, settings, how: _How):
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
-    moved, tape = record(system, lanes, u, target, settings, setout, result, how.new_input)
+    go = system, lanes, u, target, settings, setout, result, how.new_input
+    moved, tape = record(*go, tangents=not how.glide)
 
     def ends(lane, common):
         (t, q, u, time), (system, levels) = lane, common

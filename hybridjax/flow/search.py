@@ -60,12 +60,14 @@ def search(
     tape: bool,
     glide: bool,
     new_input: bool,
+    tangents: bool,
 ) -> tuple[Moved, Tape | None]:
     """Flow every lane to its target, or to a result code that says why not.
 
     Lanes whose `result` is not OK at the start stay where they are. With `glide`, one step of all
     lanes is tried first: if it brings all of them home, nothing else is done. With `new_input`,
-    guards are armed for the input u, which may have jumped.
+    guards are armed for the input u, which may have jumped. With `tangents`, steps are also short
+    enough for the derivatives of a replay.
     """
     L = lanes.t.shape[0]
     finite = jnp.isfinite(lanes.t) & jnp.isfinite(lanes.q).all(axis=0) & jnp.isfinite(u).all(axis=0)
@@ -94,7 +96,7 @@ def search(
         aim, way = take_aim(s, state, active(state), target, stride)
         ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
         here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
-        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll, in_step)
+        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll, in_step, tangents)
         calm = new.calm & (new.error <= stride.slack) & ~state.approach.on & (way.schedule < 0)
         calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
         return calm, aim, way, new

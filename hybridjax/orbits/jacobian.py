@@ -36,7 +36,7 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
-    moved, tape = record(system, lanes, zero, target, settings, h, result, new_input)
+    moved, tape = record(system, lanes, zero, target, settings, h, result, new_input, True)
     columns, end = _push(system, lanes, target, tape, of_states)
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
     return columns.transpose(2, 1, 0), moved, tape

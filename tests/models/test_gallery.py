@@ -122,17 +122,12 @@ CASES = {
 }  # fmt: skip
 
 
-# At rest the states have no errors, so that the steps are as long as they may be.
-AT_REST = {"flap, 12", "flap, 8", "Mathieu, 1"}
-NOT_RIGHT = pytest.mark.xfail(reason="multipliers of a cycle that is rest: 1e-7", strict=True)
-
-
 # The others compile for as long again.
 QUICK = {"wheel, 8 spokes", "walker, long gait", "compass gait", "juggler", "buck, 20 V"}
 
 
 def marks(name):
-    return [NOT_RIGHT] * (name in AT_REST) + [pytest.mark.slow] * (name not in QUICK)
+    return [pytest.mark.slow] * (name not in QUICK)
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=marks(x)) for x in CASES])
