@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
+from ..systems.output import Output
 from ..systems.system import Guess, HybridSystem, parameter
 from ..systems.transition import Transition
 
@@ -40,8 +41,9 @@ class SLIPRunner(HybridSystem):
 
     States: height `y` and speeds `vx`, `vy`; in stance also `x`, the place of the mass relative to
     the foot. (In flight the place does not matter and is left out, so that a step is a cycle.)
-    Input `u` is added to the angle of attack. Energy is conserved: one multiplier is exactly 1, and
-    cycles come in families, one for each energy.
+    Input `u` is added to the angle of attack. Energy is conserved (output `energy`): one multiplier
+    is exactly 1, and cycles come in families, one for each energy:
+    `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.
     """
 
     m: Float[Array, ""] = parameter(80.0, unit="kg", doc="mass")
@@ -50,10 +52,14 @@ class SLIPRunner(HybridSystem):
     g: Float[Array, ""] = parameter(9.81, unit="m/s^2", doc="gravity")
     angle: Float[Array, ""] = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
-    def energy(self, q):
-        """Energy in flight."""
-        y, vx, vy = q
-        return self.m * (self.g * y + (vx**2 + vy**2) / 2)
+    def energy(self, t, q, u):
+        """Energy of the mass, and in stance of the spring."""
+        *x, y, vx, vy = q
+        spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0
+        return self.m * (self.g * y + (vx**2 + vy**2) / 2) + spring
+
+    def outputs(self):
+        return (Output("energy", self.energy),)
 
     def charts(self):
         return {"flight": Flight(self), "stance": Stance(self)}

@@ -1,6 +1,6 @@
 """Limit cycles: fixed points of the return map, by Newton with its exact Jacobian."""
 
-import dataclasses
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -9,32 +9,19 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..flow.events import start_lanes
 from ..flow.lanes import Lanes
-from ..flow.move import Settings, move
-from ..flow.sections import AtEvent, Crossing, ListLevels
-from ..flow.target import toward
+from ..flow.move import Settings
+from ..flow.sections import AtEvent, Crossing
 from ..flow.trajectory import Trajectory, simulate
 from ..periodic.multipliers import product_eigenvalues
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
-from ..systems.transition import Scheduled
-from .return_map import solve
-
-
-class _Plane(eqx.Module):
-    """The hyperplane through a point, across the flow."""
-
-    point: Array
-    normal: Array
-
-    def __call__(self, t, q):
-        return jnp.dot(q - self.point, self.normal)
+from .begin import begin
+from .return_map import ReturnMap, solve
 
 
 class LimitCycle(eqx.Module):
@@ -42,7 +29,7 @@ class LimitCycle(eqx.Module):
 
     **Fields:**
 
-    - `period`: in the system's unit of time.
+    - `period`: in the system's unit of time; of all its `turns`.
     - `start`: the state at which it is anchored, on the section `base` (a clock section at
         `start.t` if `base` is `None`).
     - `legs`: states at the beginnings of the pieces into which the turn is cut.
@@ -52,6 +39,8 @@ class LimitCycle(eqx.Module):
     - `iterations`: Newton steps taken.
     - `result`: a `Result` code.
     - `settings`: accuracy of the flow.
+    - `conserved`: values of conserved quantities that were asked for, by name.
+    - `turns`: periods of the clock, or meetings with the section, in one period of the cycle.
     """
 
     system: HybridSystem
@@ -67,6 +56,8 @@ class LimitCycle(eqx.Module):
     order: tuple[int, ...] = eqx.field(static=True)
     """Transitions of one turn, in order, from the start."""
     settings: Settings
+    conserved: dict[str, Float[Array, ""]]
+    turns: int = eqx.field(static=True)
 
     @property
     def clocked(self) -> bool:
@@ -78,19 +69,26 @@ class LimitCycle(eqx.Module):
         """The non-zero Floquet multipliers, the largest first (on the host).
 
         Computed from the factors without forming their product, so that small ones are right
-        too; zeros that stem from resets and sections are counted by rank and left out.
+        too; zeros that stem from resets and sections are counted by rank and left out. Each
+        conserved quantity that the cycle was chosen by stands for a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
         dims = np.asarray(self.dims)
         factors = np.asarray(self.factors)
         after = np.roll(dims, -1)
         blocks = [f[: after[n], : dims[n]] for n, f in enumerate(factors)]
-        return product_eigenvalues(blocks, rtol=1e-9)
+        values = product_eigenvalues(blocks, rtol=1e-9)
+        for _ in self.conserved:
+            left = np.where(values == 1, np.inf, np.abs(values - 1))
+            values[np.argmin(left)] = 1
+        return values[np.argsort(-np.abs(values), kind="stable")]
 
     @property
     def stable(self) -> bool:
-        """Whether all multipliers lie inside the unit circle."""
-        return bool(np.all(np.abs(self.multipliers) < 1))
+        """Whether all multipliers lie inside the unit circle, but for those of exactly 1 that
+        stand for conserved quantities."""
+        inside = np.abs(self.multipliers) < 1
+        return bool(np.sum(inside) == len(inside) - len(self.conserved))
 
     @property
     def state(self) -> dict[str, float]:
@@ -120,6 +118,8 @@ class LimitCycle(eqx.Module):
         events = ", ".join(names[g] for g in self.order) or "none"
         state = ", ".join(f"{k} = {v:.9g}" for k, v in self.state.items())
         multipliers = ", ".join(_format(z) for z in self.multipliers) or "none but zero"
+        if self.conserved:
+            multipliers += f" (1: conserved {', '.join(self.conserved)})"
         return (
             f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
             f"  period       {float(self.period):.12g}\n"
@@ -147,6 +147,8 @@ def find_limit_cycle(
     guess: Guess | LimitCycle | None = None,
     *,
     section: Crossing | AtEvent | None = None,
+    turns: int | None = None,
+    conserved: Mapping[str, ArrayLike] | None = None,
     settle: ArrayLike = 0.0,
     max_period: ArrayLike = 100.0,
     settings: Settings | None = None,
@@ -168,6 +170,11 @@ def find_limit_cycle(
         "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
         flow. Newton starts at the guess if it lies on the section, else where the flow from the
         guess first meets it.
+    - `turns`: periods of the clock, or returns to the section, until the cycle closes: 2 for the
+        cycle that a period doubling leaves behind. By default 1, or the guess's.
+    - `conserved`: the values at which conserved quantities are wanted, by the names of outputs,
+        e.g. `{"energy": 1784.8}`. Cycles then come in families, with a multiplier of exactly 1 for
+        each quantity, and this picks one of them. By default none, or the guess's.
     - `settle`: time to simulate before Newton begins, so that transients die out (the paper
         takes 60 s). No help where the cycle is unstable.
     - `max_period`: for autonomous systems: give up if no return is seen in this time.
@@ -177,7 +184,7 @@ def find_limit_cycle(
     **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
     found: no convergence, an event or section that does not come, grazing, an equilibrium in
     place of a cycle, or a singular J - I (there is a whole family of cycles, from a conserved
-    quantity or a symmetry).
+    quantity or a symmetry; see `conserved`).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
@@ -192,20 +199,31 @@ def find_limit_cycle(
     if isinstance(guess, LimitCycle):
         base = guess.base if section is None else section
         start, expected, order = guess.start, guess.period, guess.order
+        if turns not in (None, guess.turns):
+            raise DefinitionError(
+                f"the guess closes after {guess.turns} turns, not {turns}: give a Guess."
+            )
+        turns = guess.turns
+        conserved = guess.conserved if conserved is None else conserved
     elif traced:
         raise DefinitionError(
             "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
             "one outside, and pass it as `guess`."
         )
     else:
-        start, base, expected = _prepare(system, guess, section, settle, max_period, settings)
+        turns = 1 if turns is None else turns
+        start, base, expected = begin(system, guess, section, turns, settle, max_period, settings)
         order = None
     if clocked:
-        expected = jnp.asarray(system.period(), float)
-    solution = solve(system, start, base, expected, settings, False, traced)
+        expected = turns * jnp.asarray(system.period(), float)
+    conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
+    if not traced:
+        _check_values(system, start, conserved)
+    kind = ReturnMap(base, conserved, turns)
+    solution = solve(system, start, kind, expected, settings, False, traced)
     if not traced and int(solution[-1]) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
-        second = solve(system, start, base, expected, settings, True, False, 64)
+        second = solve(system, start, kind, expected, settings, True, False, 64)
         solution = second if int(second[-1]) == Result.OK else solution
     start, period, factors, seen, steps, result = solution
     if not traced:
@@ -213,13 +231,42 @@ def find_limit_cycle(
     dims = jnp.array(Structure(system).dims)[seen.legs.chart]
     cycle = LimitCycle(
         system, base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
-        order, settings,
+        order, settings, conserved, turns,
     )  # fmt: skip
     if not traced and int(result) in (Result.OK, Result.SINGULAR):
         _check_clock(cycle)
+        _check_conserved(cycle)
     if not traced and throw and (code := Result(int(result))) != Result.OK:
         raise ComputationError(_explain(cycle, code))
     return cycle
+
+
+def _check_values(system: HybridSystem, start: Lanes, conserved) -> None:
+    s = Structure(system)
+    s.resolve_outputs(tuple(conserved)).require(int(start.chart[0]))
+    for name, value in conserved.items():
+        if value.shape != () or not np.isfinite(value):
+            raise DefinitionError(f"the conserved '{name}' must be one finite number; got {value}.")
+
+
+def _check_conserved(cycle: LimitCycle) -> None:
+    """Raise where a quantity that should be conserved is not: its gradient is then no left
+    eigenvector of the monodromy."""
+    s = Structure(cycle.system)
+    a, t = int(cycle.start.chart[0]), cycle.start.t[0]
+    q, u = cycle.start.q[: s.dims[a], 0], jnp.zeros(s.nu)
+    monodromy = np.eye(s.d)
+    for factor in np.asarray(cycle.factors):
+        monodromy = factor @ monodromy
+    outputs = s.resolve_outputs(tuple(cycle.conserved))
+    gradients = np.asarray(jax.jacfwd(lambda q: outputs(a, t, q, u))(q))
+    for name, gradient in zip(outputs.names, gradients, strict=True):
+        after = gradient @ monodromy[: s.dims[a], : s.dims[a]]
+        if not np.allclose(after, gradient, rtol=0, atol=1e-6 * np.max(np.abs(gradient))):
+            raise DefinitionError(
+                f"'{name}' is not conserved by {type(cycle.system).__name__}: neighbours of the "
+                "cycle change it in one turn. Leave it out of `conserved`."
+            )
 
 
 def _check_clock(cycle: LimitCycle) -> None:
@@ -247,125 +294,22 @@ def _check_clock(cycle: LimitCycle) -> None:
             )
 
 
-def _prepare(system, guess, section, settle, max_period, settings):
-    """Start state, base section and expected period, from a guess."""
-    s = Structure(system)
-    guess = system.guess() if guess is None else guess
-    if not isinstance(guess, Guess | None):
-        raise DefinitionError(
-            f"the guess is a Guess(chart, state) or a LimitCycle, not {type(guess).__name__}."
-        )
-    if guess is None:
-        raise DefinitionError(
-            f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
-        )
-    a = s.chart_index(guess.chart)
-    if guess.state.shape != (s.dims[a],) or not np.all(np.isfinite(guess.state)):
-        raise DefinitionError(
-            f"the guess must give finite values for the {s.dims[a]} states "
-            f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
-        )
-    if not np.isfinite(guess.time):
-        raise DefinitionError(f"the guess's time must be finite; got {guess.time}.")
-    for name, value in (("settle", settle), ("max_period", max_period)):
-        if not (np.isfinite(value) and value >= 0):
-            raise DefinitionError(f"{name} must be a finite time, not negative; got {value}.")
-    period = system.period()
-    if period is not None and not (np.isfinite(period) and period > 0):
-        raise DefinitionError(f"the clock's period must be positive; it is {period}.")
-    for transition in s.transitions:
-        if isinstance(transition.guard, Scheduled):
-            ratio = np.inf if period is None else float(period / transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < 1e-6:
-                raise DefinitionError(
-                    f"the schedule of '{transition.name}' must divide the clock's period, which is "
-                    f"{period}: otherwise no turn is like the last one."
-                )
-    if period is not None and section is not None:
-        raise DefinitionError(
-            "a clocked system returns to itself after its clock's period: leave out `section` "
-            "(sections of any kind are for linearize and run_experiments)."
-        )
-    if section is not None:
-        section.check(s)
-    q = jnp.zeros((s.d, 1)).at[: s.dims[a], 0].set(guess.state)
-    lanes = start_lanes(s, guess.time[None], jnp.array([a], jnp.int32), q)
-    if settle:
-        turns = float(settle) if period is None else np.ceil(settle / period) * float(period)
-        moved = _go(system, lanes, None, toward(lanes.t + turns, -1, lanes.t + turns), settings)
-        _require(moved, "settling", s)
-        lanes = moved.lanes
-        if period is not None:
-            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - turns)
-    if period is not None:
-        return lanes, None, jnp.asarray(period, float)
-    a = int(lanes.chart[0])
-    t, q = lanes.t[0], lanes.q[: s.dims[a], 0]
-    f = s.field(a, t, q, jnp.zeros(s.nu))
-    if not jnp.any(f != 0):
-        raise ComputationError(
-            f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
-            "moves: start elsewhere."
-        )
-    if section is None:
-        section = Crossing(_Plane(q, f / jnp.linalg.norm(f)), "rising", charts=(s.names[a],))
-    event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
-
-    def next_meeting(lanes, doing):
-        target = toward(jnp.full(1, jnp.inf), event, lanes.t + max_period)
-        moved = _go(system, lanes, section, target, settings)
-        _require(moved, f"{doing} ({section})", s)
-        return moved.lanes
-
-    if not _is_on(section, s, a, t, q, f, max_period):
-        lanes = next_meeting(lanes, "looking for the section")
-    back = next_meeting(lanes, "looking for the return to the section")
-    return lanes, section, back.t[0] - lanes.t[0]
-
-
-def _is_on(section, s: Structure, a: int, t, q, f, span) -> bool:
-    """Whether (t, q) in chart a lies on a section, crossing it the right way."""
-    if isinstance(section, AtEvent) or not section.in_chart(s, a):
-        return False
-    level = lambda t, q: section.level(s, a, t, q)  # noqa: E731
-    value, rate = jax.jvp(level, (t, q), (jnp.ones_like(t), f))
-    return bool((rate < 0) & (jnp.abs(value) <= -1e-9 * span * rate))
-
-
-def _require(moved, doing: str, s: Structure) -> None:
-    result = Result(int(moved.result[0]))
-    if result != Result.OK:
-        lanes = moved.lanes
-        raise ComputationError(
-            f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
-            f"'{s.names[int(lanes.chart[0])]}': {result.message}. Check the guess and the guards "
-            "with `simulate(..., throw=False)`."
-        )
-
-
-@quick_jit
-def _go(system, lanes, section, target, settings):
-    """One lane to a time, or to one section, however many steps it takes."""
-    s = Structure(system)
-    settings = dataclasses.replace(settings, max_steps=1_000_000)
-    if isinstance(section, Crossing):
-        target = dataclasses.replace(target, levels=ListLevels((section,)))
-    return move(system, lanes, jnp.zeros((s.nu, 1)), target, settings)
-
-
 def _explain(cycle: LimitCycle, code: Result) -> str:
     name = type(cycle.system).__name__
     if code == Result.SINGULAR:
         return (
             f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
-            "cycles form a family: a quantity is conserved, or there is a symmetry. Fix that "
-            "quantity in the model, or take the cycle nearest to the guess with `throw=False`."
+            "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
+            "is wanted by the value of the quantity (an output of the system), e.g. "
+            "`conserved={'energy': 1.0}`, or take the one nearest to the guess with `throw=False`."
         )
     reason = code.message
     if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
         reason = "Newton came to a state from where one period ends in another chart"
     elif code == Result.NOT_CONVERGED:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
+        if cycle.conserved:
+            reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
     return (
         f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "
         "if the cycle is stable, e.g. `settle=60 * period`."

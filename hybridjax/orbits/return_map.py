@@ -18,7 +18,7 @@ from .._core.results import Result
 from ..flow.events import arm, start_lanes
 from ..flow.lanes import Lanes
 from ..flow.move import move
-from ..flow.sections import AtEvent, ListLevels
+from ..flow.sections import AtEvent, Crossing, ListLevels
 from ..flow.target import Target, toward, until
 from ..flow.watch import slopes, watch
 from ..systems.structure import Structure
@@ -27,15 +27,39 @@ from .jacobian import flow_jacobian
 
 # Pieces into which one turn is cut: their Jacobians are the factors of the monodromy.
 LEGS = 16
-# An autonomous turn flows freely for this fraction of the expected period, then to the section.
+# An autonomous system flows freely up to this fraction of its last turn, then to the section.
 _FREE = 0.75
 # J - I counts as singular if its smallest singular value is below this.
 _SINGULAR = 1e-7
 
 
+class ReturnMap(eqx.Module):
+    """Which states a cycle comes back to.
+
+    **Fields:**
+
+    - `base`: the section of an autonomous system; `None` for a clocked one, whose section is the
+        phase of the clock at the start.
+    - `conserved`: values of conserved quantities, by the name of the output; they choose one
+        cycle of a family.
+    - `turns`: periods of the clock, or meetings with the section, in one round.
+    """
+
+    base: Crossing | AtEvent | None
+    conserved: dict[str, Float[Array, ""]]
+    turns: int = eqx.field(static=True)
+
+
 @quick_jit
 def solve(
-    system, start: Lanes, base, expected, settings, damped: bool, follow: bool, max_steps: int = 32
+    system,
+    start: Lanes,
+    kind: ReturnMap,
+    expected,
+    settings,
+    damped: bool,
+    follow: bool,
+    max_steps: int = 32,
 ):
     """Newton on the return map, and what it saw in its last turn.
 
@@ -45,26 +69,27 @@ def solve(
     s = Structure(system)
     n = s.d
     valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
-    q, seen, steps = _root(system, start, base, expected, settings, damped, max_steps)
+    q, seen, steps = _root(system, start, kind, expected, settings, damped, max_steps)
     if follow:
-        _, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
-    period = expected if base is None else seen.period
+        _, seen, _ = _turn_with_jacobian(q, system, start, kind, expected, settings)
+    period = expected if kind.base is None else seen.period
     factors = seen.factors
-    if base is not None:
-        factors = _across(s, seen.legs, factors)
+    if kind.base is not None:
+        factors = across(s, seen.legs, factors)
     monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
-    singular = jnp.linalg.svd(monodromy - jnp.diag(valid * 1.0), compute_uv=False)
+    _, hold = held(s, q, start, kind)
+    singular = jnp.linalg.svd(monodromy - jnp.diag(valid * 1.0) - hold, compute_uv=False)
     smallest = jnp.min(jnp.where(jnp.arange(n) < valid.sum(), singular, jnp.inf))
     good = jnp.isfinite(seen.distance) & (seen.distance <= 1e-8 * (1 + jnp.max(jnp.abs(q))))
     code = jnp.where(seen.result == Result.OK, Result.NOT_CONVERGED, seen.result)
     code = jnp.where(good, jnp.where(smallest < _SINGULAR, Result.SINGULAR, Result.OK), code)
-    if base is not None:
+    if kind.base is not None:
         same = seen.legs.chart == start.chart
         apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
-    begin = _begin(s, q, start, base, expected)
-    return begin, period, factors, seen, steps, code.astype(jnp.int32)
+    lanes = departure(s, q, start, kind.base, expected)
+    return lanes, period, factors, seen, steps, code.astype(jnp.int32)
 
 
 class Turn(eqx.Module):
@@ -83,7 +108,7 @@ _SOLVER = lx.SVD(rcond=_SINGULAR)
 
 
 @eqx.filter_custom_jvp
-def _root(system, start, base, expected, settings, damped, max_steps):
+def _root(system, start, kind, expected, settings, damped, max_steps):
     """The state that the return map leaves where it is, what was seen there, and steps taken."""
     if damped:
         solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
@@ -93,7 +118,7 @@ def _root(system, start, base, expected, settings, damped, max_steps):
         lambda q, args: _residual(q, *args, settings),
         solver,
         start.q[:, 0],
-        (system, start, base, expected),
+        (system, start, kind, expected),
         has_aux=True,
         max_steps=max_steps,
         throw=False,
@@ -108,8 +133,8 @@ def _root_jvp(primals, tangents):
     *parameters, settings, _, _ = primals
     q, seen, steps = _root(*primals)
 
-    def residual(system, start, base, expected):
-        return _turn(q, system, start, base, expected, settings, _flow)[0]
+    def residual(system, start, kind, expected):
+        return turn(q, system, start, kind, expected, settings, _flow)[0]
 
     _, by_parameters = eqx.filter_jvp(residual, tuple(parameters), tuple(tangents[:4]))
     jacobian = lx.MatrixLinearOperator(_turn_with_jacobian(q, *parameters, settings)[2])
@@ -119,9 +144,9 @@ def _root_jvp(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def _residual(q, system, start, base, expected, settings):
+def _residual(q, system, start, kind, expected, settings):
     """P(q) - q, and the `Turn`. The Jacobian is that of the turn's legs, computed with it."""
-    residual, seen, _ = _turn_with_jacobian(q, system, start, base, expected, settings)
+    residual, seen, _ = _turn_with_jacobian(q, system, start, kind, expected, settings)
     return residual, seen
 
 
@@ -132,19 +157,20 @@ def _residual_jvp(primals, tangents):
     return (residual, seen), (jacobian @ tangents[0], jax.tree_util.tree_map(lambda _: None, seen))
 
 
-def _turn_with_jacobian(q, system, start, base, expected, settings):
-    residual, end, result, (legs, jacobians, codes) = _turn(
-        q, system, start, base, expected, settings, _flow_with_jacobian
+def _turn_with_jacobian(q, system, start, kind, expected, settings):
+    residual, end, result, (legs, jacobians, codes) = turn(
+        q, system, start, kind, expected, settings, _flow_with_jacobian
     )
     n = q.shape[0]
     factors = jacobians[:, 0, 1 : n + 1]
     valid = jnp.arange(n) < jnp.array(Structure(system).dims)[start.chart[0]]
     monodromy = jax.lax.scan(lambda P, F: (F @ P, None), jnp.eye(n), factors)[0]
     jacobian = jnp.where(valid[:, None], monodromy, 0.0) - jnp.eye(n)
+    off, hold = held(Structure(system), q, start, kind)
+    jacobian = jacobian - hold
     legs = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), legs)
-    seen = Turn(
-        legs, factors, codes[..., 0], end.t[0] - start.t[0], jnp.max(jnp.abs(residual)), result
-    )
+    distance = jnp.max(jnp.abs(residual)) + jnp.max(jnp.abs(off))
+    seen = Turn(legs, factors, codes[..., 0], end.t[0] - start.t[0], distance, result)
     return residual, seen, jacobian
 
 
@@ -160,14 +186,15 @@ def _flow_with_jacobian(system, lanes, target, settings, h, result):
     return moved, (lanes, jacobian, tape.code)
 
 
-def _turn(q, system, start: Lanes, base, expected, settings, flow):
-    """One turn from state q on the base section, leg by leg, each done by `flow`.
+def turn(q, system, start: Lanes, kind: ReturnMap, expected, settings, flow):
+    """One round from state q on the section, leg by leg, each done by `flow`.
 
-    **Returns:** P(q) - q, the lane at the end, its result, and what `flow` returned besides.
+    **Returns:** P(q) - q, less what keeps conserved quantities at their values; the lane at the
+    end, its result, and what `flow` returned besides.
     """
     s = Structure(system)
-    lanes = _begin(s, q, start, base, expected)
-    targets = _leg_targets(s, start.t[0], base, expected)
+    lanes = departure(s, q, start, kind.base, expected)
+    targets = _leg_targets(s, start.t[0], kind, expected)
     each, common = eqx.partition(targets, _per_lane(targets))
 
     def leg(carry, target):
@@ -180,11 +207,12 @@ def _turn(q, system, start: Lanes, base, expected, settings, flow):
     (end, _, result), extra = jax.lax.scan(leg, begin, each)
     valid = jnp.arange(s.d) < jnp.array(s.dims)[start.chart[0]]
     same = (result[0] == Result.OK) & (end.chart[0] == start.chart[0])
-    residual = jnp.where(same, jnp.where(valid, end.q[:, 0], 0.0) - q, jnp.nan)
+    residual = jnp.where(valid, end.q[:, 0], 0.0) - q - held(s, q, start, kind)[0]
+    residual = jnp.where(same, residual, jnp.nan)
     return residual, end, result[0], extra
 
 
-def _begin(s: Structure, q, start: Lanes, base, expected) -> Lanes:
+def departure(s: Structure, q, start: Lanes, base, expected) -> Lanes:
     """The lane at the beginning of a turn: right after an event, that event is not due again."""
     lanes = start_lanes(s, start.t, start.chart, q[:, None])
     u, everywhere = jnp.zeros((s.nu, 1)), jnp.ones(1, bool)
@@ -196,7 +224,29 @@ def _begin(s: Structure, q, start: Lanes, base, expected) -> Lanes:
     return lanes
 
 
-def _across(s: Structure, legs: Lanes, factors):
+def held(s: Structure, q, start: Lanes, kind: ReturnMap):
+    """The step of the state that takes conserved quantities away from their values, as far as
+    they are away, and its derivative (with the direction of the step held fixed).
+
+    Along P(q) - q nothing that is conserved changes, so that P(q) - q and this step can add up to
+    zero only where both are zero; and J - I is regular once the derivative is taken from it.
+    """
+    if not kind.conserved:
+        return jnp.zeros_like(q), jnp.zeros((s.d, s.d))
+    outputs = s.resolve_outputs(tuple(kind.conserved))
+    t, u = start.t[0], jnp.zeros(s.nu)
+    branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
+
+    def excess(q):
+        values = jnp.stack(list(kind.conserved.values()))
+        return jax.lax.switch(start.chart[0], branches, q) - values
+
+    gradient = jax.jacfwd(excess)(q)
+    back = jax.lax.stop_gradient(jnp.linalg.pinv(gradient))
+    return back @ excess(q), back @ gradient
+
+
+def across(s: Structure, legs: Lanes, factors):
     """The factors on the states modulo the direction of the flow.
 
     Along the flow of an autonomous system nothing contracts. Taken out of every factor, that
@@ -215,12 +265,13 @@ def _per_lane(targets):
     return eqx.tree_at(fields, marks, (True,) * 4)
 
 
-def _leg_targets(s: Structure, t0, base, expected) -> Target:
-    """Targets of the pieces of one turn: K - 1 times, then the section the turn began on."""
-    k = jnp.arange(1, LEGS + 1)
+def _leg_targets(s: Structure, t0, kind: ReturnMap, expected) -> Target:
+    """Targets of the pieces of one round: K - 1 times, then the section the round began on."""
+    base, k = kind.base, jnp.arange(1, LEGS + 1)
     if base is None:
         return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
-    time = jnp.where(k < LEGS, t0 + _FREE * expected * k / (LEGS - 1), jnp.inf)
+    free = 1 - (1 - _FREE) / kind.turns
+    time = jnp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), jnp.inf)
     target = toward(time, -1, t0 + 3 * expected)
     last = k == LEGS
     if isinstance(base, AtEvent):

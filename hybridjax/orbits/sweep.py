@@ -21,7 +21,7 @@ from ..flow.target import toward, until
 from ..systems.structure import Structure, check_system
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
-from .return_map import solve
+from .return_map import ReturnMap, solve
 
 
 # Newton steps of a batch, in which all systems wait for the last one.
@@ -37,7 +37,9 @@ class LimitCycles(eqx.Module):
 
     - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`,
         `dims`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
-    - `codes`: the events of one turn, in order, filled up with negative numbers.
+    - `codes`: the events of one period, in order, filled up with negative numbers.
+
+    `base`, `settings`, `conserved` and `turns` are those of every cycle.
     """
 
     systems: HybridSystem
@@ -52,6 +54,8 @@ class LimitCycles(eqx.Module):
     result: Int[np.ndarray, " S"]
     codes: Int[np.ndarray, "S R"]
     settings: Settings
+    conserved: dict[str, Float[Array, ""]]
+    turns: int = eqx.field(static=True)
 
     def __len__(self) -> int:
         return len(self.result)
@@ -65,6 +69,7 @@ class LimitCycles(eqx.Module):
             pick(self.legs), pick(self.factors), pick(self.dims), pick(self.residual),
             pick(self.iterations), pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
+            self.conserved, self.turns,
         )  # fmt: skip
 
     @property
@@ -155,7 +160,7 @@ def find_limit_cycles(
     codes = _ragged(seen.codes.reshape(S, -1))
     return LimitCycles(
         systems, guess.base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
-        codes, settings,
+        codes, settings, guess.conserved, guess.turns,
     )  # fmt: skip
 
 
@@ -198,10 +203,11 @@ def _tile(systems, guess: LimitCycle, settings, settle: Bool[Array, ""]):
     def one(system):
         start, expected, result = guess.start, guess.period, jnp.zeros(1, jnp.int32)
         if guess.clocked:
-            expected = jnp.asarray(system.period(), float)
+            expected = guess.turns * jnp.asarray(system.period(), float)
             start = eqx.tree_at(lambda x: x.t, start, start.t / guess.period * expected)
         start, result = _settled(system, guess.base, start, expected, settle)
-        *found, code = solve(system, start, guess.base, expected, settings, False, False, _NEWTON)
+        kind = ReturnMap(guess.base, guess.conserved, guess.turns)
+        *found, code = solve(system, start, kind, expected, settings, False, False, _NEWTON)
         code = jnp.where(result[0] == Result.OK, code, result[0])
         return *found, code, jnp.array(Structure(system).dims)[found[3].legs.chart]
 
