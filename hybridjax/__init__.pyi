@@ -81,7 +81,9 @@ from .identify.transient import (
 )
 from .identify.validate import Validation as Validation, validate as validate
 from .io import load as load, save as save
+from .orbits.branch import Branch as Branch, BranchEnd as BranchEnd, BranchPoint as BranchPoint
 from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
+from .orbits.follow import follow as follow
 from .orbits.linearize import linearize as linearize
 from .orbits.maps import (
     Arrival as Arrival,

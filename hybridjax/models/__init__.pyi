@@ -2,6 +2,7 @@ from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
 from .buck import BuckConverter as BuckConverter
 from .compass import CompassGait as CompassGait
+from .duffing import Duffing as Duffing
 from .flap import RotorFlap as RotorFlap
 from .hopf import HopfOscillator as HopfOscillator
 from .hopper import VerticalHopper as VerticalHopper

@@ -1,3 +1,4 @@
+from .branch import branch as branch
 from .look import COLORS as COLORS, COLUMN as COLUMN, PAGE as PAGE, save as save, style as style
 from .orbit import cycle as cycle
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
