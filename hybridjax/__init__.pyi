@@ -97,6 +97,7 @@ from .orbits.sweep import (
 )
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
+from .periodic.synthetic import synthetic_ldtp as synthetic_ldtp
 from .store import (
     StoredExperiments as StoredExperiments,
     store_experiments as store_experiments,
