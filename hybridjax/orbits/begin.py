@@ -76,12 +76,12 @@ def begin(system, guess, section, turns, settle, max_period, settings):
     q = jnp.zeros((s.d, 1)).at[: s.dims[a], 0].set(guess.state)
     lanes = start_lanes(s, guess.time[None], jnp.array([a], jnp.int32), q)
     if settle:
-        turns = float(settle) if period is None else np.ceil(settle / period) * float(period)
-        moved = _go(system, lanes, None, toward(lanes.t + turns, -1, lanes.t + turns), settings)
+        wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
+        moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
         _require(moved, "settling", s)
         lanes = moved.lanes
         if period is not None:
-            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - turns)
+            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - wait)
     if period is not None:
         return lanes, None, turns * jnp.asarray(period, float)
     a = int(lanes.chart[0])
