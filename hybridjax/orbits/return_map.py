@@ -143,18 +143,14 @@ def _root_jvp(primals, tangents):
     return (q, seen, steps), (t_q, *nothing)
 
 
-@eqx.filter_custom_jvp
-def _residual(q, system, start, kind, expected, settings):
-    """P(q) - q, and the `Turn`. The Jacobian is that of the turn's legs, computed with it."""
-    residual, seen, _ = _turn_with_jacobian(q, system, start, kind, expected, settings)
-    return residual, seen
+def _residual(q, system, start, base, expected, settings):
+    """P(q) - q, whose derivative by q is the Jacobian of the turn's legs, and the `Turn`.
 
-
-@_residual.def_jvp
-def _residual_jvp(primals, tangents):
-    """Newton asks for derivatives by q only."""
-    residual, seen, jacobian = _turn_with_jacobian(*primals)
-    return (residual, seen), (jacobian @ tangents[0], jax.tree_util.tree_map(lambda _: None, seen))
+    The Jacobian comes with the value, so that the turn need not be traced again for it.
+    """
+    fixed = jax.lax.stop_gradient(q)
+    residual, seen, jacobian = _turn_with_jacobian(fixed, system, start, base, expected, settings)
+    return residual + jacobian @ (q - fixed), seen
 
 
 def _turn_with_jacobian(q, system, start, kind, expected, settings):
