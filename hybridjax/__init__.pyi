@@ -31,6 +31,16 @@ from .experiments.run import (
     stream_experiments as stream_experiments,
 )
 from .experiments.steady import steady_start as steady_start
+from .fitting.fit import fit_model as fit_model
+from .fitting.identifiability import Identifiability as Identifiability
+from .fitting.model_fit import ModelFit as ModelFit
+from .fitting.observations import (
+    AbstractObservation as AbstractObservation,
+    ObservedCycle as ObservedCycle,
+    ObservedHTF as ObservedHTF,
+    ObservedSeries as ObservedSeries,
+)
+from .fitting.stability import spectral_radius as spectral_radius
 from .flow.move import Settings as Settings
 from .flow.sections import (
     AtEvent as AtEvent,
@@ -98,6 +108,17 @@ from .orbits.sweep import (
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
 from .periodic.synthetic import synthetic_ldtp as synthetic_ldtp
+from .recordings.phase import (
+    AnglePhase as AnglePhase,
+    EventPhase as EventPhase,
+    estimate_phase as estimate_phase,
+)
+from .recordings.recording import Recording as Recording
+from .recordings.sections import SectionData as SectionData, section_data as section_data
+from .recordings.simulated import (
+    random_force as random_force,
+    simulate_recording as simulate_recording,
+)
 from .store import (
     StoredExperiments as StoredExperiments,
     store_experiments as store_experiments,

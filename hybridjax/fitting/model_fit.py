@@ -1,0 +1,121 @@
+"""What a fit of physical parameters gives back."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import stats
+
+from .._core.errors import DefinitionError
+from .._core.results import Result
+from ..orbits.cycle import LimitCycle
+from ..systems.system import HybridSystem
+from .identifiability import Identifiability
+from .parameters import Parameters
+
+
+class Starts(eqx.Module):
+    """What became of the S starts of a fit, in the order in which they were tried.
+
+    **Fields:** `values` (S, p), where they began, and `fitted` (S, p), where they ended; `cost` (S,)
+    there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,) `Result` codes.
+    """
+
+    values: Float[np.ndarray, "S p"]
+    fitted: Float[np.ndarray, "S p"]
+    cost: Float[np.ndarray, " S"]
+    steps: Int[np.ndarray, " S"]
+    result: Int[np.ndarray, " S"]
+
+    def __len__(self) -> int:
+        return len(self.result)
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " S"]:
+        """Which of them converged."""
+        return self.result == Result.OK
+
+    def __repr__(self) -> str:
+        rows = [f"{'cost':>10}  {'steps':>5}  result"]
+        for cost, steps, code in zip(self.cost, self.steps, self.result, strict=True):
+            rows.append(f"{cost:10.4g}  {steps:5d}  {Result(int(code)).message}")
+        return "\n".join(rows)
+
+
+class ModelFit(eqx.Module):
+    r"""A system whose parameters were fitted to data.
+
+    **Fields:**
+
+    - `system`: with the fitted parameters. `cycle`: its limit cycle.
+    - `names`, `values` (p,): the free parameters.
+    - `covariance` (p, p): of the values, the pseudo-inverse of `information`, so that it is zero
+        along combinations that the data do not see.
+    - `information` (p, p): $J^T J$ with the Jacobian J of the residuals in units of their standard
+        deviations; where the data have none, the unit is what the misfit itself says.
+    - `residuals` (r,): weighted, those of all observations one after the other.
+    - `cost`: sum of their squares. `freedom`: r less the number of combinations that are seen; the
+        cost to be expected where `weighted`, i.e. all data came with their standard deviations.
+    - `identifiability`: which combinations of parameters the data see.
+    - `starts`: what became of each start. `result`: code of the best one.
+    """
+
+    system: HybridSystem
+    cycle: LimitCycle
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    information: Float[np.ndarray, "p p"]
+    residuals: Float[np.ndarray, " r"]
+    cost: float = eqx.field(static=True)
+    freedom: int = eqx.field(static=True)
+    weighted: bool = eqx.field(static=True)
+    identifiability: Identifiability
+    starts: Starts
+    result: int = eqx.field(static=True)
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " p"]:
+        """Of each value; infinite for a parameter that the data do not see by itself."""
+        lost = np.any(self.identifiability.unseen != 0, axis=0)
+        return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
+
+    def chi_square(self, true: HybridSystem | Mapping[str, float]) -> float:
+        r"""Squared distance of the values from others, $e^T J^T J e$: that from the truth has a chi
+        square distribution with `identifiability.rank` degrees of freedom.
+
+        **Arguments:** `true`: a system, or values by name.
+
+        **Raises:** `DefinitionError` if a value is missing.
+        """
+        if isinstance(true, HybridSystem):
+            none = np.zeros(len(self.names))
+            true = dict(zip(self.names, Parameters(self.names, *3 * (none,)).read(true)))
+        missing = [name for name in self.names if name not in true]
+        if missing:
+            raise DefinitionError(f"there is no true value of '{missing[0]}'.")
+        error = self.values - np.array([float(true[name]) for name in self.names])
+        return float(error @ self.information @ error)
+
+    def contains(self, true: HybridSystem | Mapping[str, float], level: float = 0.95) -> bool:
+        """Whether other values lie in the joint confidence region of all that the data see."""
+        rank = self.identifiability.rank
+        if self.weighted:
+            return bool(self.chi_square(true) <= stats.chi2(rank).ppf(level))
+        return bool(self.chi_square(true) <= rank * stats.f(rank, self.freedom).ppf(level))
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.names))
+        expected = f", expected {self.freedom}" if self.weighted else ""
+        converged = int(np.sum(self.starts.ok))
+        lines = [
+            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
+            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.starts)} starts converged, "
+            f"{int(np.sum(self.starts.steps))} evaluations",
+        ]
+        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+            shown = f"+- {error:.2g}" if np.isfinite(error) else "not seen by itself"
+            lines.append(f"  {name:{width}}  {value:<14.9g} {shown}")
+        lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
+        return "\n".join(lines)

@@ -1,0 +1,271 @@
+"""What a system is fitted to: each kind of data turns a limit cycle into weighted residuals."""
+
+import abc
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.respond import observe, respond
+from ..experiments.response import response_function
+from ..flow.move import Settings
+from ..flow.sections import AbstractSections, as_sections
+from ..identify.values import check_values, weights_of
+from ..orbits.cycle import LimitCycle
+from ..orbits.linearize import linearize
+from ..orbits.place import PlacedSections, place_sections
+from ..orbits.plan import Plan
+from ..periodic.htf import HTF
+from ..systems.structure import Structure
+
+
+class AbstractObservation(eqx.Module):
+    """Something that was measured, as `fit_model` takes it. Subclass it for data of other kinds.
+
+    **Fields:** `weighted`: whether residuals are in units of their standard deviations.
+    """
+
+    weighted: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
+        """What a system with this limit cycle would give minus what was measured, weighted.
+
+        Differentiated in forward mode. NaN and infinity mean that the system cannot give it.
+        """
+
+    def prepare(self, cycle: LimitCycle) -> "AbstractObservation":
+        """Called once, before the fit, with the limit cycle from which it starts: for checks and
+        for what is computed outside of JAX transformations."""
+        return self
+
+
+class ObservedHTF(AbstractObservation):
+    r"""Harmonic transfer functions, exact or estimated.
+
+    Residuals are real and imaginary parts of $H^{model}_m(f) - H_m(f)$, in units of their standard
+    deviations $\sqrt{v/2}$ where the HTFs have variances v, otherwise relative to the rms of each
+    output's HTFs.
+    """
+
+    htf: HTF
+    sections: AbstractSections
+    weights: Float[Array, "M F ny nu"]
+    weighted: bool = eqx.field(static=True)
+
+    def __init__(self, htf: HTF, sections):
+        """**Arguments:** `htf`, of outputs and inputs that the system knows by name; `sections`,
+        the family of sections that it was measured at.
+
+        **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
+        """
+        self.htf, self.sections = htf, as_sections(sections)
+        if self.sections.count != htf.sections:
+            raise DefinitionError(
+                f"the HTFs belong to {htf.sections} sections, the family has {self.sections.count}."
+            )
+        self.weights = jnp.asarray(weights_of(htf, check_values(htf)))
+        self.weighted = htf.variance is not None
+
+    def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
+        model = linearize(cycle, self.sections, self.htf.outputs, self.htf.inputs)
+        error = (model.htf(self.htf.f, self.htf.harmonics).H - self.htf.H) * self.weights
+        return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
+
+    def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
+        linearize(cycle, self.sections, self.htf.outputs, self.htf.inputs)
+        return self
+
+
+class ObservedSeries(AbstractObservation):
+    """Outputs at the sections in experiments that begin on the limit cycle.
+
+    Residuals are differences of the outputs themselves where the data know their values on the
+    cycle (`ExperimentData.cycle_outputs`), else of deviations from the cycle; in units of `std`, or
+    relative to the rms of each output's deviations. Experiments that failed are left out.
+    """
+
+    u: Float[Array, "S n nu"]
+    y: Float[Array, "S n ny"]
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    absolute: bool = eqx.field(static=True)
+    sections: AbstractSections
+    scale: Float[Array, " ny"]
+    weighted: bool = eqx.field(static=True)
+    flow: tuple[Plan, Settings] | None
+
+    def __init__(self, data: ExperimentData, sections, std: ArrayLike | None = None):
+        """**Arguments:** `data` of experiments with `start="cycle"`; `sections`, their family;
+        `std`, the standard deviation of the measurement noise, one number or one for each output.
+
+        **Raises:** `DefinitionError` if no experiment ran well, for another number of sections, or
+        an `std` that is not positive.
+        """
+        self.sections = as_sections(sections)
+        if self.sections.count != data.sections:
+            raise DefinitionError(
+                f"the data have {data.sections} sections, the family {self.sections.count}."
+            )
+        if not data.ok.any():
+            raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
+        self.inputs, self.outputs, ny = data.inputs, data.outputs, len(data.outputs)
+        y = data.y[data.ok]
+        scale = np.sqrt(np.mean(y**2, axis=(0, 1))) if std is None else np.asarray(std, float)
+        if scale.shape not in ((), (ny,)) or not np.all(np.isfinite(scale) & (scale > 0)):
+            raise DefinitionError(
+                f"std must be positive, one number or one for each of {ny} outputs, not {std}."
+                if std is not None
+                else "an output does not move in any experiment: leave it out, or give `std`."
+            )
+        self.scale, self.weighted = jnp.broadcast_to(scale, (ny,)), std is not None
+        self.absolute = data.cycle_outputs is not None
+        if self.absolute:
+            y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.sections, 1))
+        self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
+        self.flow = None
+
+    def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
+        placed = place_sections(cycle, self.sections)
+        first = jnp.concatenate([placed.lanes.t[None], placed.lanes.q])[:, :1]
+        start = jnp.broadcast_to(first, (len(first), len(self.u)))
+        plan, settings = self.flow
+        y = respond(placed, plan, start, self.u, self.outputs, settings).y
+        if not self.absolute:
+            y = y - jnp.tile(_at_sections(placed, self.outputs), (y.shape[1] // placed.count, 1))
+        return ((y - self.y) / self.scale).ravel()
+
+    def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
+        if self.inputs != cycle.system.inputs:
+            raise DefinitionError(
+                f"the data have the inputs {self.inputs}, the system {cycle.system.inputs}."
+            )
+        response = response_function(cycle, self.sections, self.outputs)
+        return eqx.tree_at(
+            lambda o: o.flow, self, (response.plan, response.settings), is_leaf=lambda x: x is None
+        )
+
+
+class ObservedCycle(AbstractObservation):
+    """What was seen of the limit cycle itself: outputs at sections, times, the period.
+
+    Times of events are times of their sections: `ObservedCycle([hj.AtEvent("liftoff"),
+    hj.AtEvent("touchdown")], times=(0.5163, 1.3510))`. Times of a clocked system are its clock's,
+    modulo the period; those of an autonomous one count from section 0.
+
+    Residuals are in units of the standard deviations where these are given, otherwise relative to
+    the rms of each output and to the period.
+    """
+
+    sections: AbstractSections
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    seen: tuple[Float[Array, "..."], ...]
+    scales: tuple[Float[Array, "..."], ...]
+    which: tuple[str, ...] = eqx.field(static=True)
+    weighted: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        sections,
+        outputs: Sequence[str] | str = (),
+        values: ArrayLike | None = None,
+        *,
+        times: ArrayLike | None = None,
+        period: ArrayLike | None = None,
+        std: ArrayLike | None = None,
+        times_std: ArrayLike | None = None,
+        period_std: ArrayLike | None = None,
+    ):
+        """**Arguments:**
+
+        - `sections`: a family of N sections, or a list of `Crossing` and `AtEvent`.
+        - `outputs`, names, and `values` (N, ny), what they are at the sections.
+        - `times` (N,), when the cycle meets the sections. `period`.
+        - `std` of the values, one number or one for each output; `times_std`; `period_std`.
+
+        **Raises:** `DefinitionError` if nothing was observed, for shapes that do not fit, NaN, or
+        standard deviations that are not positive.
+        """
+        self.sections = as_sections(sections)
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        N, ny = self.sections.count, len(self.outputs)
+        given = {
+            "values": (values, std, (N, ny)),
+            "times": (times, times_std, (N,)),
+            "period": (period, period_std, ()),
+        }
+        given = {name: entry for name, entry in given.items() if entry[0] is not None}
+        if not given or ("values" in given) != bool(ny):
+            raise DefinitionError(
+                "give `outputs` with their `values`, `times`, or the `period` of the cycle."
+            )
+        self.which = tuple(given)
+        self.seen = tuple(_finite(name, x, shape) for name, (x, _, shape) in given.items())
+        self.scales = tuple(
+            _scale(name, std, x)
+            for x, (name, (_, std, _)) in zip(self.seen, given.items(), strict=True)
+        )
+        self.weighted = all(std is not None for _, std, _ in given.values())
+
+    @classmethod
+    def of(cls, cycle: LimitCycle, sections, outputs: Sequence[str] | str = ()) -> "ObservedCycle":
+        """All that can be seen of a known cycle: what an error-free measurement would give."""
+        placed = place_sections(cycle, sections)
+        outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        values = _at_sections(placed, outputs) if outputs else None
+        return cls(placed.sections, outputs, values, times=_times(placed), period=cycle.period)
+
+    def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
+        placed = place_sections(cycle, self.sections)
+        parts = []
+        for name, seen, scale in zip(self.which, self.seen, self.scales, strict=True):
+            if name == "values":
+                error = _at_sections(placed, self.outputs) - seen
+            elif name == "times":
+                error = _times(placed) - seen
+                if cycle.clocked:
+                    turns = jnp.round(error / cycle.period)
+                    error = error - jax.lax.stop_gradient(turns) * cycle.period
+            else:
+                error = cycle.period - seen
+            parts.append((error / scale).ravel())
+        return jnp.concatenate(parts)
+
+    def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
+        place_sections(cycle, self.sections)
+        return self
+
+
+def _at_sections(placed: PlacedSections, outputs: tuple[str, ...]) -> Float[Array, "N ny"]:
+    s = Structure(placed.cycle.system)
+    z = s.resolve_outputs(outputs)
+    return observe(s, z, placed.lanes, jnp.zeros((s.nu, placed.count))).T
+
+
+def _times(placed: PlacedSections) -> Float[Array, " N"]:
+    t = placed.lanes.t
+    return t if placed.cycle.clocked else t - t[0]
+
+
+def _finite(name: str, x: ArrayLike, shape: tuple[int, ...]) -> Float[Array, "..."]:
+    x = jnp.asarray(x, float)
+    if x.shape != shape or not jnp.isfinite(x).all():
+        raise DefinitionError(f"`{name}` must be finite and of the shape {shape}, not {x.shape}.")
+    return x
+
+
+def _scale(name: str, std: ArrayLike | None, seen: Array) -> Float[Array, "..."]:
+    """Standard deviations that were given, or sizes."""
+    if std is None:
+        size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))
+        return jnp.where(size > 0, size, 1.0)
+    std = jnp.asarray(std, float)
+    if std.shape not in ((), seen.shape[1:]) or not jnp.all(jnp.isfinite(std) & (std > 0)):
+        raise DefinitionError(f"the standard deviation of `{name}` must be positive, not {std}.")
+    return std
