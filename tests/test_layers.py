@@ -23,6 +23,7 @@ LAYERS = [
     "identify",
     "fitting",
     "plot",
+    "recordings",
     "io",
     "store",
     "report",

@@ -1,0 +1,313 @@
+"""Where in its cycle a recorded system is: phase from an angle, from events, or a function."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+from .._core.errors import DefinitionError
+from .recording import Recording, Trial
+from .smoothing import FEWEST, spline
+
+
+_BREAK = 0.25  # of a cycle: the turns in a longer gap cannot be counted
+_HARMONICS = 32  # bandwidth of the angle's signals, in cycles per cycle
+_TAILS = 0.01  # of the samples at either end, which say nothing of the range
+
+
+class AnglePhase(eqx.Module):
+    """Phase as the angle of two signals, a position and its velocity, say, around a centre.
+
+    The angle of `(position - o_p) / s_p + i (velocity - o_v) / s_v`, counted in the sense in which
+    it turns. Section 0 lies at `start`.
+
+    **Fields:**
+
+    - `position`, `velocity`: names of signals.
+    - `center` (o_p, o_v), `scale` (s_p, s_v): by default the middle of each signal's range and
+      half of its width, over all trials.
+    - `start`: angle of section 0 in rad; at 0 the velocity is that of the centre, and the position
+      is beyond it.
+    - `bandwidth`: of the splines through the signals, in Hz; by default 32 harmonics of the cycle.
+    """
+
+    position: str = eqx.field(static=True)
+    velocity: str = eqx.field(static=True)
+    center: tuple[float, float] | None = None
+    scale: tuple[float, float] | None = None
+    start: float = 0.0
+    bandwidth: float | None = None
+
+
+class EventPhase(eqx.Module):
+    """Phase that grows by one from each event to the next, linearly in between.
+
+    Since it depends on the event that comes next, so do the outputs sampled at it. Events that
+    follow the one before by less than half of the median period are taken for doubled and left
+    out; where an interval is longer than 1.5 median periods one was missed, and these cycles are
+    left out.
+
+    **Fields:** `event`: its name.
+    """
+
+    event: str = eqx.field(static=True)
+
+
+class Winding(eqx.Module):
+    """The phase of one stretch of a trial.
+
+    **Fields:** `time` (n,), `phase` (n,) in cycles: both strictly increasing. `linear`: whether
+    the phase is linear in between, or smooth.
+    """
+
+    time: Float[np.ndarray, " n"]
+    phase: Float[np.ndarray, " n"]
+    linear: bool = eqx.field(static=True)
+
+    def when(self, phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """The times at which the phase has these values, by inverse interpolation."""
+        if self.linear:
+            return np.interp(phase, self.phase, self.time)
+        return PchipInterpolator(self.phase, self.time)(phase)
+
+
+class Phase(eqx.Module):
+    """The phase of all trials of a recording, as `estimate_phase` finds it.
+
+    **Fields:**
+
+    - `stretches`: for each trial, the stretches that are not interrupted.
+    - `periods`: for each trial, the durations of its cycles. `period`: their median.
+    - `backwards`: the share of samples at which the angle ran backwards (noise).
+    - `dropped`: events taken for doubled; `missed`: cycles left out since an event was missed.
+    - `lead`: how many cycles the phase looks ahead.
+    """
+
+    stretches: tuple[tuple[Winding, ...], ...]
+    periods: tuple[Float[np.ndarray, " _"], ...]
+    period: float = eqx.field(static=True)
+    backwards: float = eqx.field(static=True)
+    dropped: int = eqx.field(static=True)
+    missed: int = eqx.field(static=True)
+    lead: int = eqx.field(static=True)
+
+    @property
+    def cycles(self) -> int:
+        """The number of whole cycles."""
+        return sum(len(p) for p in self.periods)
+
+    @property
+    def drift(self) -> float:
+        """Change of the period per cycle, relative to it: a straight line through each trial."""
+        slopes, weights = [], []
+        for p in self.periods:
+            k = np.arange(len(p)) - (len(p) - 1) / 2
+            if len(p) > 2:
+                slopes.append(float(k @ p / (k @ k)))
+                weights.append(float(k @ k))
+        return float(np.average(slopes, weights=weights)) / self.period if slopes else 0.0
+
+    @property
+    def jitter(self) -> float:
+        """Standard deviation of the periods of each trial about their line, relative to them."""
+        rest, freedom = 0.0, 0
+        for p in self.periods:
+            if len(p) > 2:
+                k = np.arange(len(p))
+                rest += float(((p - np.polyval(np.polyfit(k, p, 1), k)) ** 2).sum())
+                freedom += len(p) - 2
+        return float(np.sqrt(rest / freedom)) / self.period if freedom else 0.0
+
+    def __repr__(self) -> str:
+        notes = ""
+        if self.backwards:
+            notes += f"; {100 * self.backwards:.2g} % of samples ran backwards"
+        if self.dropped:
+            notes += f"; {self.dropped} doubled events left out"
+        if self.missed:
+            notes += f"; {self.missed} cycles with missed events left out"
+        pieces = sum(len(s) for s in self.stretches)
+        return (
+            f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
+            f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
+            f"{100 * self.drift:.2g} % per cycle{notes})"
+        )
+
+
+Definition = AnglePhase | EventPhase | Callable[[np.ndarray, Mapping[str, np.ndarray]], Any]
+
+
+def estimate_phase(recording: Recording, definition: Definition) -> Phase:
+    """The phase of every trial, offline.
+
+    **Arguments:**
+
+    - `definition`: an `AnglePhase`, an `EventPhase`, or a function of the times (n,) and the
+      signals by name, that returns an angle (n,) in rad, with or without its whole turns, NaN where
+      it is not known.
+
+    Angles that run backwards in noise are replaced by the mean of the two monotone envelopes, one
+    from below and one from above. Stretches end at gaps longer than a quarter of a cycle.
+
+    **Raises:** `DefinitionError` for signals or events that are not there, a phase that does not
+    wind, or a recording of less than two cycles.
+    """
+    if isinstance(definition, EventPhase):
+        return _from_events(recording, definition)
+    if isinstance(definition, AnglePhase):
+        angles = _angles(recording, definition)
+    elif callable(definition):
+        angles = [_from_function(recording, trial, definition) for trial in recording.trials]
+    else:
+        raise DefinitionError(
+            "a phase is an AnglePhase, an EventPhase, or a function of time and signals, not "
+            f"{type(definition).__name__}."
+        )
+    rate = _turns_per_time(angles)
+    backwards, total, stretches = 0, 0, []
+    for time, angle in angles:
+        parts = []
+        edges = np.flatnonzero(np.diff(time) > _BREAK / abs(rate)) + 1
+        for part in np.split(np.arange(len(time)), edges):
+            if len(part) < FEWEST:
+                continue
+            phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
+            backwards += int((np.diff(phase) < 0).sum())
+            total += len(part)
+            if (winding := _monotone(time[part], phase)) is not None:
+                parts.append(winding)
+        stretches.append(tuple(parts))
+    return _phase(stretches, backwards / max(total, 1))
+
+
+def _angles(recording: Recording, definition: AnglePhase):
+    """Times and angles, modulo whole turns, of each trial."""
+    columns = [recording.column(x) for x in (definition.position, definition.velocity)]
+    everything = np.concatenate([t.values[:, columns] for t in recording.trials])
+    seen = np.isfinite(everything).all(axis=0)
+    if not np.isfinite(everything).any(axis=0).all():
+        gone = (definition.position, definition.velocity)[int(np.argmin(seen))]
+        raise DefinitionError(f"{gone} is missing at every sample.")
+    low, high = np.nanquantile(everything, [_TAILS, 1 - _TAILS], axis=0)
+    center = (low + high) / 2 if definition.center is None else np.asarray(definition.center)
+    scale = (high - low) / 2 if definition.scale is None else np.asarray(definition.scale)
+    if not (scale > 0).all():
+        bad = (definition.position, definition.velocity)[int(np.argmin(scale))]
+        raise DefinitionError(
+            f"the phase needs a {bad} that varies, but its scale is {min(scale)}."
+        )
+
+    def angle(z):
+        return np.angle((z[:, 0] + 1j * z[:, 1]) * np.exp(-1j * definition.start))
+
+    found = []
+    for trial in recording.trials:
+        both = np.isfinite(trial.values[:, columns]).all(axis=1)
+        if both.sum() < FEWEST:
+            raise DefinitionError(
+                f"trial '{trial.name}' has {int(both.sum())} samples of {definition.position} and "
+                f"{definition.velocity}: too few for a phase."
+            )
+        found.append((trial.time[both], (trial.values[both][:, columns] - center) / scale))
+    rate = abs(_turns_per_time([(time, angle(z)) for time, z in found]))
+    bandwidth = definition.bandwidth or _HARMONICS * rate
+    return [
+        (time, angle(np.stack([spline(time, x, bandwidth).values for x in z.T], axis=1)))
+        for time, z in found
+    ]
+
+
+def _from_function(recording: Recording, trial: Trial, function):
+    signals = dict(zip(recording.signals, trial.values.T, strict=True))
+    angle = np.asarray(function(trial.time, signals), float)
+    if angle.shape != trial.time.shape:
+        raise DefinitionError(
+            f"the phase function returned the shape {angle.shape} for {len(trial.time)} samples of "
+            f"trial '{trial.name}'."
+        )
+    known = np.isfinite(angle)
+    return trial.time[known], angle[known]
+
+
+def _turns_per_time(angles) -> float:
+    """Signed. **Raises:** `DefinitionError` if the angle does not wind."""
+    turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles if len(a)) / (2 * np.pi)
+    duration = sum(float(t[-1] - t[0]) for t, _ in angles if len(t))
+    if abs(turns) < 2:
+        raise DefinitionError(
+            f"the phase does not wind: {abs(turns):.2g} turns in {duration:.4g}; the centre must "
+            "lie within the loop of the two signals, and two cycles or more are needed."
+        )
+    return turns / duration
+
+
+def _monotone(time, phase) -> Winding | None:
+    low = np.maximum.accumulate(phase)
+    high = np.minimum.accumulate(phase[::-1])[::-1]
+    phase = (low + high) / 2
+    rising = np.concatenate([[True], np.diff(phase) > 1e-12])
+    if rising.sum() < 2:
+        return None
+    return Winding(time[rising], phase[rising], linear=False)
+
+
+def _from_events(recording: Recording, definition: EventPhase) -> Phase:
+    name, times = definition.event, []
+    for trial in recording.trials:
+        if name not in trial.events:
+            there = ", ".join(trial.events) or "none"
+            raise DefinitionError(
+                f"trial '{trial.name}' has no event '{name}'; its events are: {there}."
+            )
+        times.append(trial.events[name])
+    intervals = np.concatenate([np.diff(t) for t in times])
+    if len(intervals) < 2:
+        raise DefinitionError(f"there are too few events '{name}' for two cycles.")
+    dropped, kept = 0, []
+    # Doubled events make short intervals, missed ones long ones: both leave the median alone
+    # once those shorter than a quarter of it are out.
+    period = float(np.median(intervals))
+    period = float(np.median(intervals[intervals > period / 4]))
+    for t in times:
+        good = []
+        for x in t:
+            if good and x - good[-1] < period / 2:
+                dropped += 1
+            else:
+                good.append(x)
+        kept.append(np.array(good))
+    missed, stretches = 0, []
+    for t in kept:
+        wide = np.flatnonzero(np.diff(t) > 1.5 * period) + 1
+        missed += sum(round(float(t[k] - t[k - 1]) / period) for k in wide)
+        parts = [part for part in np.split(t, wide) if len(part) > 1]
+        stretches.append(tuple(Winding(p, np.arange(len(p), dtype=float), True) for p in parts))
+    return _phase(stretches, 0.0, dropped, missed, lead=1)
+
+
+def _phase(stretches, backwards, dropped=0, missed=0, lead=0) -> Phase:
+    periods = []
+    for parts in stretches:
+        each = [np.zeros(0)]
+        for part in parts:
+            whole = np.arange(np.ceil(part.phase[0]), np.floor(part.phase[-1]) + 1)
+            each.append(np.diff(part.when(whole)))
+        periods.append(np.concatenate(each))
+    everything = np.concatenate(periods)
+    if len(everything) < 2:
+        raise DefinitionError(
+            f"the recording holds {len(everything)} whole cycles; at least two are needed to "
+            "speak of a period."
+        )
+    return Phase(
+        tuple(stretches),
+        tuple(periods),
+        float(np.median(everything)),
+        backwards,
+        dropped,
+        missed,
+        lead,
+    )

@@ -1,0 +1,238 @@
+"""What a laboratory recorded: sampled signals, events, units, in one or several trials."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.errors import DefinitionError
+from .smoothing import spline
+
+
+class Trial(eqx.Module):
+    """One uninterrupted run of the instruments.
+
+    **Fields**, on the host:
+
+    - `time` (n,): of the samples, strictly increasing, not necessarily regular.
+    - `values` (n, k): the signals; NaN where a sample is missing.
+    - `events`: times of events by name, ascending; none need lie on a sample.
+    - `name`: for messages and figures.
+    """
+
+    time: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "n k"]
+    events: dict[str, Float[np.ndarray, " _"]]
+    name: str = eqx.field(static=True)
+
+
+class Recording(eqx.Module):
+    """Sampled signals of one or several trials. Nothing is resampled.
+
+    **Fields:**
+
+    - `trials`: one or several `Trial`s with the same signals.
+    - `signals`: their names. `units`: a unit for each, "" where none was given.
+    """
+
+    trials: tuple[Trial, ...]
+    signals: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        time: Any,
+        signals: Mapping[str, Any],
+        *,
+        events: Mapping[str, Any] | None = None,
+        units: Mapping[str, str] | None = None,
+        name: str = "trial",
+    ):
+        """A recording of one trial; `join` puts several together.
+
+        **Arguments:**
+
+        - `time` (n,): of the samples, in seconds, say; strictly increasing.
+        - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing.
+        - `events`: times of events by name, such as foot strikes.
+        - `units`: by name. `name`: of the trial.
+
+        **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
+        backwards, and infinite values; it names the sample.
+        """
+        where = f"trial '{name}'"
+        time = _numbers(where, "time", time)
+        if not signals:
+            raise DefinitionError(f"{where} has no signals.")
+        columns = {key: _numbers(where, key, values) for key, values in signals.items()}
+        for key, values in columns.items():
+            if len(values) != len(time):
+                raise DefinitionError(
+                    f"{where}: {key} has {len(values)} samples, but time has {len(time)}."
+                )
+            if np.isinf(values).any():
+                raise DefinitionError(
+                    f"{where}: {key} is infinite at sample {int(np.argmax(np.isinf(values)))}; put "
+                    "NaN where a sample is bad."
+                )
+        if len(time) < 2:
+            raise DefinitionError(f"{where} has {len(time)} samples: nothing was recorded.")
+        if not np.isfinite(time).all():
+            bad = int(np.argmax(~np.isfinite(time)))
+            raise DefinitionError(f"{where}: time is not a finite number at sample {bad}.")
+        if (np.diff(time) <= 0).any():
+            bad = int(np.argmax(np.diff(time) <= 0)) + 1
+            how = "repeats" if time[bad] == time[bad - 1] else "runs backwards"
+            raise DefinitionError(
+                f"{where}: time {how} at sample {bad} ({time[bad - 1]:.10g}, then "
+                f"{time[bad]:.10g}); sort the samples, or make a trial of each part."
+            )
+        found = {}
+        for key, values in (events or {}).items():
+            values = _numbers(where, key, values)
+            if np.isinf(values).any():
+                raise DefinitionError(f"{where}: the event {key} has an infinite time.")
+            found[key] = np.sort(values[~np.isnan(values)])
+        unknown = set(units or {}) - set(columns)
+        if unknown:
+            raise DefinitionError(
+                f"{where}: there is a unit for '{sorted(unknown)[0]}', but the signals are "
+                f"{', '.join(columns)}."
+            )
+        self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), found, name),)
+        self.signals = tuple(columns)
+        self.units = tuple((units or {}).get(key, "") for key in columns)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        time: str = "time",
+        events: Mapping[str, Any] | None = None,
+        units: Mapping[str, str] | None = None,
+        name: str = "trial",
+    ) -> "Recording":
+        """A trial from a table with named columns: of pandas, polars, pyarrow, or a dictionary.
+
+        **Arguments:** `time`: the column with the times; all others are signals. The rest as for
+        `Recording`.
+
+        **Raises:** `DefinitionError` if there is no such column, and as `Recording`.
+        """
+        names = [str(key) for key in getattr(frame, "column_names", None) or frame.keys()]
+        if time not in names:
+            raise DefinitionError(
+                f"trial '{name}' has no column '{time}'; its columns are {', '.join(names)}."
+            )
+        signals = {key: np.asarray(frame[key]) for key in names if key != time}
+        return cls(np.asarray(frame[time]), signals, events=events, units=units, name=name)
+
+    @staticmethod
+    def join(recordings: Iterable["Recording"]) -> "Recording":
+        """All trials of several recordings, as one.
+
+        **Raises:** `DefinitionError` if there is none, or signals or units differ.
+        """
+        recordings = list(recordings)
+        if not recordings:
+            raise DefinitionError("there is no recording to join.")
+        first, trials = recordings[0], []
+        for other in recordings:
+            a, b = first.trials[0].name, other.trials[0].name
+            if set(other.signals) != set(first.signals):
+                raise DefinitionError(
+                    f"trials '{a}' and '{b}' have different signals: {', '.join(first.signals)}, "
+                    f"and {', '.join(other.signals)}."
+                )
+            order = [other.signals.index(key) for key in first.signals]
+            for key, unit, k in zip(first.signals, first.units, order, strict=True):
+                if other.units[k] != unit:
+                    raise DefinitionError(
+                        f"{key} is in '{unit}' in trial '{a}', but in '{other.units[k]}' in trial "
+                        f"'{b}': convert one of them."
+                    )
+            trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
+        return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
+
+    def mark(
+        self,
+        event: str,
+        signal: str,
+        *,
+        level: float = 0.0,
+        direction: Literal["rising", "falling"] = "rising",
+        bandwidth: float = np.inf,
+    ) -> "Recording":
+        """The same with one more event: a signal crosses a level.
+
+        Jumps against the direction (an angle that begins anew) are no events, jumps along it are.
+        What crosses a level several times within a cycle, in noise, makes doubled events, which
+        `EventPhase` leaves out.
+
+        **Arguments:** `event`: its name. `bandwidth`: in Hz, of the smoothing spline whose
+        crossings are taken; by default it interpolates.
+
+        **Raises:** `DefinitionError` for a signal that is not there or never crosses the level.
+        """
+        column, trials = self.column(signal), []
+        sign = 1.0 if direction == "rising" else -1.0
+        for trial in self.trials:
+            curve = spline(trial.time, trial.values[:, column], bandwidth)
+            t, y = curve.time, sign * (curve.values - level)
+            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+            if not len(at):
+                raise DefinitionError(
+                    f"trial '{trial.name}': {signal} never crosses {level:g}, {direction}."
+                )
+            low, high = t[at], t[at + 1]
+            for _ in range(50):  # bisection
+                middle = (low + high) / 2
+                below = sign * (curve(middle) - level) < 0
+                low, high = np.where(below, middle, low), np.where(below, high, middle)
+            events = trial.events | {event: (low + high) / 2}
+            trials.append(Trial(trial.time, trial.values, events, trial.name))
+        return eqx.tree_at(lambda r: r.trials, self, tuple(trials))
+
+    def column(self, name: str) -> int:
+        """The place of a signal.
+
+        **Raises:** `DefinitionError` if there is none of that name.
+        """
+        if name not in self.signals:
+            raise DefinitionError(
+                f"there is no signal '{name}'; the recording has {', '.join(self.signals)}."
+            )
+        return self.signals.index(name)
+
+    def unit(self, name: str) -> str:
+        """The unit of a signal, "" where none was given."""
+        return self.units[self.column(name)]
+
+    def __repr__(self) -> str:
+        parts = []
+        for t in self.trials:
+            step = np.diff(t.time)
+            missing = int(np.isnan(t.values).any(axis=1).sum())
+            events = "".join(f", {len(v)} {k}" for k, v in t.events.items())
+            parts.append(
+                f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g}, every "
+                f"{np.median(step):.4g} (longest {step.max():.4g})"
+                + (f", {missing} with gaps" if missing else "")
+                + events
+            )
+        pairs = zip(self.signals, self.units, strict=True)
+        names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
+        return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
+
+
+def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
+    values = np.asarray(values)
+    if values.dtype.kind not in "fiub" or values.ndim != 1:
+        raise DefinitionError(
+            f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "
+            f"{values.shape}."
+        )
+    return values.astype(float)

@@ -1,0 +1,59 @@
+"""The dirt of real recordings, to test with: noise, quantisation, drift, lost samples, gaps."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from .recording import Recording
+
+
+def spoil(
+    recording: Recording,
+    signals: Sequence[str],
+    *,
+    noise: float = 0.0,
+    quantum: float = 0.0,
+    drift: float = 0.0,
+    missing: float = 0.0,
+    gap: tuple[float, float] | None = None,
+    irregular: bool = False,
+    lost: int = 0,
+    doubled: int = 0,
+    seed: int = 0,
+) -> Recording:
+    """A recording as a poor laboratory would have made it.
+
+    **Arguments:**
+
+    - `signals`: those that are measured; inputs stay as they are.
+    - `noise`: standard deviation of white noise. `quantum`: what values are rounded to.
+    - `drift`: amplitude of a slow sine, one turn over each trial.
+    - `missing`: share of samples that are lost, NaN. `gap`: start and end of a stretch of NaN.
+    - `irregular`: a random third of the samples is not there at all.
+    - `lost`, `doubled`: how many events of each kind vanish, or are followed by a false one.
+    - `seed`: of all of these.
+    """
+    rng = np.random.default_rng(seed)
+    columns = [recording.column(x) for x in signals]
+    trials = []
+    for trial in recording.trials:
+        n = len(trial.time)
+        kept = np.sort(rng.permutation(n)[: 2 * n // 3]) if irregular else np.arange(n)
+        time, values = trial.time[kept], trial.values[kept].copy()
+        y = values[:, columns] + noise * rng.normal(size=(len(time), len(columns)))
+        span = np.ptp(time)
+        y += drift * np.sin(2 * np.pi * (time - time[0]) / span)[:, None]
+        y = np.round(y / quantum) * quantum if quantum else y
+        y[rng.random(len(time)) < missing] = np.nan
+        if gap is not None:
+            y[(time >= gap[0]) & (time < gap[1])] = np.nan
+        values[:, columns] = y
+        events = {}
+        for name, at in trial.events.items():
+            chosen = rng.permutation(len(at))[: lost + doubled]
+            false = at[chosen[lost:]] + 0.05 * np.median(np.diff(at))
+            events[name] = np.sort(np.concatenate([np.delete(at, chosen[:lost]), false]))
+        parts = (time, values, events)
+        trials.append(eqx.tree_at(lambda t: (t.time, t.values, t.events), trial, parts))
+    return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
