@@ -78,9 +78,7 @@ class LimitCycle(eqx.Module):
         after = np.roll(dims, -1)
         blocks = [f[: after[n], : dims[n]] for n, f in enumerate(factors)]
         values = product_eigenvalues(blocks, rtol=1e-9)
-        for _ in self.conserved:
-            left = np.where(values == 1, np.inf, np.abs(values - 1))
-            values[np.argmin(left)] = 1
+        values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         return values[np.argsort(-np.abs(values), kind="stable")]
 
     @property

@@ -25,6 +25,8 @@ from .sweep import LimitCycles
 _STRAIGHT, _FEW = 0.97, 3
 # Where to look for a point instead, as parts of a step.
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
+# Test functions below this are rounding errors.
+_ROUNDING = 1e-7
 # The first step, and the shortest, relative to the longest.
 _FIRST, _SHORTEST = 0.2, 1e-5
 
@@ -136,7 +138,7 @@ class _Trace:
 
     def run(self, start: Point) -> tuple[list[Point], list[tuple[int, str]], BranchEnd]:
         """The points, the marks (row, kind) among them, and why they end."""
-        points, marks, length = [start], [], _FIRST * self.step
+        points, marks, length, moved = [start], [], _FIRST * self.step, None
         low, high = self.values[0], self.values[-1]
         if (start.value >= high and start.tangent[-1] > 0) or (
             start.value <= low and start.tangent[-1] < 0
@@ -154,6 +156,11 @@ class _Trace:
                 length /= 2
                 if length >= _SHORTEST * self.step:
                     continue
+                if there.result in (Result.EVENT_ORDER, Result.GRAZING) and here is not moved:
+                    moved = self.curve.elsewhere(here)
+                    if moved is not None:
+                        points[-1], length = moved, _FIRST * self.step
+                        continue
                 return points, marks, BranchEnd(here.value, there.result, there.result.message)
             for event in self.events(here, there):
                 if event.kind:
@@ -173,6 +180,8 @@ class _Trace:
         found = []
         for kind in KINDS:
             before, after = here.tests[kind], there.tests[kind]
+            if max(abs(before), abs(after)) < _ROUNDING:
+                continue
             if before * after >= 0 or (kind == "branch point" and here.turns_before(there)):
                 continue
             event = self.locate(here, there, kind)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from .._core.errors import DefinitionError
 from .._core.results import Result
+from ..flow.lanes import Lanes
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
@@ -38,10 +39,12 @@ class Failure:
 class Point:
     """A cycle on the curve.
 
-    **Fields:** `z` (d+1,), state and parameter; `size` (d+1,), what counts as 1 in each; `tangent`
-    (d+1,) of the curve, a unit vector in these sizes; `round`, see `extended`; `steps` of Newton.
+    **Fields:** `start`, chart and phase at which it is anchored; `z` (d+1,), state and parameter;
+    `size` (d+1,), what counts as 1 in each; `tangent` (d+1,) of the curve, a unit vector in these
+    sizes; `round`, see `extended`; `steps` of Newton.
     """
 
+    start: Lanes
     z: Float[np.ndarray, " n"]
     size: Float[np.ndarray, " n"]
     tangent: Float[np.ndarray, " n"]
@@ -106,7 +109,7 @@ class Curve:
         self.cycle, self.parameter, self.span = cycle, parameter, span
         self.structure = Structure(cycle.system)
         self.kind = ReturnMap(cycle.base, cycle.conserved, cycle.turns)
-        self.start, self.expected = cycle.start, cycle.period
+        self.expected = cycle.period
         self.order = _turned(cycle.order)
         _leaf(cycle.system, parameter)
         flat = jax.tree_util.tree_map(
@@ -131,14 +134,14 @@ class Curve:
         n = self.structure.d
         z = np.append(np.asarray(self.cycle.start.q[:, 0]), value)
         row = np.append(np.zeros(n), 1.0)
-        legs = self.cycle.legs
-        return self._correct(z, row, np.append(np.ones(n), self.span), row, legs)
+        size = np.append(np.ones(n), self.span)
+        return self._correct(z, row, size, row, self.cycle.start)
 
     def step(self, here: Point, length: float) -> Point | Failure:
         """The next point, about `length` further along the tangent."""
         ahead = length * here.tangent * here.size
         point = self._correct(
-            here.z + ahead, here.tangent / here.size, here.size, here.tangent, here.round.legs
+            here.z + ahead, here.tangent / here.size, here.size, here.tangent, here.start
         )
         if isinstance(point, Failure):
             return point
@@ -149,7 +152,7 @@ class Curve:
         """The point over a place on the chord from a to b."""
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
-        return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.round.legs)
+        return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.start)
 
     def land(self, a: Point, b: Point, value: float) -> Point | Failure:
         """The point between a and b where the parameter has a value."""
@@ -157,16 +160,40 @@ class Curve:
         z = a.z + where * (b.z - a.z)
         z[-1] = value
         row = np.append(np.zeros(len(z) - 1), 1 / a.size[-1])
-        point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.round.legs)
+        point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.start)
         if not isinstance(point, Failure):
             point.z[-1] = value
         return point
 
-    def _correct(self, z0, row, size, forward, legs) -> Point | Failure:
+    def elsewhere(self, here: Point) -> Point | None:
+        """The same cycle, anchored at a phase of the clock that is far from all events.
+
+        An event that moves across the phase at which the cycle begins changes the chart there, and
+        is no obstacle to the cycle.
+        """
+        codes = here.round.codes
+        events = np.flatnonzero((codes >= 0).any(axis=1)) + 0.5
+        if self.kind.base is not None or not len(events):
+            return None
+        K = len(codes)
+        apart = np.abs(np.arange(K)[:, None] - events)
+        k = int(np.argmax(np.min(np.minimum(apart, K - apart), axis=1)))
+        legs = here.round.legs
+        phase = legs.t[k : k + 1] / here.round.period * self.expected
+        start = eqx.tree_at(
+            lambda x: (x.t, x.chart), here.start, (jnp.asarray(phase), jnp.asarray(legs.chart[[k]]))
+        )
+        row = np.append(np.zeros(len(here.z) - 1), 1.0)
+        forward = row * np.sign(here.tangent[-1])
+        z = np.append(legs.q[:, k], here.value)
+        point = self._correct(z, row / here.size, here.size, forward, start)
+        return None if k == 0 or isinstance(point, Failure) else point
+
+    def _correct(self, z0, row, size, forward, start: Lanes) -> Point | Failure:
         """Newton's method for a point with row @ (z - z0) = 0."""
         z, last = z0.copy(), np.inf
         for k in range(_MOST):
-            round = self._round(z)
+            round = self._round(z, start)
             if (failure := self._failure(round)) is not None:
                 return failure
             A = (
@@ -181,16 +208,16 @@ class Curve:
             change = np.linalg.lstsq(A, -right, rcond=1e-14)[0]
             length = np.linalg.norm(change)
             if length <= _SMALL or (length <= _ROUNDING and length >= 0.5 * last):
-                return self._point(z, forward, round, k)
+                return self._point(z, forward, start, round, k)
             if length > 2 * last:
                 break
             z, last = z + change * size, length
         return Failure(Result.NOT_CONVERGED)
 
-    def _round(self, z) -> Round:
+    def _round(self, z, start: Lanes) -> Round:
         system = self.system_at(z[-1])
         out = go_round(
-            system, self.direction, jnp.asarray(z[:-1]), self.start, self.kind, self.expected,
+            system, self.direction, jnp.asarray(z[:-1]), start, self.kind, self.expected,
             self.cycle.settings,
         )  # fmt: skip
         return jax.tree_util.tree_map(np.asarray, out)
@@ -198,25 +225,37 @@ class Curve:
     def _failure(self, round: Round) -> Failure | None:
         if int(round.result) != Result.OK:
             return Failure(Result(int(round.result)))
-        if not np.all(np.isfinite(round.residual)):
-            return Failure(Result.EVENT_ORDER)
-        if _turned(int(g) for g in np.ravel(round.codes) if g >= 0) != self.order:
+        order = _turned(int(g) for g in np.ravel(round.codes) if g >= 0)
+        if sorted(order) != sorted(self.order):
+            return Failure(Result.GRAZING)  # events come and go where a guard is touched
+        if order != self.order or not np.all(np.isfinite(round.residual)):
             return Failure(Result.EVENT_ORDER)
         return None
 
-    def _point(self, z, forward, round: Round, steps: int) -> Point | Failure:
-        legs, chart = round.legs, int(self.start.chart[0])
-        same = np.append(legs.q[:, legs.chart == chart], z[:-1, None], axis=1)
-        moves = np.ptp(same, axis=1)
-        rest = np.max(moves) <= _REST * np.max(np.abs(same))
-        if rest and self.kind.base is not None and len(set(legs.chart)) == 1:
+    def _point(self, z, forward, start: Lanes, round: Round, steps: int) -> Point | Failure:
+        moves, largest = self._extent(int(start.chart[0]), z[:-1], round.legs)
+        rest = np.max(moves) <= _REST * np.max(largest)
+        if rest and self.kind.base is not None:
             return Failure(Result.EQUILIBRIUM)
-        floor = np.maximum(_FLOOR * np.max(moves), _SHARE * np.max(np.abs(same), axis=1))
+        floor = np.maximum(_FLOOR * np.max(moves), _SHARE * largest)
         size = np.append(np.ones_like(moves) if rest else np.maximum(moves, floor), self.span)
-        point = Point(z, size, forward, round, steps)
+        point = Point(start, z, size, forward, round, steps)
         _, _, right = np.linalg.svd(point.scaled)
         tangent = right[-1] * (1.0 if right[-1] @ forward >= 0 else -1.0)
         return dataclasses.replace(point, tangent=tangent)
+
+    def _extent(self, first: int, q, legs) -> tuple[np.ndarray, np.ndarray]:
+        """By how much each state of the first chart moves on the cycle, in all charts that have a
+        state of its name, and its largest modulus."""
+        s = self.structure
+        moves, largest = np.zeros(s.d), np.zeros(s.d)
+        for k, name in enumerate(s.charts[first].states):
+            seen = [q[k]]
+            for a, chart in enumerate(s.charts):
+                if name in chart.states:
+                    seen.extend(legs.q[chart.states.index(name), legs.chart == a])
+            moves[k], largest[k] = np.ptp(seen), np.max(np.abs(seen))
+        return moves, largest
 
 
 def _turned(order) -> tuple[int, ...]:

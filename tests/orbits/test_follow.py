@@ -209,10 +209,17 @@ def test_period_doubling_of_the_long_gait():
 
 @pytest.mark.slow
 def test_a_foot_that_stays_on_the_ground(hopper_cycle):
-    """Driven less, the hopper stops hopping: an event grazes or is lost, and the branch ends."""
-    branch = hj.follow(hopper_cycle, "a", (1.0, 20.0))
-    assert branch.ends[0].result in (hj.Result.GRAZING, hj.Result.EVENT_ORDER)
-    assert branch.ends[0].value > 1.0 and branch.ends[1].message == "the values end"
+    """Driven less, the hopper stops hopping: the force of the ground, (m + M) g plus a sine of
+    amplitude a r / (r - k), r = M w^2, just reaches zero."""
+    branch = hj.follow(hopper_cycle, "a", (1.0, 30.0))
+    assert branch.ends[0].result == hj.Result.GRAZING
+    r = 2 * (2 * np.pi) ** 2
+    np.testing.assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
+    # More, and liftoff comes before the phase at which the cycle given begins.
+    assert branch.ends[1].message == "the values end" and not branch.points
+    assert branch.values[-1] == 30.0 and float(branch[-1].start.t[0]) != 0.5
+    again = hj.find_limit_cycle(branch[-1].system, branch[-1])
+    np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
 
 
 @pytest.mark.slow
