@@ -159,6 +159,13 @@ def prepare(
     z = Structure(cycle.system).resolve_outputs(outputs)
     if start not in ("cycle", "periodic"):
         raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
+    if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
+        raise DefinitionError(
+            f"clock sections sample {type(cycle.system).__name__}, which has no clock, at fixed "
+            "times: nothing brings its phase back (a multiplier of exactly 1), so that every input "
+            "shifts it for good. Use sections that depend on the state (KinematicPhase, or a list "
+            "of Crossing and AtEvent)."
+        )
     if not cycle.stable:
         largest = np.abs(cycle.multipliers[0])
         raise ComputationError(

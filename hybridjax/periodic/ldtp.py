@@ -314,10 +314,17 @@ class LDTP(eqx.Module):
         distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)
+            why = "Leave this frequency out."
+            if abs(multipliers[index] - 1) < _RESONANCE:
+                why = (
+                    "A multiplier of exactly 1 stems from a conserved quantity, or from an "
+                    "autonomous system that is sampled at fixed times, where nothing brings its "
+                    "phase back: use sections that depend on the state, or leave whole f out."
+                )
             raise DefinitionError(
                 f"The response at f = {f[line]:g} cycles per period is unbounded: the multiplier "
                 f"{multipliers[index]:.9g} lies on the unit circle there (z^N I - Phi is "
-                "singular). Leave this frequency out."
+                f"singular). {why}"
             )
 
 
