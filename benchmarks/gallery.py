@@ -1,0 +1,134 @@
+"""The gallery: every model's limit cycle, multipliers, exact HTF and an estimate laid over it.
+
+For each case of `gallery_cases.py`: the cycle; its multipliers and their error against what is
+known of them, relative to the largest; the exact harmonic transfer functions between the sections
+stated there, m = -1, 0, 1, from the input to the output; and their estimate from a batch of
+experiments (multisines on odd lines up to f = 4, or N/2 if that is less, 16 periods), with its
+largest error relative to the largest |H_0|. An unstable cycle has no experiments.
+
+    python benchmarks/gallery.py --out DIR [--only NAME ...]
+
+writes a picture for each case, `gallery.json`, and the table `gallery.md` into DIR.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+from gallery_cases import CASES, Case
+from matplotlib import pyplot
+from PIL import Image
+
+import hybridjax as hj
+
+
+HARMONICS = (-1, 0, 1)
+PERIODS = 16
+
+
+def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
+    """The cycle, the exact HTF, and its estimate."""
+    cycle = hj.find_limit_cycle(
+        case.system, case.guess, section=case.section, turns=case.turns, conserved=case.conserved
+    )
+    placed = hj.place_sections(cycle, case.sections)
+    model = hj.linearize(cycle, placed, case.output)
+    N = placed.count
+    design = hj.multisine(
+        N, PERIODS, f_max=min(4.0, N / 2), amplitude=case.amplitude or 1.0, lines="odd"
+    )
+    estimate = None
+    if case.amplitude:
+        data = hj.run_experiments(
+            cycle, placed, design, case.output, start=case.start, accuracy=1e-11
+        )
+        assert data.ok.all(), data.summary()
+        estimate = hj.estimate_htf(data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2])
+    f = np.unique(design.f) if estimate is None else estimate.f
+    harmonics = HARMONICS if estimate is None else estimate.harmonics
+    return cycle, model.htf(f, harmonics=harmonics), estimate
+
+
+def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None) -> dict:
+    """What the table says."""
+    multipliers = cycle.multipliers
+    truth = np.asarray(case.truth, complex)
+    return {
+        "title": case.title,
+        "period": float(cycle.period),
+        "events": [e.name for e in cycle.trajectory().events],
+        "sections": exact.sections,
+        "multipliers": [[z.real, z.imag] for z in multipliers],
+        "multiplier error": float(np.max(np.abs(multipliers - truth)) / np.max(np.abs(truth))),
+        "source": case.source,
+        "channel": f"{case.push} to {case.output}",
+        "largest H_0": float(np.max(np.abs(exact.harmonic(0)))),
+        "HTF error": None if estimate is None else float(estimate.error(exact)[0]),
+    }
+
+
+def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path):
+    """The cycle (of one that is rest: its multipliers), and |H_m| beside it."""
+    with hj.plot.style():
+        figure, (left, right) = pyplot.subplots(
+            1, 2, figsize=(hj.plot.PAGE, 2.7), layout="constrained", width_ratios=(1, 1.5)
+        )
+        if case.plane is None:
+            hj.plot.multipliers(cycle, ax=left, zoom=False)
+        else:
+            hj.plot.cycle(cycle, *case.plane, ax=left)
+        htfs = [exact] if estimate is None else [estimate, exact]
+        hj.plot.magnitude(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
+        figure.suptitle(f"{case.title}: {case.push} to {case.output}", fontsize=8)
+        figure.savefig(path, dpi=90)
+        pyplot.close(figure)
+    # Few colours are enough, and make the file small.
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(48).save(path, optimize=True)
+
+
+def table(rows: dict[str, dict]) -> str:
+    """The table of the page docs/gallery.md."""
+    lines = [
+        "| model | period | N | multipliers | error | truth | channel | error of H |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows.values():
+        values = [complex(*z) for z in row["multipliers"]]
+        shown = ", ".join(_text(z) for z in values if z.imag >= 0)
+        error = "-" if row["HTF error"] is None else f"{row['HTF error']:.0e}"
+        lines.append(
+            f"| {row['title']} | {row['period']:.8g} | {row['sections']} | {shown} "
+            f"| {row['multiplier error']:.0e} | {row['source']} | {row['channel']} | {error} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _text(z: complex) -> str:
+    return f"{z.real:.8g} ± {z.imag:.8g}i" if z.imag else f"{z.real:.8g}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
+    options = parser.parse_args()
+    hj.enable_x64()
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows = {}
+    for name in options.only:
+        begin = time.process_time()
+        case = CASES[name]()
+        found = compute(case)
+        rows[name] = numbers(case, *found)
+        picture = "".join(c if c.isalnum() else "-" for c in name.lower()).replace("--", "-")
+        draw(case, *found, options.out / f"{picture}.png")
+        print(table({name: rows[name]}).splitlines()[-1], f"({time.process_time() - begin:.0f} s)")
+        (options.out / "gallery.json").write_text(json.dumps(rows, indent=1))
+        (options.out / "gallery.md").write_text(table(rows))
+
+
+if __name__ == "__main__":
+    main()

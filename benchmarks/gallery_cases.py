@@ -1,0 +1,147 @@
+"""The gallery: for each model a cycle, sections, an input, an output, and what is known of it.
+
+Truths are from the closed forms that the models give as `exact`, or were computed apart from
+hybridjax, by Newton on the return map with DOP853 (relative tolerance 1e-13, events polished on the
+true guard), refined with a high-order integrator in mpmath (34 digits).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+import hybridjax as hj
+
+
+m = hj.models
+
+
+class Case(NamedTuple):
+    """One entry.
+
+    `sections` are for linearisation and experiments, `output` and `input` name what is measured and
+    pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An experiment
+    begins in the predicted periodic response, or where there is none, on the cycle (`start`).
+    """
+
+    title: str
+    system: hj.HybridSystem
+    sections: object
+    output: str
+    push: str
+    amplitude: float
+    truth: list[complex]
+    source: str
+    plane: tuple[str, str] | None
+    section: object = None
+    guess: hj.Guess | None = None
+    turns: int | None = None
+    conserved: dict[str, float] | None = None
+    start: str = "periodic"
+
+
+def _pair(z: complex) -> list[complex]:
+    return [z, z.conjugate()]
+
+
+def _levels(event: str, state: str, direction: str, first: float, last: float) -> list:
+    """The event's section, and seven levels of a state that is monotone between events."""
+    levels = np.linspace(first, last, 7)
+    return [hj.AtEvent(event), *(hj.Crossing(state, direction, value) for value in levels)]
+
+
+_APEX = hj.Crossing("vM", "falling")
+_MPMATH = "mpmath"
+_CLOSED = "closed form"
+_BUCK = ("v", "i")
+
+CASES: dict[str, Callable[[], Case]] = {
+    "hopper": lambda: Case(
+        "vertical hopper", m.VerticalHopper(), hj.ClockPhase(32, start=_APEX), "yM", "force",
+        2e-3, _pair(-0.248983334735609 + 0.699333251798004j), _MPMATH, ("yM", "vM"),
+    ),
+    "lossy hopper": lambda: Case(
+        "the same, retention 0.8", m.VerticalHopper(retention=0.8),
+        hj.ClockPhase(32, start=_APEX), "yM", "force", 2e-3,
+        _pair(-0.317897006349938 + 0.694628822735891j), _MPMATH, ("yM", "vM"),
+    ),
+    "bar": lambda: Case(
+        "two-legged bar", m.TwoLeggedBar(), hj.ClockPhase(16), "y", "force", 1e-4,
+        [*_pair(-0.153520955429110 + 0.361043052961495j),
+         *_pair(0.151655665357578 + 0.227749294883360j)],
+        _MPMATH, ("y", "v"),
+    ),
+    "wheel": lambda: Case(
+        "rimless wheel", m.RimlessWheel(), _levels("impact", "th", "rising", -0.25, 0.4), "w",
+        "hip torque", 1e-3, [0.5], _CLOSED, ("th", "w"), section=hj.AtEvent("impact"),
+    ),
+    "long gait": lambda: Case(
+        "simplest walker, long gait", m.SimplestWalker(),
+        _levels("heelstrike", "th", "falling", 0.15, -0.15), "w", "hip torque", 1e-5,
+        _pair(-0.190099841065888 + 0.557598776682068j), _MPMATH, ("th", "w"),
+        section=hj.AtEvent("heelstrike"),
+    ),
+    "short gait": lambda: Case(
+        "simplest walker, short gait", m.SimplestWalker(),
+        _levels("heelstrike", "th", "falling", 0.15, -0.15), "w", "hip torque", 0.0,
+        [4.00386435892970, 0.459589589797671], _MPMATH, ("th", "w"),
+        section=hj.AtEvent("heelstrike"), guess=m.SimplestWalker().short_gait(),
+    ),
+    "compass gait": lambda: Case(
+        "compass gait", m.CompassGait(), _levels("heelstrike", "s", "falling", 0.15, -0.25),
+        "vs", "hip torque", 1e-2,
+        [*_pair(-0.199726126830030 + 0.544476062094737j), 0.131572624077177], _MPMATH,
+        ("s", "vs"), section=hj.AtEvent("heelstrike"),
+    ),
+    "SLIP": lambda: Case(
+        "SLIP runner at 1784.8 J", m.SLIPRunner(),
+        [hj.Crossing("vy", "falling", charts=("flight",)), hj.AtEvent("touchdown"),
+         hj.Crossing("vy", "rising", charts=("stance",)), hj.AtEvent("liftoff")],
+        "vx", "angle of attack", 1e-4, [1.0, -0.161307631037475], _MPMATH, ("y", "vy"),
+        section=hj.Crossing("vy", "falling"), conserved={"energy": 1784.8}, start="cycle",
+    ),
+    "juggler": lambda: Case(
+        "paddle juggler", m.PaddleJuggler(), [hj.AtEvent("impact"), hj.Crossing("v", "falling")],
+        "y", "paddle speed", 1e-4, _pair(0.399920196836063 + 0.574511824214789j), _CLOSED,
+        ("y", "v"),
+    ),
+    "buck": lambda: Case(
+        "buck converter, 20 V", m.BuckConverter(), hj.ClockPhase(8, start=0.06), "v",
+        "reference voltage", 1e-4, _pair(-0.691894155835222 + 0.447746968999235j), _MPMATH, _BUCK,
+    ),
+    "buck, period 2": lambda: Case(
+        "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, start=0.03),
+        "v", "reference voltage", 1e-4, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
+        _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), turns=2,
+    ),
+    "Hopf": lambda: Case(
+        "Hopf normal form", m.HopfOscillator(),
+        hj.KinematicPhase(16, position="x", velocity="y", start=hj.Crossing("y", "rising")),
+        "x", "added to x'", 1e-4, [0.818730753077982], _CLOSED, ("x", "y"),
+        section=hj.Crossing("y", "rising"),
+    ),
+    "van der Pol": lambda: Case(
+        "van der Pol, mu = 1", m.VanDerPol(),
+        hj.KinematicPhase(16, position="x", velocity="v", start=hj.Crossing("v", "falling")),
+        "x", "force", 1e-3, [8.59695063603805e-4], _MPMATH, ("x", "v"),
+        section=hj.Crossing("v", "falling"),
+    ),
+    "van der Pol, 3": lambda: Case(
+        "van der Pol, mu = 3", m.VanDerPol(mu=3.0),
+        hj.KinematicPhase(16, position="x", velocity="v", start=hj.Crossing("v", "falling")),
+        "x", "force", 1e-3, [6.98947562607979e-16], _MPMATH, ("x", "v"),
+        section=hj.Crossing("v", "falling"),
+    ),
+    "rotor flap": lambda: Case(
+        "rotor flap", m.RotorFlap(), hj.ClockPhase(16), "b", "moment", 1e-2,
+        [-0.0215994758114450, -0.00373617944596341], _MPMATH, None,
+    ),
+    "Mathieu": lambda: Case(
+        "damped Mathieu (0.25, 0.1)", m.Mathieu(delta=0.25, epsilon=0.1), hj.ClockPhase(16), "x",
+        "force", 1e-2, [-0.728150761133001, -0.390866230632208], _MPMATH, None,
+    ),
+    "Duffing": lambda: Case(
+        "Duffing, rate 0.5", m.Duffing(), hj.ClockPhase(16), "x", "force", 1e-3,
+        _pair(0.524688411062 + 0.0964967071j), "scipy", ("x", "v"),
+    ),
+}  # fmt: skip
