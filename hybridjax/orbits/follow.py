@@ -7,6 +7,7 @@ Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 1
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,7 +19,7 @@ from .._core.results import Result
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .cycle import LimitCycle
 from .solution_curve import Curve, Failure, Point
-from .sweep import LimitCycles
+from .sweep import LimitCycles, front
 
 
 # Where the step is made shorter and longer: cosine of the turn of the tangent, Newton steps.
@@ -233,18 +234,14 @@ class _Trace:
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     """The points as cycles."""
-    cycle, rounds = curve.cycle, [p.round for p in points]
-    systems = [curve.system_at(p.value) for p in points]
-    stack = lambda *x: np.stack([np.asarray(y) for y in x])  # noqa: E731
-    arrays = jax.tree_util.tree_map(stack, *[curve.arrays(x) for x in systems])
-    r = jax.tree_util.tree_map(stack, *rounds)
-    codes = [[g for g in np.ravel(x.codes) if g >= 0] for x in rounds]
-    most = max(1, *map(len, codes))
+    cycle, stack = curve.cycle, lambda *x: np.stack([np.asarray(y) for y in x])
+    systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
+    systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
+    r = jax.tree_util.tree_map(stack, *(p.round for p in points))
     dims = np.array(curve.structure.dims)[r.legs.chart]
     return LimitCycles(
-        curve.merged(arrays), cycle.base, r.period, r.start, r.legs, r.factors, dims,
+        systems, cycle.base, r.period, r.start, r.legs, r.factors, dims,
         np.max(np.abs(r.residual), axis=1), np.array([p.steps for p in points]),
-        np.zeros(len(points), np.int32),
-        np.array([[*c, *[-1] * (most - len(c))] for c in codes]),
+        np.zeros(len(points), np.int32), front(r.codes.reshape(len(points), -1)),
         cycle.settings, cycle.conserved, cycle.turns,
     )  # fmt: skip

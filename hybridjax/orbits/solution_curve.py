@@ -73,18 +73,17 @@ class Point:
     @ft.cached_property
     def scaled(self) -> Float[np.ndarray, "d n"]:
         """Derivatives of the residual, all in sizes."""
-        r = self.round
-        by_z = np.concatenate([r.by_state, np.asarray(r.by_parameter)[:, None]], axis=1)
+        by_z = np.column_stack([self.round.by_state, self.round.by_parameter])
         return by_z * self.size / self.size[:-1, None]
 
     @ft.cached_property
     def eigenvalues(self) -> np.ndarray:
-        return np.linalg.eigvals(np.asarray(self.round.monodromy))
+        return np.linalg.eigvals(self.round.monodromy)
 
     @ft.cached_property
     def tests(self) -> dict[str, float]:
         """Functions that change their signs where a multiplier crosses the unit circle."""
-        M = np.asarray(self.round.monodromy)
+        M = self.round.monodromy
         mu, n = self.eigenvalues, len(M)
         pairs = [mu[i] * mu[j] - 1 for i in range(n) for j in range(i)]
         return {
@@ -122,12 +121,6 @@ class Curve:
 
     def system_at(self, value: float) -> HybridSystem:
         return _with(self.cycle.system, self.parameter, value)
-
-    def arrays(self, system):
-        return eqx.filter(system, eqx.is_array)
-
-    def merged(self, arrays):
-        return eqx.combine(arrays, self.cycle.system)
 
     def first(self, value: float) -> Point | Failure:
         """The cycle itself."""
@@ -196,12 +189,8 @@ class Curve:
             round = self._round(z, start)
             if (failure := self._failure(round)) is not None:
                 return failure
-            A = (
-                np.vstack(
-                    [np.concatenate([round.by_state, round.by_parameter[:, None]], axis=1), row]
-                )
-                * size
-            )
+            by_z = np.column_stack([round.by_state, round.by_parameter])
+            A = np.vstack([by_z, row]) * size
             right = np.append(round.residual, row @ (z - z0))
             if not np.all(np.isfinite(A)):
                 return Failure(Result.NOT_CONVERGED)

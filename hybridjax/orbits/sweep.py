@@ -157,7 +157,7 @@ def find_limit_cycles(
         for x, y in zip(*map(jax.tree_util.tree_leaves, (out, second)), strict=True):
             x[again] = y
     start, period, factors, seen, steps, result, dims = out
-    codes = _ragged(seen.codes.reshape(S, -1))
+    codes = front(seen.codes.reshape(S, -1))
     return LimitCycles(
         systems, guess.base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
         codes, settings, guess.conserved, guess.turns,
@@ -235,7 +235,7 @@ def _settled(system, base, start: Lanes, expected, settle: Bool[Array, ""]):
     return lanes, moved.result
 
 
-def _ragged(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
+def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     """Codes of events moved to the front of each row, and the columns without any left out."""
     order = np.argsort(codes < 0, axis=1, kind="stable")
     codes = np.take_along_axis(codes, order, axis=1)
