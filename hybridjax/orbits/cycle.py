@@ -1,5 +1,6 @@
 """Limit cycles: fixed points of the return map, by Newton with its exact Jacobian."""
 
+import functools
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -64,7 +65,7 @@ class LimitCycle(eqx.Module):
         """Whether a clock drives the system."""
         return self.system.period() is not None
 
-    @property
+    @functools.cached_property
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, the largest first (on the host).
 
@@ -79,7 +80,9 @@ class LimitCycle(eqx.Module):
         blocks = [f[: after[n], : dims[n]] for n, f in enumerate(factors)]
         values = product_eigenvalues(blocks, rtol=1e-9)
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
-        return values[np.argsort(-np.abs(values), kind="stable")]
+        values = values[np.argsort(-np.abs(values), kind="stable")]
+        values.flags.writeable = False  # they are kept
+        return values
 
     @property
     def stable(self) -> bool:
