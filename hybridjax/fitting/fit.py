@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from .._core.compile import quick_jit
-from .._core.errors import DefinitionError
+from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle, find_limit_cycle
 from ..systems.system import Guess, HybridSystem
 from .candidate import candidate_cycle
-from .identifiability import diagnose
+from .identifiability import Identifiability, diagnose
 from .model_fit import ModelFit, Starts
 from .observations import AbstractObservation
 from .parameters import Free, Parameters, free_parameters
@@ -25,6 +25,8 @@ from .parameters import Free, Parameters, free_parameters
 
 # The iteration ends when neither coordinates nor residuals move by more than this part.
 _RTOL = 1e-9
+# Evaluations of the model for one start.
+MAX_STEPS = 64
 # Along directions whose sensitivity is below this part of the largest one no step is taken.
 _RCOND = 1e-8
 # Without variances, a fit that explains all but this part of the data (mean square) is perfect.
@@ -36,6 +38,11 @@ class _Problem(eqx.Module):
 
     parameters: Parameters
     observations: tuple[AbstractObservation, ...]
+
+    @property
+    def weighted(self) -> bool:
+        """Whether all data came with their standard deviations."""
+        return all(one.weighted for one in self.observations)
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
         """Infinite where there is no limit cycle, or nothing to be observed on it."""
@@ -93,7 +100,7 @@ def fit_model(
     starts: int = 1,
     spread: float = 0.2,
     seed: int = 0,
-    max_steps: int = 64,
+    max_steps: int = MAX_STEPS,
     progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
@@ -109,11 +116,12 @@ def fit_model(
 
     **Arguments:**
 
-    - `system`: where the fit starts. It has a limit cycle.
+    - `system`: where the fit starts.
     - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
         (infinite where there are none, `None` for the sign of the value). Names may have dots.
-    - `guess`: of the limit cycle of `system`, see `find_limit_cycle`.
+    - `guess`: of the limit cycle of `system`, or the cycle of a similar system; see
+        `find_limit_cycle`.
     - `starts`: how many starts to try at most: `system` itself, then others around it. Once one
         has converged to a cost that the data explain (as large as their standard deviations make
         it, or without these 1e-12 of the data's squares), the rest is not tried.
@@ -126,35 +134,80 @@ def fit_model(
     is raised where a fit does not converge.
 
     **Raises:** `DefinitionError` for parameters, bounds or data that do not fit the system;
-    `ComputationError` if `system` has no limit cycle.
+    `ComputationError` if no start has a limit cycle.
 
     The program is compiled at the first call for each class of systems and kind of data; other
     values of parameters and data use it again.
     """
+    if starts < 1 or max_steps < 1 or not spread > 0:
+        raise DefinitionError(
+            f"starts and max_steps must be at least 1 and spread positive, not {starts}, "
+            f"{max_steps} and {spread}."
+        )
+    problem, near = _prepare(system, data, free, guess)
+    parameters, weighted = problem.parameters, problem.weighted
+    x0 = np.asarray(parameters.encode(parameters.read(system)))
+    around = spread * np.random.default_rng(seed).uniform(-1, 1, (starts - 1, len(x0)))
+    tried, best = [], None
+    for x in tqdm([x0, *(x0 + around)], "starts", disable=not progress):
+        found = _from(problem, jnp.asarray(x), system, near, max_steps)
+        tried.append(found)
+        best = found if best is None or found.cost < best.cost else best
+        if best.result == Result.OK and best.cost <= _goal(len(best.residuals), len(x0), weighted):
+            break
+    if best.cost == np.inf:
+        raise ComputationError(
+            f"no limit cycle was found for any of {starts} starts, so that there is none to fit: "
+            f"{best.result.message}. Start elsewhere, or give more `starts`."
+        )
+    return _summary(parameters, tried, best, weighted)
+
+
+def identifiability(
+    system: HybridSystem,
+    data: AbstractObservation | Sequence[AbstractObservation],
+    free: Free,
+    *,
+    guess: Guess | LimitCycle | None = None,
+) -> Identifiability:
+    """Which combinations of parameters some data see, without a fit: before an experiment, say.
+
+    **Arguments:** as for `fit_model`. The values of the data do not matter, their kind and their
+    standard deviations do.
+
+    **Returns:** an `Identifiability`, at the parameters of `system`.
+
+    **Raises:** as `fit_model`; `ComputationError` if `system` cannot give such data.
+    """
+    problem, near = _prepare(system, data, free, guess)
+    parameters, cycle = problem.parameters, find_limit_cycle(system, near)
+    x = parameters.encode(parameters.read(system))
+    _, r, J, _, _ = _levenberg_marquardt(problem, x, cycle, jnp.asarray(jnp.inf), MAX_STEPS)
+    if not np.isfinite(r).all():
+        raise ComputationError("the system has a limit cycle, but the data cannot be had from it.")
+    return diagnose(parameters.names, _relative(parameters, x, J))
+
+
+def _prepare(system, data, free, guess) -> tuple[_Problem, LimitCycle]:
+    """The problem, and a limit cycle near which to look for others."""
     parameters = free_parameters(system, free)
     observations = (data,) if isinstance(data, AbstractObservation) else tuple(data)
     if not observations or not all(isinstance(one, AbstractObservation) for one in observations):
         raise DefinitionError(
             "data are ObservedHTF, ObservedSeries or ObservedCycle objects, one or more."
         )
-    if starts < 1 or max_steps < 1 or not spread > 0:
-        raise DefinitionError(
-            f"starts and max_steps must be at least 1 and spread positive, not {starts}, "
-            f"{max_steps} and {spread}."
-        )
-    first = find_limit_cycle(system, guess)
-    problem = _Problem(parameters, tuple(one.prepare(first) for one in observations))
-    weighted = all(one.weighted for one in observations)
-    x0 = np.asarray(parameters.encode(parameters.read(system)))
-    around = spread * np.random.default_rng(seed).uniform(-1, 1, (starts - 1, len(x0)))
-    tried, best = [], None
-    for x in tqdm([x0, *(x0 + around)], "starts", disable=not progress):
-        found = _from(problem, jnp.asarray(x), first, max_steps)
-        tried.append(found)
-        best = found if best is None or found.cost < best.cost else best
-        if best.result == Result.OK and best.cost <= _goal(len(best.residuals), len(x0), weighted):
-            break
-    return _summary(parameters, tried, best, weighted)
+    near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+    return _Problem(parameters, tuple(one.prepare(near) for one in observations)), near
+
+
+def _relative(parameters: Parameters, x, jacobian) -> Float[np.ndarray, "r p"]:
+    """From derivatives by coordinates to derivatives by relative changes of the values."""
+    values, slopes = jax.jvp(parameters.decode, (x,), (jnp.ones_like(x),))
+    return np.asarray(jacobian * _sizes(values) / slopes)
+
+
+def _sizes(values):
+    return jnp.where(values == 0, 1.0, jnp.abs(values))
 
 
 class _Found(eqx.Module):
@@ -170,14 +223,15 @@ class _Found(eqx.Module):
     jacobian: Float[np.ndarray, "r p"]
 
 
-def _from(problem: _Problem, x: Float[Array, " p"], first: LimitCycle, max_steps: int) -> _Found:
+def _from(problem: _Problem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
     p = problem.parameters
-    cycle = find_limit_cycle(p.insert(first.system, p.decode(x)), first, throw=False)
+    cycle = find_limit_cycle(p.insert(system, p.decode(x)), near, throw=False)
     if int(cycle.result) != Result.OK:
         nothing = np.zeros(0), np.zeros((0, len(x)))
         return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
-    end, r, J, steps, done = _levenberg_marquardt(problem, x, cycle, jnp.asarray(_RTOL), max_steps)
-    cycle = find_limit_cycle(p.insert(first.system, p.decode(end)), cycle, throw=False)
+    tolerance = jnp.asarray(_RTOL)
+    end, r, J, steps, done = _levenberg_marquardt(problem, x, cycle, tolerance, max_steps)
+    cycle = find_limit_cycle(p.insert(system, p.decode(end)), cycle, throw=False)
     result = Result.OK if done else Result.NOT_CONVERGED
     r = np.asarray(r)
     return _Found(x, end, float(r @ r), int(steps), result, cycle, r, np.asarray(J))
@@ -201,9 +255,8 @@ def _summary(parameters: Parameters, tried: list[_Found], best: _Found, weighted
         np.array([int(one.result) for one in tried]),
     )
     values = decode(best.x)
-    slopes = jax.jvp(parameters.decode, (best.x,), (jnp.ones_like(best.x),))[1]
-    size = np.where(values == 0, 1.0, np.abs(values))
-    sensitivity = best.jacobian / np.asarray(slopes) * size
+    size = np.asarray(_sizes(values))
+    sensitivity = _relative(parameters, best.x, best.jacobian)
     seen = diagnose(parameters.names, sensitivity)
     freedom = len(best.residuals) - seen.rank
     unit = 1.0 if weighted else best.cost / max(freedom, 1)

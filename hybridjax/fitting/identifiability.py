@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 
 # Singular values of the sensitivities below this part of the largest one are zero.
-_RTOL = 1e-7
+_RTOL = 1e-9
 # Entries of a direction count as a ratio of small integers if they are so close to one.
 _CLOSE, _SMALL = 1e-3, 6
 
@@ -29,12 +29,14 @@ class Identifiability(eqx.Module):
         deviations, one over a singular value is the relative standard error of its combination.
     - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible, and small
         integers where it has such.
+    - `sensitivity` (r, p): S.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     rank: int = eqx.field(static=True)
     singular_values: Float[np.ndarray, " p"]
     unseen: Float[np.ndarray, "k p"]
+    sensitivity: Float[np.ndarray, "r p"]
 
     @property
     def complete(self) -> bool:
@@ -62,7 +64,7 @@ def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> I
     _, values, rows = np.linalg.svd(sensitivity, full_matrices=True)
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
     rank = int(np.sum(values > _RTOL * values[0]))
-    return Identifiability(names, rank, values, _readable(rows[rank:]))
+    return Identifiability(names, rank, values, _readable(rows[rank:]), sensitivity)
 
 
 def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
@@ -105,5 +107,5 @@ def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
         return f"a common factor of ({together}){only}"
     if len(parts) == 2 and parts[0][1] == -parts[1][1]:
         return f"{parts[0][0]} and {parts[1][0]} apart, only their product"
-    powers = ", ".join(name + ("" if w == 1 else f"^{w:.3g}") for name, w in parts)
-    return f"({powers}) changed together by powers of one factor".replace("^-", "^-")
+    powers = ", ".join(name if w == 1 else f"{name}^{w:.3g}" for name, w in parts)
+    return f"a common factor, with these powers, of ({powers})"

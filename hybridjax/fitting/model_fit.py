@@ -1,5 +1,6 @@
 """What a fit of physical parameters gives back."""
 
+import operator
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -12,14 +13,13 @@ from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem
 from .identifiability import Identifiability
-from .parameters import Parameters
 
 
 class Starts(eqx.Module):
     """What became of the S starts of a fit, in the order in which they were tried.
 
-    **Fields:** `values` (S, p), where they began, and `fitted` (S, p), where they ended; `cost` (S,)
-    there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,) `Result` codes.
+    **Fields:** `values` (S, p), where they began, and `fitted` (S, p), where they ended; `cost`
+    (S,) there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,), codes.
     """
 
     values: Float[np.ndarray, "S p"]
@@ -90,8 +90,7 @@ class ModelFit(eqx.Module):
         **Raises:** `DefinitionError` if a value is missing.
         """
         if isinstance(true, HybridSystem):
-            none = np.zeros(len(self.names))
-            true = dict(zip(self.names, Parameters(self.names, *3 * (none,)).read(true)))
+            true = {name: operator.attrgetter(name)(true) for name in self.names}
         missing = [name for name in self.names if name not in true]
         if missing:
             raise DefinitionError(f"there is no true value of '{missing[0]}'.")
@@ -111,8 +110,8 @@ class ModelFit(eqx.Module):
         converged = int(np.sum(self.starts.ok))
         lines = [
             f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
-            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.starts)} starts converged, "
-            f"{int(np.sum(self.starts.steps))} evaluations",
+            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.starts)} starts "
+            f"converged, {int(np.sum(self.starts.steps))} evaluations",
         ]
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
             shown = f"+- {error:.2g}" if np.isfinite(error) else "not seen by itself"

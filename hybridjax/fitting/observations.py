@@ -79,7 +79,14 @@ class ObservedHTF(AbstractObservation):
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        linearize(cycle, self.sections, self.htf.outputs, self.htf.inputs)
+        Structure(cycle.system).resolve_outputs(self.htf.outputs)
+        unknown = [name for name in self.htf.inputs if name not in cycle.system.inputs]
+        if unknown:
+            raise DefinitionError(
+                f"the HTFs have the input '{unknown[0]}'; those of the system are "
+                f"{', '.join(cycle.system.inputs)}."
+            )
+        place_sections(cycle, self.sections)
         return self
 
 

@@ -1,0 +1,55 @@
+"""What cannot be seen is found, and said in words."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, strategies as st
+
+from hybridjax.fitting.identifiability import diagnose
+
+
+def blind(rows, residuals=30, seed=0):
+    """Sensitivities with a given null space."""
+    rows = np.atleast_2d(np.asarray(rows, float))
+    S = np.random.default_rng(seed).normal(size=(residuals, rows.shape[1]))
+    return S - S @ np.linalg.pinv(rows) @ rows
+
+
+@pytest.mark.parametrize(
+    "rows, words",
+    [
+        ([[0, 0, 1, 0]], ["c"]),
+        ([[1, 0, 0, 1]], ["a common factor of (a, d), only a/d"]),
+        ([[1, 1, 0, 1]], ["a common factor of (a, b, d)"]),
+        ([[0, 1, -1, 0]], ["b and c apart, only their product"]),
+        ([[0, 1, -2, 0]], ["a common factor, with these powers, of (b, c^-2)"]),
+        ([[1, 1, 1, 0], [0, 0, 0, 1]], ["a common factor of (a, b, c)", "d"]),
+        ([[1, 1, 1, 1], [0, 0, 1, 1]],
+         ["a common factor of (a, b), only a/b", "a common factor of (c, d), only c/d"]),
+    ],
+)  # fmt: skip
+def test_directions_are_said_in_words(rows, words):
+    found = diagnose(tuple("abcd"), blind(rows))
+    assert found.rank == 4 - len(rows) and not found.complete
+    assert sorted(found.descriptions()) == sorted(words)
+    assert all(f"not seen: {text}" in repr(found) for text in words)
+
+
+def test_everything_seen_and_nothing_seen():
+    full = diagnose(("a", "b"), np.eye(3)[:, :2])
+    assert full.complete and full.rank == 2 and full.unseen.shape == (0, 2)
+    none = diagnose(("a", "b"), np.zeros((3, 2)))
+    assert none.rank == 0 and sorted(none.descriptions()) == ["a", "b"]
+    few = diagnose(("a", "b"), np.array([[1.0, 1.0]]))
+    assert few.descriptions() == ["a and b apart, only their product"]
+
+
+@given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3))
+def test_the_basis_spans_what_is_not_seen(rows):
+    rows = np.array(rows, float)
+    assume(np.linalg.svd(rows, compute_uv=False)[-1] > 1e-3)
+    S = blind(rows)
+    found = diagnose(tuple("abcde"), S)
+    assert found.unseen.shape == rows.shape
+    assert np.abs(S @ found.unseen.T).max() < 1e-2 * np.abs(S).max()
+    both = np.concatenate([rows, found.unseen])
+    assert np.linalg.matrix_rank(both, tol=1e-2) == len(rows)
