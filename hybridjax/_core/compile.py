@@ -6,6 +6,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
+from .tracing import is_traced
+
 
 # What makes XLA compile for the CPU in a third of the time: no optimisation passes of LLVM, and
 # the older of its two code generators. Options that an XLA does not know are left out.
@@ -27,7 +29,8 @@ def quick_jit(function: Callable) -> Callable:
 
     @ft.wraps(function)
     def call(*arguments):
-        if jax.default_backend() != "cpu":
+        # JAX refuses the options below the top level only after it has traced the function.
+        if jax.default_backend() != "cpu" or is_traced(arguments):
             return plain(*arguments)
         try:
             return quick()(*arguments)
