@@ -3,12 +3,14 @@
 For each case of `gallery_cases.py`: the cycle; its multipliers and their error against what is
 known of them, relative to the largest; the exact harmonic transfer functions between the sections
 stated there, m = -1, 0, 1, from the input to the output; and their estimate from a batch of
-experiments (multisines on odd lines up to f = 4, or N/2 if that is less, 16 periods), with its
+experiments (multisines on odd lines up to f = 4, or N/2 if that is less, 32 periods), with its
 largest error relative to the largest |H_0|. An unstable cycle has no experiments.
 
     python benchmarks/gallery.py --out DIR [--only NAME ...]
 
-writes a picture for each case, `gallery.json`, and the table `gallery.md` into DIR.
+writes a picture for each case, `gallery.json`, and the table `gallery.md` into DIR; cases that an
+earlier run left there stay in the table. `--only
+branches` follows three of the models along a parameter (`branches.png`).
 """
 
 import argparse
@@ -25,7 +27,8 @@ import hybridjax as hj
 
 
 HARMONICS = (-1, 0, 1)
-PERIODS = 16
+PERIODS = 32
+NAMES = [*CASES, "branches"]
 
 
 def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
@@ -81,10 +84,48 @@ def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | Non
             hj.plot.cycle(cycle, *case.plane, ax=left)
         htfs = [exact] if estimate is None else [estimate, exact]
         hj.plot.magnitude(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
+        lowest = min(np.min(line.get_ydata(), initial=np.inf) for line in right.get_lines())
+        right.set_ylim(bottom=max(lowest / 2, right.get_ylim()[0]))
+        legend = right.get_legend()
+        right.legend(
+            legend.legend_handles, [x.get_text() for x in legend.get_texts()],
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4,
+        )  # fmt: skip
         figure.suptitle(f"{case.title}: {case.push} to {case.output}", fontsize=8)
-        figure.savefig(path, dpi=90)
-        pyplot.close(figure)
-    # Few colours are enough, and make the file small.
+        save(figure, path)
+
+
+def branches(path: Path) -> None:
+    """Duffing's resonance, the buck converter's period doubling, and the two gaits."""
+    m, strike = hj.models, hj.AtEvent("heelstrike")
+    walker, buck = m.SimplestWalker(), m.BuckConverter()
+    doubled = hj.find_limit_cycle(
+        m.BuckConverter(Vin=25.0), hj.Guess("open", (12.04, 0.627, 3.8)), turns=2
+    )
+    gaits = [
+        hj.find_limit_cycle(walker, guess, section=strike)
+        for guess in (walker.guess(), walker.short_gait())
+    ]
+    panels = [
+        ("x", [hj.follow(hj.find_limit_cycle(m.Duffing()), "rate", (0.5, 2.0))]),
+        ("v", [hj.follow(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0)),
+               hj.follow(doubled, "Vin", (24.0, 25.5))]),
+        ("th", [hj.follow(gait, "slope", (0.002, 0.018)) for gait in gaits]),
+    ]  # fmt: skip
+    with hj.plot.style():
+        figure, axes = pyplot.subplots(
+            1, 3, figsize=(1.4 * hj.plot.PAGE, 3.0), layout="constrained"
+        )
+        for ax, (output, some) in zip(axes, panels, strict=True):
+            hj.plot.branch(*some, output=output, ax=ax)
+            print(*some, sep="\n")
+        save(figure, path)
+
+
+def save(figure, path: Path) -> None:
+    """As a small file: few colours are enough."""
+    figure.savefig(path, dpi=90)
+    pyplot.close(figure)
     with Image.open(path) as image:
         image.convert("RGB").quantize(48).save(path, optimize=True)
 
@@ -113,12 +154,15 @@ def _text(z: complex) -> str:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES)
     options = parser.parse_args()
     hj.enable_x64()
     options.out.mkdir(parents=True, exist_ok=True)
-    rows = {}
-    for name in options.only:
+    numbers_file = options.out / "gallery.json"
+    rows = json.loads(numbers_file.read_text()) if numbers_file.exists() else {}
+    if "branches" in options.only:
+        branches(options.out / "branches.png")
+    for name in (x for x in options.only if x != "branches"):
         begin = time.process_time()
         case = CASES[name]()
         found = compute(case)
@@ -126,7 +170,8 @@ def main():
         picture = "".join(c if c.isalnum() else "-" for c in name.lower()).replace("--", "-")
         draw(case, *found, options.out / f"{picture}.png")
         print(table({name: rows[name]}).splitlines()[-1], f"({time.process_time() - begin:.0f} s)")
-        (options.out / "gallery.json").write_text(json.dumps(rows, indent=1))
+        rows = {x: rows[x] for x in CASES if x in rows}
+        numbers_file.write_text(json.dumps(rows, indent=1))
         (options.out / "gallery.md").write_text(table(rows))
 
 

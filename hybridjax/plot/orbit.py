@@ -17,6 +17,7 @@ from .look import COLORS, axes_or_new, label_of
 
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
 _BAR = 0.035  # half of a section's bar, as a part of the width of the picture
+_TURN = 1 + 1e-6  # so that an event at the very end of a turn is seen
 
 
 def cycle(
@@ -53,7 +54,7 @@ def cycle(
         system = None if own is None else (own.cycle.system if what == "sections" else own.system)
         if system is not None and Structure(system).names != s.names:
             raise DefinitionError(f"`{what}` and the cycle belong to different systems.")
-    orbit = cycle.trajectory()
+    orbit = cycle.trajectory(_TURN)
     with axes_or_new(ax, height=3.0) as ax:
         if perturbed is not None:
             pieces = _pieces(perturbed, x, y)
