@@ -192,7 +192,7 @@ def find_limit_cycle(
     cycle that was not found mean nothing, and are NaN as a rule.
     """
     settings = Settings(rtol=1e-12, atol=1e-12) if settings is None else settings
-    traced = is_traced(system)
+    traced = is_traced((system, conserved))
     if not traced:
         require_x64(system)
         check_system(system)

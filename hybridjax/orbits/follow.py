@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.tracing import is_traced
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .cycle import LimitCycle
 from .solution_curve import Curve, Failure, Point
@@ -48,7 +49,7 @@ def follow(
 
     ```python
     branch = hj.follow(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0))
-    hj.plot.branch(branch, "v")
+    hj.plot.branch(branch, output="v")
     ```
 
     **Arguments:**
@@ -105,6 +106,11 @@ def _check(cycle, values, step) -> np.ndarray:
     if not isinstance(cycle, LimitCycle):
         raise DefinitionError(
             f"expected a LimitCycle, got {type(cycle).__name__}: use find_limit_cycle first."
+        )
+    if is_traced(cycle):
+        raise DefinitionError(
+            "a branch is followed where values are known: call `follow` outside of "
+            "JAX transformations, and differentiate `find_limit_cycle` at its points."
         )
     require_x64(cycle.system)
     if int(cycle.result) != Result.OK:

@@ -4,6 +4,8 @@ The paddle juggler's multipliers solve lambda^2 - (1 + a^2 + (1 + a)^2 s / g) la
 s the paddle's acceleration at the impact (Holmes 1982): all three kinds of points follow.
 """
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
 import hybridjax as hj
+
+from ..toys import Field
 
 
 m = hj.models
@@ -81,6 +85,48 @@ def test_bad_input(juggling):
         follow(juggling, "period", (0.1, 0.2))
     with pytest.raises(hj.DefinitionError, match="longest step"):
         follow(juggling, "A", (0.1, 0.2), step=0.0)
+    with pytest.raises(hj.DefinitionError, match="outside of JAX transformations"):
+        eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
+    with pytest.raises(hj.DefinitionError, match="turns must be a whole number, at least 1; got 0"):
+        hj.find_limit_cycle(juggling.system, turns=0)
+    with pytest.raises(hj.DefinitionError, match="closes after 1 turns, not 2"):
+        hj.find_limit_cycle(juggling.system, juggling, turns=2)
+
+
+class Spring(eqx.Module):
+    k: jax.Array = hj.parameter(1.5)
+
+
+class Pushed(hj.HybridSystem):
+    """x'' + x' / 5 + k x = cos t, with k in a part of the system."""
+
+    spring: Spring = eqx.field(default_factory=Spring)
+
+    def charts(self):
+        def field(t, q, u):
+            return q[1], jnp.cos(t) - 0.2 * q[1] - self.spring.k * q[0] + u[0]
+
+        return {"a": Field(("x", "v"), field)}
+
+    def period(self):
+        return 2 * jnp.pi
+
+
+@pytest.mark.slow
+def test_a_parameter_of_a_part():
+    """A linear oscillator: everything is known. Stiff enough, its multipliers circle the origin."""
+    cycle = hj.find_limit_cycle(Pushed(), hj.Guess("a", (0.0, 0.0)))
+    with pytest.raises(hj.DefinitionError, match="'spring.c'; parameters are spring.k"):
+        hj.follow(cycle, "spring.c", (1.0, 2.0))
+    branch = hj.follow(cycle, "spring.k", (1.4, 3.0))
+    assert not branch.points and branch.stable.all()
+    rate = -0.1 + 1j * np.sqrt(branch.values - 0.01)
+    truth = np.exp(2 * np.pi * rate)
+    truth = truth.real + 1j * np.abs(truth.imag)
+    np.testing.assert_allclose(branch.multipliers[:, 0], truth, atol=1e-10)
+    x = [float(branch[k].start.q[0, 0]) for k in (0, -1)]
+    k = branch.values[[0, -1]]
+    np.testing.assert_allclose(x, (k - 1) / ((k - 1) ** 2 + 0.04), rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -220,29 +266,3 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     assert branch.values[-1] == 30.0 and float(branch[-1].start.t[0]) != 0.5
     again = hj.find_limit_cycle(branch[-1].system, branch[-1])
     np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_running_at_one_energy():
-    """Cycles of a family, chosen by the quantity that is conserved."""
-    runner, apex = m.SLIPRunner(), hj.Crossing("vy", "falling")
-    with pytest.raises(hj.ComputationError, match="conserved={'energy'"):
-        hj.find_limit_cycle(runner, section=apex)
-    cycle = hj.find_limit_cycle(runner, section=apex, conserved={"energy": 1784.8})
-    state = [cycle.state["y"], cycle.state["vx"]]
-    np.testing.assert_allclose(state, [0.940267144379607, 5.11585365577165], rtol=1e-12)
-    np.testing.assert_allclose(cycle.period, 0.252532613817573, rtol=1e-11)
-    np.testing.assert_allclose(cycle.multipliers, [1, -0.161307631037475], rtol=1e-10)
-    assert cycle.multipliers[0] == 1 and cycle.stable and "(1: conserved energy)" in repr(cycle)
-    with pytest.raises(hj.DefinitionError, match="'y' is not conserved"):
-        hj.find_limit_cycle(runner, section=apex, conserved={"y": 0.94})
-    with pytest.raises(hj.DefinitionError, match="one finite number"):
-        hj.find_limit_cycle(runner, section=apex, conserved={"energy": np.nan})
-    with pytest.raises(hj.DefinitionError, match="no output 'momentum'"):
-        hj.find_limit_cycle(runner, section=apex, conserved={"momentum": 1.0})
-
-    branch = hj.follow(cycle, "k", (18000.0, 22000.0))
-    (flip,) = branch.points
-    assert flip.kind == "flip" and branch.stable[flip.index + 1 :].all()
-    energy = [runner.energy(0.0, jnp.asarray(branch[k].start.q[:3, 0]), 0.0) for k in (0, -1)]
-    np.testing.assert_allclose(energy, 1784.8, rtol=1e-11)

@@ -1,0 +1,67 @@
+"""Cycles of the SLIP runner, one for each energy.
+
+Numbers were computed apart from this package, with DOP853 and mpmath to 34 digits.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+pytestmark = pytest.mark.slow
+APEX = hj.Crossing("vy", "falling")
+
+
+@pytest.fixture(scope="module")
+def running():
+    return hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"energy": 1784.8})
+
+
+def test_one_cycle_of_a_family(running):
+    state = [running.state["y"], running.state["vx"]]
+    np.testing.assert_allclose(state, [0.940267144379607, 5.11585365577165], rtol=1e-12)
+    np.testing.assert_allclose(running.period, 0.252532613817573, rtol=1e-11)
+    np.testing.assert_allclose(running.multipliers, [1, -0.161307631037475], rtol=1e-10)
+    assert running.multipliers[0] == 1 and running.stable
+    assert "(1: conserved energy)" in repr(running)
+
+
+def test_families_are_named_where_none_is_chosen():
+    with pytest.raises(hj.ComputationError, match="conserved={'energy'"):
+        hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX)
+
+
+@pytest.mark.parametrize(
+    "conserved, words",
+    [({"y": 0.94}, "'y' is not conserved"), ({"energy": np.nan}, "one finite number"),
+     ({"momentum": 1.0}, "no output 'momentum'")],
+)  # fmt: skip
+def test_what_is_not_conserved_is_refused(conserved, words):
+    with pytest.raises(hj.DefinitionError, match=words):
+        hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved=conserved)
+
+
+def test_the_family_along_a_parameter(running):
+    branch = hj.follow(running, "k", (18000.0, 22000.0))
+    (flip,) = branch.points
+    assert flip.kind == "flip" and branch.stable[flip.index + 1 :].all()
+    runner = running.system
+    energy = [runner.energy(0.0, jnp.asarray(branch[k].start.q[:3, 0]), 0.0) for k in (0, -1)]
+    np.testing.assert_allclose(energy, 1784.8, rtol=1e-11)
+
+
+def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
+    def height(k, energy):
+        runner = eqx.tree_at(lambda x: x.k, running.system, k)
+        cycle = hj.find_limit_cycle(runner, running, conserved={"energy": energy})
+        return cycle.start.q[0, 0]
+
+    at = jnp.array(20000.0), jnp.array(1784.8)
+    by_k, by_energy = (jax.jvp(height, at, tangent)[1] for tangent in ((1.0, 0.0), (0.0, 1.0)))
+    for exact, step in ((by_k, (20.0, 0.0)), (by_energy, (0.0, 0.5))):
+        ends = [height(at[0] + s * step[0], at[1] + s * step[1]) for s in (-1, 1)]
+        np.testing.assert_allclose(exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5)
