@@ -108,11 +108,22 @@ from .orbits.sweep import (
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
 from .periodic.synthetic import synthetic_ldtp as synthetic_ldtp
+from .recordings.advice import (
+    Advice as Advice,
+    advise as advise,
+    choose_order as choose_order,
+    hold_out as hold_out,
+)
+from .recordings.impulse import (
+    ImpulseResponses as ImpulseResponses,
+    impulse_responses as impulse_responses,
+)
 from .recordings.phase import (
     AnglePhase as AnglePhase,
     EventPhase as EventPhase,
     estimate_phase as estimate_phase,
 )
+from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .recordings.sections import SectionData as SectionData, section_data as section_data
 from .recordings.simulated import (

@@ -166,7 +166,7 @@ def linearise(
     v = along_cycles(c, problem.u)
     for n in range(N):
         V = lagged(v, n, problem.lags, problem.lead) @ problem.maps[n]
-        E = _starts(problem, c, n)
+        E = responses_to_starts(c, problem.first[:, n], T, min(problem.free, T))
         regression = None
         for i in range(ny):
             good = problem.good[:, :, n, i]
@@ -186,11 +186,11 @@ def linearise(
     return Linearisation(residual, jacobian, freedom, b, slope, roots)
 
 
-def _starts(problem: Problem, c: Coefficients, n: int) -> Float[np.ndarray, "S T K"]:
-    """The responses to g in each of the first K cycles in which a record meets section n."""
-    S, T = problem.u.shape[:2]
-    K = min(problem.free, T)
-    place = problem.first[:, n, None] + np.arange(K)
+def responses_to_starts(
+    c: Coefficients, first: Int[np.ndarray, " S"], T: int, K: int
+) -> Float[np.ndarray, "S T K"]:
+    """The responses to g in each of the first K cycles, of T, in which a record meets a section."""
+    place = first[:, None] + np.arange(K)
     impulses = (np.arange(T)[:, None] == place[:, None]).astype(float)
     return along_cycles(c, impulses)
 

@@ -175,9 +175,19 @@ def fit_series(
         delayed = delayed_outputs(rescale(problem, _noise(found, order)), order)
         rows = max(delayed.freedom, 1)
         refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
-    covariance, freedom = _covariance(problem, c, found, errors)
+    about = _covariance(problem, c, found, errors)
+    result = Result.OK if converged else Result.NOT_CONVERGED
+    return _as_fit(problem, c, found, layout, *about, result)
 
-    nu, ny = layout.u.shape[3], layout.y.shape[3]
+
+def quick_fit(problem: Problem, c: np.ndarray, found: Linearisation, layout: Layout) -> SeriesFit:
+    """A fit with these coefficients, whatever they are worth, and an unknown covariance."""
+    unknown = np.full((len(c), len(c)), np.inf)
+    return _as_fit(problem, c, found, layout, unknown, np.inf, Result.NOT_CONVERGED)
+
+
+def _as_fit(problem, c, found, layout, covariance, freedom, result) -> SeriesFit:
+    N, nu, ny = layout.y.shape[2], layout.u.shape[3], layout.y.shape[3]
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
@@ -195,9 +205,9 @@ def fit_series(
         numerators=by_input(found.numerators),
         slopes=by_input(found.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
-        noise=_noise(found, order) * problem.scale,
+        noise=_noise(found, len(c)) * problem.scale,
         covariance_freedom=freedom,
-        result=Result.OK if converged else Result.NOT_CONVERGED,
+        result=result,
         sections=N,
         inputs=layout.inputs,
         outputs=layout.outputs,

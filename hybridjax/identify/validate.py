@@ -12,7 +12,9 @@ from scipy import stats
 
 from .._core.errors import DefinitionError
 from ..periodic.ldtp import LDTP
+from .prediction import predict
 from .records import Piece, Recorded, pieces_of
+from .series import SeriesFit
 
 
 _FEWEST = 8  # samples of a section, below which a correlation says nothing
@@ -80,7 +82,7 @@ class Validation(eqx.Module):
 
 
 def validate(
-    model: LDTP,
+    model: LDTP | SeriesFit,
     data: Recorded,
     *,
     start: Literal["free", "rest"] = "free",
@@ -99,8 +101,9 @@ def validate(
 
     **Arguments:**
 
-    - `model`: identified or exact. `data`: `ExperimentData`, a `Record` or several, best those
-      that the model was not made from; those that it was made from always fit too well.
+    - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is.
+    - `data`: `ExperimentData`, a `Record` or several, best those that the model was not made from;
+      those that it was made from always fit too well.
     - `start`: "free" estimates the state at the start of each record from it; "rest" takes it as
       zero.
     - `lags`: how many are looked at; default one period, less for few cycles.
@@ -151,7 +154,7 @@ def validate(
     )
 
 
-def check_model(model: LDTP, N: int, inputs, outputs) -> None:
+def check_model(model: LDTP | SeriesFit, N: int, inputs, outputs) -> None:
     of_data = {"sections": N, "inputs": inputs, "outputs": outputs}
     for name, value in of_data.items():
         if getattr(model, name) != value:
@@ -160,8 +163,12 @@ def check_model(model: LDTP, N: int, inputs, outputs) -> None:
             )
 
 
-def simulate_piece(model: LDTP, piece: Piece, free: bool) -> Float[np.ndarray, "n ny"]:
+def simulate_piece(
+    model: LDTP | SeriesFit, piece: Piece, free: bool
+) -> Float[np.ndarray, "n ny"]:
     """The outputs of the model, from the state that fits the record best, or from rest."""
+    if isinstance(model, SeriesFit):
+        return predict(model, piece, free)
     forced = np.asarray(model.simulate(piece.u, start=piece.start))
     if not free:
         return forced

@@ -7,8 +7,8 @@ import hybridjax as hj
 @pytest.fixture(scope="session")
 def hopper_recording(hopper_cycle):
     """200 strides of the paper's hopper under a random force, without noise."""
-    force = hj.random_force(200, 100, 8, rms=0.02, seed=0)
-    return hj.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=100)
+    force = hj.random_force(200, 64, 8, rms=0.02, seed=0)
+    return hj.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from hybridjax.recordings.spoil import spoil
 def test_five_lines(hopper_recording, hopper_cycle, angle):
     data = hj.section_data(hopper_recording, angle, inputs="u", outputs=("yM", "vM"), sections=16)
     fit = hj.fit_series(data.records, order=2)
-    assert fit.compare(hopper_cycle.multipliers).max_error < 1e-3
+    assert fit.compare(hopper_cycle.multipliers).max_error < 2e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
     assert "199.94 cycles" in repr(data)
 

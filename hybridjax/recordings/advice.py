@@ -1,0 +1,213 @@
+"""What the data cannot carry, in plain words."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.errors import DefinitionError
+from .._core.results import Result
+from ..identify.compare import compare_multipliers
+from ..identify.estimate import roots_of
+from ..identify.prediction import predict
+from ..identify.records import Record, lay_out, pieces_of
+from ..identify.regression import initial, lagged, linearise, set_up
+from ..identify.series import SeriesFit, fit_series, quick_fit
+from ..identify.validate import Validation, validate
+from .sections import SectionData
+from .spectra import input_band, input_spectrum
+
+
+_FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are few
+_WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
+_LOST = 0.2  # of all samples
+_TIE = 0.02  # relative difference of misfits that are as good as equal
+
+
+def plain_regression(
+    data: SectionData | tuple[Record, ...], order: int
+) -> Complex[np.ndarray, " d"]:
+    """Multipliers by least squares on chi y = B u (ARX), which noise in y biases towards zero.
+
+    To see by how much: `fit_series` has no such bias.
+    """
+    layout = lay_out(data.records if isinstance(data, SectionData) else data)
+    problem = set_up(layout, order, layout.y.shape[2], False)
+    _, T, N, ny = problem.y.shape
+    gram = np.zeros((order + 1, order + 1))
+    for n in range(N):
+        V = lagged(problem.u, n, problem.lags, problem.lead) @ problem.maps[n]
+        late = np.arange(T) >= problem.first[:, n, None] + problem.free
+        for i in range(ny):
+            delays = range(order + 1)
+            rows = late & np.all([np.roll(problem.good[:, :, n, i], j, 1) for j in delays], axis=0)
+            Z = np.stack([np.roll(problem.y[:, :, n, i], j, 1)[rows] for j in delays], axis=1)
+            Z = Z - V[rows] @ np.linalg.lstsq(V[rows], Z)[0]
+            gram += Z.T @ Z
+    return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
+
+
+def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
+    """The number of multipliers that predicts best what it was not fitted to.
+
+    For each number a first, consistent estimate (total least squares) is made from all but the last
+    `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
+    within 2 % of the best one.
+
+    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
+    """
+    early, late = _split(data, share)
+    layout = lay_out(early)
+    rest = pieces_of(late).pieces
+    misfits = []
+    for d in range(1, most + 1):
+        problem = set_up(layout, d, layout.y.shape[2], False)
+        c = initial(problem, d)
+        found = linearise(problem, c)
+        if (found.freedom <= 2 * d).any():
+            break
+        fit = quick_fit(problem, c, found, layout)
+        error = np.concatenate([predict(fit, p, True) - p.y for p in rest])
+        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
+    if not misfits:
+        raise DefinitionError(
+            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.sections} "
+            "sections: record more, or take fewer sections."
+        )
+    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _TIE))
+
+
+class HeldOut(NamedTuple):
+    """A fit to the first part of each record, tried on the rest."""
+
+    fit: SeriesFit
+    validation: Validation
+
+
+def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
+    """Fit all but the last `share` of every record, and simulate that.
+
+    **Raises:** `DefinitionError` if too few cycles are left for either.
+    """
+    if not 0 < share < 1:
+        raise DefinitionError(f"share must lie between 0 and 1, not {share}.")
+    early, late = _split(data, share)
+    fit = fit_series(early, order, check=False)
+    return HeldOut(fit, validate(fit, late))
+
+
+def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
+    early, late = [], []
+    for r in data.records:
+        cut = round(len(r.u) * (1 - share))
+        early.append(_part(r, slice(0, cut)))
+        late.append(_part(r, slice(cut, None)))
+    return early, late
+
+
+def _part(record: Record, rows: slice) -> Record:
+    start = (record.start + rows.start) % record.sections
+    return Record(
+        record.u[rows],
+        record.y[rows],
+        sections=record.sections,
+        start=start,
+        inputs=record.inputs,
+        outputs=record.outputs,
+        lead=record.lead,
+    )
+
+
+class Advice(eqx.Module):
+    """What to know before the numbers of a fit are believed. Printing it shows the warnings.
+
+    **Fields:**
+
+    - `warnings`: sentences; none if nothing speaks against the fit.
+    - `plain` (d,): the multipliers that plain regression (ARX) gives, and `bias`, how far they are
+      from those of the fit.
+    - `band`: for each input the frequency (cycles per period) up to which it had power.
+    - `strides`: numbers of strides, and `expected` (k, d): the standard errors of the multipliers
+      to be expected with so many like these.
+    """
+
+    warnings: tuple[str, ...] = eqx.field(static=True)
+    plain: Complex[np.ndarray, " d"]
+    bias: float = eqx.field(static=True)
+    band: tuple[float, ...] = eqx.field(static=True)
+    strides: tuple[int, ...] = eqx.field(static=True)
+    expected: Float[np.ndarray, "k d"]
+
+    def __repr__(self) -> str:
+        return "\n".join(self.warnings) or "Nothing speaks against the fit."
+
+
+def advise(data: SectionData, fit: SeriesFit) -> Advice:
+    """Look for what makes a fit to recorded data worth less than it says.
+
+    Too few strides for the unknowns, inputs without power where the multipliers are, noise that
+    would bias plain regression, intervals that reach the unit circle, an iteration that did not
+    end.
+    """
+    found = []
+    N, R, _, nu = fit.numerators.shape
+    d = len(fit.multipliers)
+    layout = lay_out(data.records)
+    sampled = np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min()
+    unknown = R * nu + len(layout.y) * (d + 1)
+    if sampled - unknown < _FEW * sampled:
+        found.append(
+            f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
+            "record more, take fewer sections, or excite fewer inputs."
+        )
+    f, power = input_spectrum(data)
+    resonance = np.abs(np.angle(fit.multipliers)) / (2 * np.pi)
+    for i, name in enumerate(fit.inputs):
+        mean = power[:, i].mean()
+        for m, at in zip(fit.multipliers, resonance, strict=True):
+            near = np.abs((f - at + 0.5) % 1 - 0.5) < 0.1
+            mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < 0.1
+            if m.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK * mean:
+                found.append(
+                    f"Weak excitation: {name} has next to no power at the frequencies "
+                    f"{at:.2f} + k cycles per period, where the multiplier {m:.3g} is seen."
+                )
+    band = input_band(data)
+    for name, edge in zip(fit.inputs, band, strict=True):
+        if edge < 1:
+            found.append(
+                f"Narrow excitation: {name} has power only up to {edge:.2g} cycles per period, so "
+                "that responses at different phases can hardly be told apart."
+            )
+        elif edge < 0.9 * N / 2:
+            found.append(
+                f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
+                f"where the power of {name} ends."
+            )
+    plain = plain_regression(data, d)
+    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
+    if bias > 2 * fit.standard_errors.max():
+        found.append(
+            f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
+            "use it here."
+        )
+    for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
+        if z.imag >= 0 and abs(z) + 2 * error > 1:
+            found.append(
+                f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
+            )
+    if fit.result != Result.OK:
+        found.append(f"The fit did not end: {Result(fit.result).message}.")
+    if data.missing > _LOST:
+        found.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
+    strides = (100, 300, 1000, 3000)
+    now = max(sampled - unknown, 1)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
+    with np.errstate(divide="ignore"):
+        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
+    return Advice(tuple(found), plain, bias, tuple(band), strides, expected)
+
+
+def _list(values) -> str:
+    return ", ".join(f"{z:.3g}" for z in values)

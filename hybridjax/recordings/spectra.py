@@ -1,0 +1,34 @@
+"""At which frequencies the inputs of a recording had power."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy import signal
+
+from ..identify.records import pieces_of
+from .sections import SectionData
+
+
+_EDGE = 0.01  # of the largest power: below that an input tells nothing
+_CYCLES = 16  # in one window, at most
+
+
+def input_spectrum(
+    data: SectionData,
+) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
+    """Frequencies in cycles per period, and power spectral densities there (Welch 1967)."""
+    pieces, N, inputs, _, _ = pieces_of(data.records)
+    length = N * max(1, min(_CYCLES, max(len(p.u) for p in pieces) // (2 * N)))
+    total, weight = np.zeros((length // 2 + 1, len(inputs))), 0
+    f = np.fft.rfftfreq(length, 1 / N)
+    for piece in pieces:
+        if len(piece.u) >= length:
+            _, power = signal.welch(piece.u, N, nperseg=length, axis=0)
+            total, weight = total + len(piece.u) * power, weight + len(piece.u)
+    return f, total / max(weight, 1)
+
+
+def input_band(data: SectionData) -> list[float]:
+    """For each input, the frequency (cycles per period) above which it has next to no power."""
+    f, power = input_spectrum(data)
+    strong = power > _EDGE * power.max(axis=0)
+    return [float(f[np.flatnonzero(s)[-1]]) if s.any() else 0.0 for s in strong.T]
