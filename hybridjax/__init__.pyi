@@ -114,6 +114,10 @@ from .recordings.advice import (
     choose_order as choose_order,
     hold_out as hold_out,
 )
+from .recordings.identification import (
+    Identification as Identification,
+    identify_recording as identify_recording,
+)
 from .recordings.impulse import (
     ImpulseResponses as ImpulseResponses,
     impulse_responses as impulse_responses,
@@ -125,6 +129,7 @@ from .recordings.phase import (
 )
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
+from .recordings.report import write_report as write_report
 from .recordings.sections import SectionData as SectionData, section_data as section_data
 from .recordings.simulated import (
     random_force as random_force,

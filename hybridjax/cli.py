@@ -46,7 +46,76 @@ def _parser() -> argparse.ArgumentParser:
     add("--quick", action="store_true",
         help="a short form: 20 experiments of 36 cycles, the last 16 kept")  # fmt: skip
     reproduce.set_defaults(run=_reproduce)
+    _add_identify(commands)
     return parser
+
+
+def _add_identify(commands) -> None:
+    identify = commands.add_parser(
+        "identify",
+        help="find the multipliers of a recorded rhythm",
+        description="From recorded signals (CSV, NPZ or Parquet, a trial in each file) to Floquet "
+        "multipliers, harmonic transfer functions and impulse responses, with a report.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = identify.add_argument
+    add("files", nargs="+", metavar="FILE", help="one trial in each; the first line of a CSV file "
+        "names its columns")  # fmt: skip
+    add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
+    add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
+    phase = identify.add_mutually_exclusive_group(required=True)
+    phase.add_argument("--phase", type=_names, metavar="X,V",
+        help="two signals whose angle about the centre is the phase")  # fmt: skip
+    phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
+    add("--center", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
+    add("--scale", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
+    add("--out", required=True, metavar="DIR", help="folder for the results; made if needed")
+    add("--sections", type=_count, default=32, metavar="N", help="sections in each cycle")
+    add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
+    add("--bandwidth", type=float, metavar="HZ", help="of the splines through the outputs; by "
+        "default N per period")  # fmt: skip
+    add("--time", default="time", metavar="NAME", help="column with the times")
+    add("--crossings", choices=("clock", "duration"), help="an extra output from the times at "
+        "which sections are crossed: for systems with a clock, or without")  # fmt: skip
+    add("--drift", type=float, metavar="CYCLES", help="remove changes of the cycle that take "
+        "longer than this")  # fmt: skip
+    identify.set_defaults(run=_identify)
+
+
+def _identify(options) -> None:
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import pathlib
+
+    import matplotlib
+
+    matplotlib.use("Agg")  # files only
+    from ._core.errors import DefinitionError
+    from ._core.precision import enable_x64
+    from .recordings.identification import identify_recording
+    from .recordings.phase import AnglePhase, EventPhase
+    from .recordings.read import read_recording
+    from .recordings.report import check_folder, write_report
+
+    enable_x64()
+    check_folder(pathlib.Path(options.out))
+    for name in ("phase", "center", "scale"):
+        value = getattr(options, name)
+        if value is not None and len(value) != 2:
+            raise DefinitionError(f"--{name} needs two entries with a comma in between.")
+    recording = read_recording(*options.files, time=options.time)
+    print(recording)
+    if options.event is None:
+        phase = AnglePhase(*options.phase, center=options.center, scale=options.scale)
+    else:
+        phase = EventPhase(options.event)
+    found = identify_recording(
+        recording, phase, inputs=options.input, outputs=options.outputs,
+        sections=options.sections, order=options.order, bandwidth=options.bandwidth,
+        time=options.crossings, drift=options.drift,
+    )  # fmt: skip
+    print(found)
+    print(write_report(found, options.out))
 
 
 def _reproduce(options) -> None:
@@ -80,6 +149,17 @@ def _count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not a positive whole number")
     return value
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(","))
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(x) for x in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers") from None
 
 
 def _assignment(text: str) -> tuple[str, float]:

@@ -1,0 +1,160 @@
+"""Figures of recordings: phase, section data, impulse responses."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Complex
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..identify.series import SeriesFit
+from ..plot.look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
+from .impulse import ImpulseResponses
+from .phase import Phase
+from .sections import SectionData
+from .spectra import input_spectrum
+
+
+def plot_phase(phase: Phase) -> Figure:
+    """Periods of the cycles, one after the other, and how they are distributed."""
+    with style():
+        figure, axes = new_figure(1, 2, width=PAGE, height=2.2, width_ratios=(3, 1))
+        left, right = axes[0]
+        first = 0
+        for k, periods in enumerate(phase.periods):
+            at = first + np.arange(len(periods))
+            left.plot(at, periods, ".", ms=2, color=CYCLE[k % len(CYCLE)])
+            first += len(periods)
+        left.axhline(phase.period, color="black", lw=0.6)
+        left.set(xlabel="cycle (trials in different colours)", ylabel="period (s)")
+        right.hist(
+            np.concatenate(phase.periods), bins=30, orientation="horizontal", color=COLORS["grey"]
+        )
+        right.set_ylim(left.get_ylim())
+        right.tick_params(labelleft=False)
+        right.set(xlabel="cycles")
+        letters(axes)
+    return figure
+
+
+def plot_sections(data: SectionData, *, labels: Mapping[str, str] | None = None) -> Figure:
+    """For each signal the average cycle, the deviations from it, and the input's spectrum.
+
+    Left: the average cycle. Middle: deviations against phase, grey, with twice their standard
+    deviation. Right: the power of inputs against frequency, for outputs the deviation at section 0
+    from cycle to cycle.
+    """
+    N = data.sections
+    names = data.inputs + data.outputs
+    cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
+    f, power = input_spectrum(data)
+    phase = np.arange(N) / N
+    with style():
+        figure, axes = new_figure(len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names))
+        for i, name in enumerate(names):
+            average, spread, last = axes[i]
+            unit = f" ({data.units[i]})" if data.units[i] else ""
+            label = label_of(name, labels)
+            average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
+            average.set_ylabel(label + unit)
+            values = np.concatenate(
+                [np.concatenate([r.u, r.y], axis=1)[:, i] for r in data.records]
+            )
+            at = np.concatenate([(r.start + np.arange(len(r.u))) % N for r in data.records])
+            thin = slice(None, None, max(1, len(at) // 20000))
+            spread.plot(at[thin] / N, values[thin], ",", color=COLORS["grey"], rasterized=True)
+            std = np.array([np.nanstd(values[at == n]) for n in range(N)])
+            for sign in (-2, 2):
+                spread.plot(phase, sign * std, color=CYCLE[0])
+            spread.set_ylabel(rf"$\delta$ {label}{unit}")
+            if i < len(data.inputs):
+                last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
+                last.set(xlabel="frequency (cycles/period)", ylabel="power")
+            else:
+                each = [
+                    np.flatnonzero((r.start + np.arange(len(r.u))) % N == 0) for r in data.records
+                ]
+                y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]
+                last.plot(np.concatenate(y), lw=0.5, color=CYCLE[1])
+                last.set(xlabel="cycle", ylabel=rf"$\delta$ {label}{unit}")
+        for ax in axes[-1, :2]:
+            ax.set_xlabel("phase (cycles)")
+        figure.align_ylabels(axes)
+        letters(axes)
+    return figure
+
+
+def plot_impulse_responses(
+    found: ImpulseResponses, *, input: int = 0, labels: Mapping[str, str] | None = None
+) -> Figure:
+    """Left: responses to a push against its phase and the time since. Right: some of them with
+    bands of 95 %."""
+    ny, N = len(found.outputs), len(found.phase)
+    chosen = [0, N // 4, N // 2, 3 * N // 4]
+    with style():
+        figure, axes = new_figure(ny, 2, width=PAGE, height=0.4 + 1.9 * ny)
+        for i, name in enumerate(found.outputs):
+            plane, curves = axes[i]
+            values = found.values[:, :, i, input]
+            top = np.abs(values).max()
+            image = plane.pcolormesh(
+                found.lag, found.phase, values, cmap="RdBu_r", vmin=-top, vmax=top,
+                rasterized=True, shading="nearest",
+            )  # fmt: skip
+            figure.colorbar(image, ax=plane, label=label_of(name, labels))
+            plane.set_ylabel("phase of the push")
+            for k, m in enumerate(dict.fromkeys(chosen)):
+                band = 1.96 * found.errors[m, :, i, input]
+                line = {"color": CYCLE[k % len(CYCLE)]}
+                curves.plot(found.lag, values[m], label=f"phase {found.phase[m]:.2f}", **line)
+                curves.fill_between(
+                    found.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
+                )
+            curves.axhline(0, color="black", lw=0.4)
+            curves.set_ylabel(f"{label_of(name, labels)} / impulse")
+        axes[0, 1].legend(loc="upper right")
+        for ax in axes[-1]:
+            ax.set_xlabel("time since the push (cycles)")
+        letters(axes)
+    return figure
+
+
+def plot_multipliers(
+    fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: Axes | None = None
+) -> Axes:
+    """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
+    are small; beside them those of plain regression, if given."""
+    with axes_or_new(ax, height=3.4) as ax:
+        circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
+        leading = fit.multipliers[0]
+        reach = 0.0
+        if np.isfinite(fit.covariance).all():
+            reach = 2 * np.abs(fit.ellipse(0) - leading).max()
+        boxes = [ax]
+        if 0 < reach < 0.1:
+            corner = 0.02 if leading.real > 0 else 0.64
+            boxes.append(ax.inset_axes((corner, 0.02, 0.34, 0.34)))
+            boxes[1].set(
+                xlim=(leading.real - reach, leading.real + reach),
+                ylim=(leading.imag - reach, leading.imag + reach),
+            )
+            boxes[1].tick_params(labelsize="xx-small", length=2)
+            boxes[1].locator_params(nbins=3)
+            ax.indicate_inset_zoom(boxes[1], edgecolor="0.4")
+        for box in boxes:
+            box.plot(circle.real, circle.imag, color=COLORS["grey"], lw=0.6, zorder=0)
+            if plain is not None:
+                box.plot(
+                    plain.real, plain.imag, "x", color=COLORS["red"], ms=5, label="plain regression"
+                )
+            z = fit.multipliers
+            box.plot(z.real, z.imag, "o", mfc="none", color=CYCLE[0], label="output error")
+            if reach:
+                for i in range(len(z)):
+                    border = fit.ellipse(i)
+                    box.fill(border.real, border.imag, color=CYCLE[0], alpha=0.3, lw=0)
+            box.set_aspect("equal")
+        far = 1.1 * max(1.0, np.abs(fit.multipliers).max())
+        ax.set(xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$")
+        ax.legend(loc="upper left")
+    return ax

@@ -1,0 +1,69 @@
+"""All steps from a recording to multipliers, in one call."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+
+from ..identify.series import SeriesFit, fit_series
+from .advice import Advice, HeldOut, advise, choose_order, hold_out
+from .impulse import ImpulseResponses, impulse_responses
+from .phase import Definition, Phase, estimate_phase
+from .recording import Recording
+from .sections import SectionData, section_data
+
+
+class Identification(eqx.Module):
+    """What was found in a recording, step by step.
+
+    **Fields:** `recording`; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a
+    fit to the first three quarters, tried on the last; `responses` to pushes; `advice`.
+    """
+
+    recording: Recording
+    phase: Phase
+    data: SectionData
+    fit: SeriesFit
+    held_out: HeldOut
+    responses: ImpulseResponses
+    advice: Advice
+
+    def __repr__(self) -> str:
+        parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
+        return "\n".join(map(repr, parts))
+
+
+def identify_recording(
+    recording: Recording,
+    phase: Phase | Definition,
+    *,
+    inputs: str | Sequence[str],
+    outputs: str | Sequence[str],
+    sections: int = 32,
+    order: int | None = None,
+    **options: Any,
+) -> Identification:
+    """From a recording to multipliers, transfer functions, impulse responses and what to think of
+    them.
+
+    **Arguments:** as for `section_data`, and
+
+    - `order`: the number of multipliers; None lets `choose_order` find it.
+
+    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
+    """
+    if not isinstance(phase, Phase):
+        phase = estimate_phase(recording, phase)
+    about = {"inputs": inputs, "outputs": outputs, "sections": sections}
+    data = section_data(recording, phase, **about, **options)
+    order = choose_order(data) if order is None else order
+    fit = fit_series(data.records, order, check=False)
+    return Identification(
+        recording,
+        phase,
+        data,
+        fit,
+        hold_out(data, order),
+        impulse_responses(fit, data),
+        advise(data, fit),
+    )
