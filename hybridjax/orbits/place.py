@@ -197,7 +197,7 @@ def _place(
         again = jnp.where((i == 0) & ~first, 1, 0)
         target = Target(
             jnp.where(stay, lanes.t, bound.time[i] + again * period),
-            i[None],
+            jnp.where(stay, -1, i)[None],
             bound.event[i][None],
             lanes.t + 1.5 * period,
             None,
@@ -287,8 +287,12 @@ def _check(placed: PlacedSections, first: int) -> None:
     for i, code in enumerate(np.asarray(placed.result)):
         if code != Result.OK:
             reason = Result(int(code)).message
+            hint = ""
+            if code == Result.SECTION_MISSED:
+                hint = " Does it lie on an event of the cycle? Then move it a little."
             raise ComputationError(
-                f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: {reason}."
+                f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: "
+                f"{reason}.{hint}"
             )
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):

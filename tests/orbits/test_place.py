@@ -55,6 +55,18 @@ def test_a_number_as_the_anchor(hopper_cycle):
     np.testing.assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
 
 
+@pytest.mark.parametrize("offset", np.linspace(-0.3, 0.3, 5))
+def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset):
+    """On which side of it is no matter; it was taken for a section that is touched."""
+    center, scale = (1.9, float(offset)), (0.3, 1.9)
+    family = hj.KinematicPhase(
+        4, position="yM", velocity="vM", center=center, scale=scale, start=APEX
+    )
+    placed = hj.place_sections(hopper_cycle, family)
+    np.testing.assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
+    assert abs(placed.lanes.q[1, 0]) < 1e-12
+
+
 def test_sections_follow_the_cycle_of_another_hopper(hopper_cycle, lossy_cycle):
     """A family is a definition, bound to no cycle: its anchor moves with the apex."""
     family = hj.ClockPhase(32, start=APEX)
