@@ -23,7 +23,7 @@ from .partition import (
 def multisine(
     sections: int = 32,
     periods: int = 64,
-    f_max: Number = 10.0,
+    f_max: Number | None = None,
     amplitude: Number | Callable = 0.01,
     seed: int = 0,
     *,
@@ -46,7 +46,8 @@ def multisine(
     **Arguments:**
 
     - `sections`: N. `periods`: P, the periods in one window; the resolution is 1/P.
-    - `f_max`, `f_min`: the band in cycles per period, both ends included.
+    - `f_max`, `f_min`: the band in cycles per period, both ends included; by default up to 10 as in
+      the paper, or to N/2 where that is less.
     - `amplitude`: of each cosine, or a function of an array of f that gives it. `Design.scaled`
       sets the rms value of the signals. `seed`: of the phases and the division.
     - `lines`: `"odd"` takes odd j only (P must be even). A distortion of even order then answers
@@ -78,6 +79,7 @@ def multisine(
     _check_choices(
         half_integers, second_order, lines, phases, excite, periods, highest_harmonic, experiments
     )
+    f_max = min(10.0, sections / 2) if f_max is None else f_max
     j = _band(sections, periods, f_min, f_max, half_integers, lines)
     # A frequency that needs two phases stands twice; `second` marks its second appearance.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, sections)]]))
