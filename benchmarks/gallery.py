@@ -3,8 +3,9 @@
 For each case of `gallery_cases.py`: the cycle; its multipliers and their error against what is
 known of them, relative to the largest; the exact harmonic transfer functions between the sections
 stated there, m = -1, 0, 1, from the input to the output; and their estimate from a batch of
-experiments (multisines on odd lines up to f = 4, or N/2 if that is less, 32 periods), with its
-largest error relative to the largest |H_0|. An unstable cycle has no experiments.
+experiments (multisines on odd lines up to f = 4, or N/2 if that is less, two windows of 32 periods,
+of which the first is discarded), with its largest error relative to the largest |H_0|. An unstable
+cycle has no experiments.
 
     python benchmarks/gallery.py --out DIR [--only NAME ...]
 
@@ -45,7 +46,7 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     estimate = None
     if case.amplitude:
         data = hj.run_experiments(
-            cycle, placed, design, case.output, start=case.start, accuracy=1e-11
+            cycle, placed, design, case.output, start=case.start, discard=PERIODS, accuracy=1e-11
         )
         assert data.ok.all(), data.summary()
         estimate = hj.estimate_htf(data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2])
@@ -123,11 +124,11 @@ def branches(path: Path) -> None:
 
 
 def save(figure, path: Path) -> None:
-    """As a small file: few colours are enough."""
+    """As a small file: a palette is enough."""
     figure.savefig(path, dpi=90)
     pyplot.close(figure)
     with Image.open(path) as image:
-        image.convert("RGB").quantize(48).save(path, optimize=True)
+        image.convert("RGB").quantize(128).save(path, optimize=True)
 
 
 def table(rows: dict[str, dict]) -> str:

@@ -78,7 +78,7 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "long gait": lambda: Case(
         "simplest walker, long gait", m.SimplestWalker(),
-        _levels("heelstrike", "th", "falling", 0.15, -0.15), "w", "hip torque", 1e-5,
+        _levels("heelstrike", "th", "falling", 0.15, -0.15), "w", "hip torque", 2e-6,
         _pair(-0.190099841065888 + 0.557598776682068j), _MPMATH, ("th", "w"),
         section=hj.AtEvent("heelstrike"),
     ),
@@ -90,7 +90,7 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "compass gait": lambda: Case(
         "compass gait", m.CompassGait(), _levels("heelstrike", "s", "falling", 0.15, -0.25),
-        "vs", "hip torque", 1e-2,
+        "vs", "hip torque", 1e-3,
         [*_pair(-0.199726126830030 + 0.544476062094737j), 0.131572624077177], _MPMATH,
         ("s", "vs"), section=hj.AtEvent("heelstrike"),
     ),

@@ -61,6 +61,7 @@ def branch(
         ax.plot([], [], "-", color=grey, label="stable")
         ax.plot([], [], "--", color=grey, label="unstable")
         ax.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
+        ax.locator_params(axis="x", nbins=6)
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return ax
 

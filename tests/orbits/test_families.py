@@ -62,6 +62,6 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
 
     at = jnp.array(20000.0), jnp.array(1784.8)
     by_k, by_energy = (jax.jvp(height, at, tangent)[1] for tangent in ((1.0, 0.0), (0.0, 1.0)))
-    for exact, step in ((by_k, (20.0, 0.0)), (by_energy, (0.0, 0.5))):
+    for exact, step in ((by_k, (4.0, 0.0)), (by_energy, (0.0, 0.05))):
         ends = [height(at[0] + s * step[0], at[1] + s * step[1]) for s in (-1, 1)]
         np.testing.assert_allclose(exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5)
