@@ -135,6 +135,12 @@ from .recordings.simulated import (
     random_force as random_force,
     simulate_recording as simulate_recording,
 )
+from .recordings.tables import (
+    add_command as add_command,
+    read_design as read_design,
+    write_design as write_design,
+)
+from .recordings.tracker import PhaseTracker as PhaseTracker
 from .store import (
     StoredExperiments as StoredExperiments,
     store_experiments as store_experiments,

@@ -240,19 +240,24 @@ def _covariance(problem: Problem, c, found: Linearisation, errors: str):
     noise = noise @ noise.T / _PROBES
     parts = np.einsum("istnac,jstnac->stij", found.jacobian, found.jacobian)
     square = parts.sum(axis=(0, 1))
-    if errors == "white":
+    if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
         return sandwich(square - noise, square)
     # A residual is smaller than the error, by the share of its equation in the unknowns.
-    left = found.freedom / np.maximum(problem.good.sum(axis=(0, 1)), 1)
-    error = found.residual / np.sqrt(np.maximum(left, 1e-3))[..., None]
+    error = found.residual / np.sqrt(np.maximum(1 - found.leverage, 1e-3))[..., None]
     score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
     gradient = np.einsum("sti,stj->ij", score, score)
+    # The scores add up to zero at the minimum, which takes this part of their covariance away.
+    half = np.linalg.inv(np.linalg.cholesky(square))
+    share = np.einsum("ij,stjk,lk->stil", half, parts, half)
+    taken = (share**2).sum()
     slowest = np.clip(np.abs(roots_of(c)).max(), 1e-3, 0.99)
     lags = int(min(np.ceil(np.log(0.1) / np.log(slowest)), problem.y.shape[1] // 4))
     weights = 1 - np.arange(1, lags + 1) / (lags + 1)
     for k, w in enumerate(weights, 1):
         product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
         gradient += w * (product + product.T)
+        taken += 2 * w * (share[:, k:] * share[:, :-k]).sum()
+    gradient /= max(1 - taken / d, 0.5)
     covariance, freedom = sandwich(square - noise, gradient, parts.reshape(-1, d, d))
     return covariance, freedom / (1 + 2 * float((weights**2).sum()))
 

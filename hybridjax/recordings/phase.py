@@ -11,10 +11,12 @@ from scipy.interpolate import PchipInterpolator
 from .._core.errors import DefinitionError
 from .recording import Recording, Trial
 from .smoothing import FEWEST, spline
+from .tracker import track
 
 
 _BREAK = 0.25  # of a cycle: the turns in a longer gap cannot be counted
 _HARMONICS = 32  # bandwidth of the angle's signals, in cycles per cycle
+_LEAP = 1e-6  # of a cycle, in which a phase leaps or waits
 _TAILS = 0.01  # of the samples at either end, which say nothing of the range
 
 
@@ -140,14 +142,16 @@ class Phase(eqx.Module):
 Definition = AnglePhase | EventPhase | Callable[[np.ndarray, Mapping[str, np.ndarray]], Any]
 
 
-def estimate_phase(recording: Recording, definition: Definition) -> Phase:
-    """The phase of every trial, offline.
+def estimate_phase(recording: Recording, definition: Definition, *, causal: bool = False) -> Phase:
+    """The phase of every trial.
 
     **Arguments:**
 
     - `definition`: an `AnglePhase`, an `EventPhase`, or a function of the times (n,) and the
       signals by name, that returns an angle (n,) in rad, with or without its whole turns, NaN where
       it is not known.
+    - `causal`: from the past only, as hardware in real time would find it: an angle by a
+      `PhaseTracker`; from events by the duration of the last cycle.
 
     Angles that run backwards in noise are replaced by the mean of the two monotone envelopes, one
     from below and one from above. Stretches end at gaps longer than a quarter of a cycle.
@@ -156,9 +160,9 @@ def estimate_phase(recording: Recording, definition: Definition) -> Phase:
     wind, or a recording of less than two cycles.
     """
     if isinstance(definition, EventPhase):
-        return _from_events(recording, definition)
+        return _from_events(recording, definition, causal)
     if isinstance(definition, AnglePhase):
-        angles = _angles(recording, definition)
+        angles = _angles(recording, definition, smooth=not causal)
     elif callable(definition):
         angles = [_from_function(recording, trial, definition) for trial in recording.trials]
     else:
@@ -175,6 +179,8 @@ def estimate_phase(recording: Recording, definition: Definition) -> Phase:
             if len(part) < FEWEST:
                 continue
             phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
+            if causal:
+                phase = track(time[part], angle[part], rate)
             backwards += int((np.diff(phase) < 0).sum())
             total += len(part)
             if (winding := _monotone(time[part], phase)) is not None:
@@ -183,7 +189,7 @@ def estimate_phase(recording: Recording, definition: Definition) -> Phase:
     return _phase(stretches, backwards / max(total, 1))
 
 
-def _angles(recording: Recording, definition: AnglePhase):
+def _angles(recording: Recording, definition: AnglePhase, smooth: bool):
     """Times and angles, modulo whole turns, of each trial."""
     columns = [recording.column(x) for x in (definition.position, definition.velocity)]
     everything = np.concatenate([t.values[:, columns] for t in recording.trials])
@@ -212,7 +218,10 @@ def _angles(recording: Recording, definition: AnglePhase):
                 f"{definition.velocity}: too few for a phase."
             )
         found.append((trial.time[both], (trial.values[both][:, columns] - center) / scale))
-    rate = abs(_turns_per_time([(time, angle(z)) for time, z in found]))
+    rough = [(time, angle(z)) for time, z in found]
+    rate = abs(_turns_per_time(rough))
+    if not smooth:
+        return rough
     bandwidth = definition.bandwidth or _HARMONICS * rate
     return [
         (time, angle(np.stack([spline(time, x, bandwidth).values for x in z.T], axis=1)))
@@ -254,7 +263,7 @@ def _monotone(time, phase) -> Winding | None:
     return Winding(time[rising], phase[rising], linear=False)
 
 
-def _from_events(recording: Recording, definition: EventPhase) -> Phase:
+def _from_events(recording: Recording, definition: EventPhase, causal: bool) -> Phase:
     name, times = definition.event, []
     for trial in recording.trials:
         if name not in trial.events:
@@ -284,8 +293,26 @@ def _from_events(recording: Recording, definition: EventPhase) -> Phase:
         wide = np.flatnonzero(np.diff(t) > 1.5 * period) + 1
         missed += sum(round(float(t[k] - t[k - 1]) / period) for k in wide)
         parts = [part for part in np.split(t, wide) if len(part) > 1]
-        stretches.append(tuple(Winding(p, np.arange(len(p), dtype=float), True) for p in parts))
-    return _phase(stretches, 0.0, dropped, missed, lead=1)
+        if causal:
+            stretches.append(tuple(_extrapolated(p) for p in parts if len(p) > 2))
+        else:
+            stretches.append(tuple(Winding(p, np.arange(len(p), dtype=float), True) for p in parts))
+    return _phase(stretches, 0.0, dropped, missed, lead=0 if causal else 1)
+
+
+def _extrapolated(t: Float[np.ndarray, " n"]) -> Winding:
+    """Each cycle goes on at the rate of the one before, and waits for its event where that is late.
+
+    Where the event is early the phase leaps.
+    """
+    before, own = np.diff(t[:-1]), np.diff(t[1:])
+    k = np.arange(1.0, len(t) - 1)
+    turn = t[1:-1] + np.minimum(before, own) * (1 - _LEAP)
+    phase = k + np.minimum(own / before, 1.0) * (1 - _LEAP)
+    time = np.stack([t[1:-1], turn], axis=1).ravel()
+    return Winding(
+        np.append(time, t[-1]), np.append(np.stack([k, phase], axis=1).ravel(), k[-1] + 1), True
+    )
 
 
 def _phase(stretches, backwards, dropped=0, missed=0, lead=0) -> Phase:

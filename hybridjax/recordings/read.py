@@ -39,28 +39,32 @@ def read_recording(
     """
     if not paths:
         raise DefinitionError("there is no file to read.")
-    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".npz": _npz, ".parquet": _parquet}
-    found = []
-    for path in map(Path, paths):
-        if path.suffix.lower() not in readers:
-            raise DefinitionError(
-                f"'{path}' ends in '{path.suffix}'; recordings are read from .csv, .npz and "
-                ".parquet files."
-            )
-        try:
-            size = path.stat().st_size
-        except OSError as error:
-            raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
-        if size == 0:
-            raise FileFormatError(f"'{path}' is empty.")
-        columns = readers[path.suffix.lower()](path)
-        found.append(_recording(path, columns, time, dict(units or {})))
+    found = [_recording(path, time, dict(units or {})) for path in map(Path, paths)]
     return Recording.join(found)
 
 
-def _recording(path: Path, columns: dict[str, np.ndarray], time: str, units) -> Recording:
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a file by their headers.
+
+    **Raises:** as `read_recording`.
+    """
+    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".npz": _npz, ".parquet": _parquet}
+    if path.suffix.lower() not in readers:
+        raise DefinitionError(
+            f"'{path}' ends in '{path.suffix}'; tables are read from .csv, .npz and .parquet files."
+        )
+    try:
+        empty = path.stat().st_size == 0
+        if empty:
+            raise FileFormatError(f"'{path}' is empty.")
+        return readers[path.suffix.lower()](path)
+    except OSError as error:
+        raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
+
+
+def _recording(path: Path, time: str, units: dict[str, str]) -> Recording:
     plain, own = {}, {}
-    for header, values in columns.items():
+    for header, values in read_columns(path).items():
         name, unit = _split(header)
         if name in plain:
             raise FileFormatError(f"'{path}' has two columns '{name}'.")

@@ -11,7 +11,7 @@ from .._core.errors import DefinitionError
 from ..identify.records import Record
 from .phase import Definition, Phase, Winding, estimate_phase
 from .recording import Recording, Trial
-from .smoothing import gaps, inside, means, spline
+from .smoothing import gaps, inside, means, nearest, spline
 
 
 _GAP = 0.5  # of the time between sections: a longer one leaves a sample out
@@ -86,7 +86,7 @@ def section_data(
     outputs: str | Sequence[str],
     sections: int = 32,
     bandwidth: float | None = None,
-    sampled: Literal["mean", "start"] = "mean",
+    sampled: Literal["mean", "middle"] = "mean",
     time: Literal["clock", "duration"] | None = None,
     drift: float | None = None,
     max_gap: float | None = None,
@@ -101,8 +101,8 @@ def section_data(
     - `bandwidth`: in Hz, of the smoothing splines through the outputs (see `spline`); by default N
       per period, which averages over about one section. Infinite: interpolating cubic splines.
     - `sampled`: inputs are their "mean" from each section to the next (they are taken as
-      linear between samples), or the value at its "start", for one that is held from section to
-      section.
+      linear between samples), or the sample next to the "middle", for one that is held from section
+      to section.
     - `time`: an extra output that tells when a section was crossed: "clock" for systems that are
       driven by a clock, the time minus the clock's; "duration" for others, the time since the
       section before.
@@ -190,7 +190,6 @@ class _Sampler:
         if len(k) <= sections:
             return None
         t = winding.when(k / sections)
-        holes = gaps(self.time, np.isfinite(self.time), longest)
         u = np.stack([self._input(x, t, longest) for x in self.inputs], axis=1)
         y = np.stack([curve(t[:-1]) for curve in self.curves], axis=1)
         for i, x in enumerate(self.outputs):
@@ -200,12 +199,11 @@ class _Sampler:
 
     def _input(self, x, t, longest: float):
         seen = np.isfinite(x)
-        if self.sampled == "start":
-            at = np.searchsorted(self.time[seen], t[:-1], side="right") - 1
-            u, end = x[seen][np.maximum(at, 0)], t[:-1]
+        if self.sampled == "middle":
+            u = nearest(self.time, x, (t[:-1] + t[1:]) / 2)
         else:
-            u, end = means(self.time, x, t), t[1:]
-        u[inside(gaps(self.time, seen, longest), t[:-1], end)] = np.nan
+            u = means(self.time, x, t)
+        u[inside(gaps(self.time, seen, longest), t[:-1], t[1:])] = np.nan
         return u
 
 
@@ -217,21 +215,21 @@ def _with_times(parts: list[_Part], N: int, period: float, kind: str) -> list[_P
             for p in parts
         ]
     # t = T cycle + a[section]: cycles are counted through gaps.
-    cycles = [p.k // N + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
-              + (parts[0].k[0] // N - p.k[0] // N) * 0 for p in parts]  # fmt: skip
-    out = []
+    cycles = [
+        p.k // N + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
+        for p in parts
+    ]
     section = np.concatenate([p.k % N for p in parts])
     t, cycle = np.concatenate([p.t for p in parts]), np.concatenate(cycles).astype(float)
-    for _ in range(2):
-        mean_t = np.bincount(section, t, N) / np.maximum(np.bincount(section, minlength=N), 1)
-        mean_c = np.bincount(section, cycle, N) / np.maximum(np.bincount(section, minlength=N), 1)
-        x, z = cycle - mean_c[section], t - mean_t[section]
-        T = float(x @ z / (x @ x))
-    deviation = z - T * x
+    count = np.maximum(np.bincount(section, minlength=N), 1)
+    x = cycle - (np.bincount(section, cycle, N) / count)[section]
+    z = t - (np.bincount(section, t, N) / count)[section]
+    deviation = z - (x @ z) / (x @ x) * x
     edges = np.cumsum([len(p.k) for p in parts])[:-1]
-    for p, d in zip(parts, np.split(deviation, edges), strict=True):
-        out.append(eqx.tree_at(lambda p: p.y, p, np.column_stack([p.y, d])))
-    return out
+    return [
+        eqx.tree_at(lambda p: p.y, p, np.column_stack([p.y, d]))
+        for p, d in zip(parts, np.split(deviation, edges), strict=True)
+    ]
 
 
 def _deviations(parts: list[_Part], N: int, drift: float | None):

@@ -91,3 +91,12 @@ def means(
     slope = (values[at + 1] - values[at]) / (time[at + 1] - time[at])
     whole = area[at] + since * (values[at] + slope * since / 2)
     return np.diff(whole) / np.diff(edges)
+
+
+def nearest(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], t: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " m"]:
+    """The samples next to some times."""
+    seen = np.isfinite(values)
+    time, values = time[seen], values[seen]
+    return values[np.searchsorted((time[:-1] + time[1:]) / 2, t)]
