@@ -113,6 +113,7 @@ from .recordings.advice import (
     advise as advise,
     choose_order as choose_order,
     hold_out as hold_out,
+    plain_regression as plain_regression,
 )
 from .recordings.identification import (
     Identification as Identification,

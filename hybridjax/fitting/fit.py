@@ -15,6 +15,7 @@ from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle, find_limit_cycle
+from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
 from .candidate import candidate_cycle
 from .identifiability import Identifiability, diagnose
@@ -26,7 +27,7 @@ from .parameters import Free, Parameters, free_parameters
 # The iteration ends when neither coordinates nor residuals move by more than this part.
 _RTOL = 1e-9
 # Evaluations of the model for one start.
-MAX_STEPS = 64
+_MAX_STEPS = 64
 # Along directions whose sensitivity is below this part of the largest one no step is taken.
 _RCOND = 1e-8
 # Without variances, a fit that explains all but this part of the data (mean square) is perfect.
@@ -100,7 +101,7 @@ def fit_model(
     starts: int = 1,
     spread: float = 0.2,
     seed: int = 0,
-    max_steps: int = MAX_STEPS,
+    max_steps: int = _MAX_STEPS,
     progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
@@ -134,7 +135,7 @@ def fit_model(
     is raised where a fit does not converge.
 
     **Raises:** `DefinitionError` for parameters, bounds or data that do not fit the system;
-    `ComputationError` if no start has a limit cycle.
+    `ComputationError` if no start has a limit cycle on which the data can be observed.
 
     The program is compiled at the first call for each class of systems and kind of data; other
     values of parameters and data use it again.
@@ -157,8 +158,8 @@ def fit_model(
             break
     if best.cost == np.inf:
         raise ComputationError(
-            f"no limit cycle was found for any of {starts} starts, so that there is none to fit: "
-            f"{best.result.message}. Start elsewhere, or give more `starts`."
+            f"none of {starts} starts has a limit cycle on which the data can be observed "
+            f"({best.result.message}): start elsewhere, or give more `starts`."
         )
     return _summary(parameters, tried, best, weighted)
 
@@ -182,7 +183,7 @@ def identifiability(
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system))
-    _, r, J, _, _ = _levenberg_marquardt(problem, x, cycle, jnp.asarray(jnp.inf), MAX_STEPS)
+    _, r, J, _, _ = _levenberg_marquardt(problem, x, cycle, jnp.asarray(jnp.inf), _MAX_STEPS)
     if not np.isfinite(r).all():
         raise ComputationError("the system has a limit cycle, but the data cannot be had from it.")
     return diagnose(parameters.names, _relative(parameters, x, J))
@@ -197,7 +198,25 @@ def _prepare(system, data, free, guess) -> tuple[_Problem, LimitCycle]:
             "data are ObservedHTF, ObservedSeries or ObservedCycle objects, one or more."
         )
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
+    near = _anchored(near)
     return _Problem(parameters, tuple(one.prepare(near) for one in observations)), near
+
+
+def _anchored(cycle: LimitCycle) -> LimitCycle:
+    """The same cycle, begun as far as can be from any change of charts: there the cycles of other
+    systems are most likely to be in the same chart at the same phase of the clock."""
+    charts = np.asarray(cycle.legs.chart)
+    apart = np.subtract.outer(np.arange(len(charts)), np.arange(len(charts))) % len(charts)
+    apart = np.minimum(apart, apart.T)
+    room = np.where(charts != charts[:, None], apart, len(charts)).min(axis=1)
+    if not cycle.clocked or room[0] == room.max():
+        return cycle
+    k, s = int(np.argmax(room)), Structure(cycle.system)
+    a, q = int(charts[k]), cycle.legs.q[:, k]
+    return find_limit_cycle(
+        cycle.system, Guess(s.names[a], q[: s.dims[a]], cycle.legs.t[k]),
+        turns=cycle.turns, conserved=cycle.conserved, settings=cycle.settings,
+    )  # fmt: skip
 
 
 def _relative(parameters: Parameters, x, jacobian) -> Float[np.ndarray, "r p"]:
@@ -226,15 +245,17 @@ class _Found(eqx.Module):
 def _from(problem: _Problem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
     p = problem.parameters
     cycle = find_limit_cycle(p.insert(system, p.decode(x)), near, throw=False)
+    nothing = np.zeros(0), np.zeros((0, len(x)))
     if int(cycle.result) != Result.OK:
-        nothing = np.zeros(0), np.zeros((0, len(x)))
         return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
     tolerance = jnp.asarray(_RTOL)
     end, r, J, steps, done = _levenberg_marquardt(problem, x, cycle, tolerance, max_steps)
+    r, steps = np.asarray(r), int(steps)
+    if not np.isfinite(r).all():  # there is a cycle, but not what was observed on it
+        return _Found(x, x, np.inf, steps, Result.NOT_CONVERGED, cycle, *nothing)
     cycle = find_limit_cycle(p.insert(system, p.decode(end)), cycle, throw=False)
     result = Result.OK if done else Result.NOT_CONVERGED
-    r = np.asarray(r)
-    return _Found(x, end, float(r @ r), int(steps), result, cycle, r, np.asarray(J))
+    return _Found(x, end, float(r @ r), steps, result, cycle, r, np.asarray(J))
 
 
 def _goal(count: int, parameters: int, weighted: bool) -> float:
@@ -259,7 +280,7 @@ def _summary(parameters: Parameters, tried: list[_Found], best: _Found, weighted
     sensitivity = _relative(parameters, best.x, best.jacobian)
     seen = diagnose(parameters.names, sensitivity)
     freedom = len(best.residuals) - seen.rank
-    unit = 1.0 if weighted else best.cost / max(freedom, 1)
+    unit = 1.0 if weighted else max(best.cost / max(freedom, 1), np.finfo(float).tiny)
     information = sensitivity.T @ sensitivity / (unit * np.outer(size, size))
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     some = left[:, : seen.rank] / singular[: seen.rank] * size[:, None]

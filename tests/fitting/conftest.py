@@ -1,0 +1,67 @@
+import jax
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import APEX, OUTPUTS
+
+
+HOPPER = ("m", "M", "k", "b", "l0", "a", "g")
+SECTIONS = hj.ClockPhase(8, start=APEX)
+
+
+class Charge(hj.Chart):
+    states = ("x", "v")
+    oscillator: "Oscillator"
+
+    def field(self, t, q, u):
+        o = self.oscillator
+        x, v = q
+        return v, o.p * o.q * (1 - x**2) * v - o.w**2 * x + u[0]
+
+
+class Oscillator(hj.HybridSystem):
+    """Van der Pol's, with a damping of which only the product of two factors can be seen."""
+
+    p: jax.Array = hj.parameter(0.5)
+    q: jax.Array = hj.parameter(2.0)
+    w: jax.Array = hj.parameter(1.0)
+
+    def charts(self):
+        return {"charge": Charge(self)}
+
+    def guess(self):
+        return hj.Guess("charge", (2.0, 0.0))
+
+
+@pytest.fixture(scope="session")
+def oscillation():
+    return hj.find_limit_cycle(Oscillator(), section=hj.Crossing("v", "falling"))
+
+
+@pytest.fixture(scope="session")
+def hopper_htf(hopper_cycle):
+    model = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS)
+    return model.htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
+
+
+@pytest.fixture(scope="session")
+def seen_in_htf(hopper_cycle, hopper_htf):
+    data = hj.ObservedHTF(hopper_htf, SECTIONS)
+    return hj.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
+
+
+@pytest.fixture(scope="session")
+def hopper_observed(hopper_cycle):
+    """All that is to be seen of the limit cycle: states at sections, times of events."""
+    events = [hj.AtEvent("liftoff"), hj.AtEvent("touchdown")]
+    return [
+        hj.ObservedCycle.of(hopper_cycle, SECTIONS, OUTPUTS),
+        hj.ObservedCycle.of(hopper_cycle, events),
+    ]
+
+
+@pytest.fixture(scope="session")
+def seen_in_cycle(hopper_cycle, hopper_observed):
+    return hj.identifiability(hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle)

@@ -1,0 +1,88 @@
+"""Derivatives of HTFs, states on sections and event times by the hopper's parameters.
+
+`sensitivity` holds p dr/dp of the residuals, in forward mode. The hopper has exact identities: a
+change of the unit of force scales m, M, k, b and a together, which the HTFs from a force answer by
+the inverse factor and the cycle not at all; and a change of the unit of length scales a, g and l0.
+"""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import OUTPUTS
+from .conftest import HOPPER, SECTIONS
+
+
+pytestmark = pytest.mark.slow
+FORCES = [HOPPER.index(name) for name in ("m", "M", "k", "b", "a")]
+STEP = 1e-5
+
+
+def flat(H):
+    return np.concatenate([np.asarray(H).real.ravel(), np.asarray(H).imag.ravel()])
+
+
+def by_differences(cycle, look):
+    """p d(look)/dp for each parameter, by central differences of fourth order."""
+    columns = []
+    for name in HOPPER:
+        at = {}
+        for k in (-2, -1, 1, 2):
+            value = getattr(cycle.system, name) * (1 + k * STEP)
+            system = eqx.tree_at(lambda s, name=name: getattr(s, name), cycle.system, value)
+            at[k] = look(hj.find_limit_cycle(system, cycle))
+        columns.append((8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * STEP))
+    return np.stack(columns, axis=-1)
+
+
+def test_htfs(hopper_cycle, hopper_htf, seen_in_htf):
+    S = seen_in_htf.sensitivity
+    weights = np.asarray(hj.ObservedHTF(hopper_htf, SECTIONS).weights)
+    scaled = flat(np.asarray(hopper_htf.H) * weights)
+    size = np.abs(S).max()
+    np.testing.assert_allclose(S[:, FORCES].sum(axis=1), -scaled, atol=1e-9 * size)
+    np.testing.assert_allclose(S[:, HOPPER.index("l0")], 0, atol=1e-9 * size)
+    both = S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]
+    np.testing.assert_allclose(both, 0, atol=1e-9 * size)
+
+    def look(cycle):
+        model = hj.linearize(cycle, SECTIONS, OUTPUTS)
+        return flat(np.asarray(model.htf(hopper_htf.f, hopper_htf.harmonics).H) * weights)
+
+    np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)
+
+
+def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, seen_in_cycle):
+    S = seen_in_cycle.sensitivity
+    size = np.abs(S).max()
+    np.testing.assert_allclose(S[:, FORCES].sum(axis=1), 0, atol=1e-9 * size)
+
+    def look(cycle):
+        parts = []
+        for one in hopper_observed:
+            now = hj.ObservedCycle.of(cycle, one.sections, one.outputs)
+            parts += [np.ravel(x / s) for x, s in zip(now.seen, one.scales, strict=True)]
+        return np.concatenate(parts)
+
+    np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)
+
+
+def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
+    """The gradient of a loss is the sum of its residuals' derivatives."""
+    weights = hj.ObservedHTF(hopper_htf, SECTIONS).weights
+    direction = np.random.default_rng(0).normal(size=(2, *hopper_htf.H.shape))
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(system):
+        cycle = hj.find_limit_cycle(system, hopper_cycle)
+        model = hj.linearize(cycle, SECTIONS, OUTPUTS)
+        H = model.htf(hopper_htf.f, hopper_htf.harmonics).H * weights
+        return (direction[0] * H.real + direction[1] * H.imag).sum()
+
+    slopes = gradient(hopper_cycle.system)
+    found = [float(getattr(slopes, n) * getattr(hopper_cycle.system, n)) for n in HOPPER]
+    true = direction.ravel() @ seen_in_htf.sensitivity
+    np.testing.assert_allclose(found, true, atol=1e-9 * np.abs(true).max())

@@ -1,0 +1,114 @@
+"""Parameters come back from data, with errors that are what they are said to be."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import OUTPUTS
+from .conftest import HOPPER, SECTIONS, Oscillator
+
+
+PHASES = hj.ClockPhase(4, start=hj.Crossing("v", "falling"))
+
+
+def observed(cycle, **noise):
+    """Outputs at four phases, and the period."""
+    true = hj.ObservedCycle.of(cycle, PHASES, ("x", "v"))
+    values, _, period = true.seen
+    shift = np.random.default_rng(0).normal(size=values.shape) * noise.get("std", 0.0)
+    late = noise.get("period_std", 0.0)
+    return hj.ObservedCycle(PHASES, ("x", "v"), values + shift, period=period + late, **noise)
+
+
+def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
+    wrong = Oscillator(p=0.6, q=2.1, w=0.9)
+    fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
+    assert fit.result == hj.Result.OK and fit.cost < 1e-20
+    assert fit.system.w == pytest.approx(1.0, rel=1e-9)
+    assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
+    assert fit.system.p / fit.system.q == pytest.approx(0.6 / 2.1, rel=1e-6)  # it did not move
+    assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
+    assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
+    assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
+    assert "not seen: p and q apart" in repr(fit) and "1 of 1 starts" in repr(fit)
+
+
+def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
+    data = observed(oscillation, std=1e-3, period_std=1e-3)
+    fit = hj.fit_model(oscillation.system, data, ("p", "q", "w"), guess=oscillation)
+    assert fit.weighted and fit.freedom == 7
+    assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
+    assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
+    assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
+    with pytest.raises(hj.DefinitionError, match="no true value of 'w'"):
+        fit.contains({"p": 0.5, "q": 2.0})
+
+
+def test_more_starts_are_tried_only_where_they_are_needed(oscillation):
+    nothing_fits = hj.ObservedCycle(
+        PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period
+    )
+    several = hj.fit_model(
+        oscillation.system, nothing_fits, ("p", "q", "w"), guess=oscillation, starts=3
+    )
+    assert len(several.starts) == 3 and several.cost == several.starts.cost.min()
+    assert np.ptp(several.starts.values[:, 0]) > 0
+    assert repr(several.starts).count("\n") == 3
+    one = hj.fit_model(
+        oscillation.system, observed(oscillation), ("p", "q", "w"), guess=oscillation, starts=3
+    )
+    assert len(one.starts) == 1
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"free": "mass"}, "no parameter of Oscillator"),
+        ({"starts": 0}, "starts and max_steps"),
+        ({"spread": 0.0}, "spread positive"),
+        ({"data": ()}, "one or more"),
+        ({"data": "htf"}, "one or more"),
+    ],
+)
+def test_bad_arguments_are_refused(oscillation, options, message):
+    options = {"data": observed(oscillation), "free": ("p", "w"), **options}
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.fit_model(oscillation.system, guess=oscillation, **options)
+
+
+@pytest.mark.slow
+def test_htfs_of_the_hopper_see_neither_its_leg_nor_actuator_and_gravity_apart(seen_in_htf):
+    assert seen_in_htf.rank == 5
+    assert sorted(seen_in_htf.descriptions()) == ["a common factor of (a, g), only a/g", "l0"]
+
+
+@pytest.mark.slow
+def test_the_limit_cycle_of_the_hopper_does_not_see_a_common_scale(seen_in_cycle):
+    assert seen_in_cycle.rank == 6
+    assert seen_in_cycle.descriptions() == ["a common factor of (m, M, k, b, a)"]
+
+
+@pytest.mark.slow
+def test_the_hopper_comes_back_from_its_htfs(hopper_cycle, hopper_htf, seen_in_htf):
+    data = hj.ObservedHTF(hopper_htf, SECTIONS)
+    wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
+    fit = hj.fit_model(wrong, data, HOPPER, guess=hopper_cycle, starts=4)
+    true = hopper_cycle.system
+    for name in ("m", "M", "k", "b"):
+        assert float(getattr(fit.system, name)) == pytest.approx(getattr(true, name), rel=1e-9)
+    assert float(fit.system.a / fit.system.g) == pytest.approx(10.0, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_the_hopper_comes_back_from_experiments(hopper_cycle):
+    u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.count, 1))
+    data = hj.run_experiments(hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
+    wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
+    fit = hj.fit_model(
+        wrong, hj.ObservedSeries(data, SECTIONS), HOPPER, guess=hopper_cycle, starts=4
+    )
+    assert fit.identifiability.complete
+    for name in HOPPER:
+        found, true = (float(getattr(s, name)) for s in (fit.system, hopper_cycle.system))
+        assert found == pytest.approx(true, rel=1e-6), name

@@ -1,0 +1,64 @@
+"""Data that do not fit are refused where they are given."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from .conftest import SECTIONS
+
+
+H = np.ones((1, 3, 1, 1), complex)
+F = np.array([0.1, 0.2, 0.3])
+
+
+def records(**options):
+    y = np.random.default_rng(0).normal(size=(2, 16, 1))
+    return hj.ExperimentData(
+        np.zeros((2, 16, 1)), options.pop("y", y), sections=8, periods=2, **options
+    )
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "16 sections, the family has 8"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H * np.nan, 0, 8), SECTIONS), "NaN"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
+        (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
+        (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "std must be positive"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "each of 1 outputs"),
+        (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "does not move"),
+        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
+        (lambda: hj.ObservedCycle(SECTIONS, values=np.ones((8, 1))), "`outputs` with their"),
+        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
+        (lambda: hj.ObservedCycle(SECTIONS, times=np.full(8, np.nan)), "finite"),
+        (lambda: hj.ObservedCycle(SECTIONS, period=1.0, period_std=0.0), "must be positive"),
+        (lambda: hj.ObservedCycle("apex", period=1.0), "sections are a family"),
+    ],
+)
+def test_bad_data_are_refused(make, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        make()
+
+
+def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
+    system = hopper_cycle.system
+    force = hj.HTF(F, H, 0, 8, inputs="force", outputs="yM")
+    height = hj.HTF(F, H, 0, 8, inputs="u", outputs="height")
+    for data, message in (
+        (hj.ObservedHTF(force, SECTIONS), "input 'force'"),
+        (hj.ObservedHTF(height, SECTIONS), "height"),
+        (hj.ObservedSeries(records(inputs="force", outputs="yM"), SECTIONS), "force"),
+    ):
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.identifiability(system, data, "k", guess=hopper_cycle)
+
+
+def test_only_experiments_that_ran_well_are_used():
+    data = records(result=[0, 3], cycle_outputs=np.ones((8, 1)))
+    observed = hj.ObservedSeries(data, SECTIONS)
+    assert observed.y.shape == (1, 16, 1) and observed.absolute and not observed.weighted
+    np.testing.assert_allclose(observed.y, data.y[:1] + 1.0)
