@@ -72,6 +72,7 @@ def cycle(
         _events(ax, s, orbit, (x, y), center)
         ax.autoscale_view()
         ax.margins(0.08)
+        ax.locator_params(axis="x", nbins=6)
         if sections is not None:
             step = max(1, round(sections.count / 8)) if numbers is None else numbers
             _sections(ax, s, sections, (x, y), center, step)
