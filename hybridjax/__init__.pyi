@@ -31,7 +31,7 @@ from .experiments.run import (
     stream_experiments as stream_experiments,
 )
 from .experiments.steady import steady_start as steady_start
-from .fitting.fit import fit_model as fit_model
+from .fitting.fit import fit_model as fit_model, identifiability as identifiability
 from .fitting.identifiability import Identifiability as Identifiability
 from .fitting.model_fit import ModelFit as ModelFit
 from .fitting.observations import (
