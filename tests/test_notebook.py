@@ -44,7 +44,12 @@ def strides(found):
         assert fit.contains(found.truth, 0.999).all()
 
 
-CHECKS = {"paper": paper, "strides": strides}
+def own_system(found):
+    assert abs(found.slope - found.cycle.multipliers[0]) < 1e-7
+    assert found.fit.compare(found.cycle.multipliers).max_error < 1e-5
+
+
+CHECKS = {"own_system": own_system, "paper": paper, "strides": strides}
 
 
 @pytest.mark.slow

@@ -1,0 +1,216 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Your own hybrid system
+#
+# A one-legged hopper that no clock drives: a mass on a springy leg, in the manner of Raibert's
+# machines. It falls, lands, and compresses the leg. From when the leg is shortest until it has
+# its length again and leaves the ground, a cylinder pushes, which puts in the energy that the
+# damper takes out.
+#
+# This notebook writes it down, finds its limit cycle, checks the answer by hand, measures it as
+# one would measure a machine, and shows what happens when something is wrong.
+
+# %%
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import hybridjax as hj
+
+
+hj.enable_x64()  # before any model is built
+
+# %% [markdown]
+# ## Charts, guards, resets
+#
+# A *chart* is a phase of the motion, with named states and a vector field. The field is written
+# for one state; it returns as many rates as there are states. `u` are the inputs, here a vertical
+# force on the body.
+
+
+# %%
+class Flight(hj.Chart):
+    states = ("y", "v")
+    robot: "Robot"
+
+    def field(self, t, q, u):
+        y, v = q
+        return v, u[0] / self.robot.m - self.robot.g
+
+
+class Stance(hj.Chart):
+    states = ("y", "v")
+    robot: "Robot"
+    thrust: jax.Array
+
+    def field(self, t, q, u):
+        p = self.robot
+        y, v = q
+        return v, (p.k * (p.l0 - y) - p.b * v + self.thrust + u[0]) / p.m - p.g
+
+
+# %% [markdown]
+# The system says which charts there are, and which *transitions* lead from one to another. A
+# transition happens when its guard falls through zero; the reset maps the state into the new
+# chart (the same state, if it is left out). Parameters are arrays: they can be changed without
+# compiling anything again, and differentiated.
+
+
+# %%
+class Robot(hj.HybridSystem):
+    """Mass on a leg that thrusts while it gets longer. Input `u`: a force on the mass."""
+
+    m: jax.Array = hj.parameter(1.0, unit="kg", doc="mass")
+    g: jax.Array = hj.parameter(9.81, unit="m/s^2", doc="gravity")
+    l0: jax.Array = hj.parameter(0.5, unit="m", doc="length of the leg")
+    k: jax.Array = hj.parameter(800.0, unit="N/m", doc="stiffness of the leg")
+    b: jax.Array = hj.parameter(12.0, unit="N s/m", doc="damping of the leg")
+    thrust: jax.Array = hj.parameter(30.0, unit="N", doc="force of the cylinder")
+
+    def charts(self):
+        return {
+            "flight": Flight(self),
+            "compression": Stance(self, 0.0 * self.thrust),
+            "extension": Stance(self, self.thrust),
+        }
+
+    def transitions(self):
+        def height(t, q, u):
+            return q[0] - self.l0
+
+        return [
+            hj.Transition("touchdown", "flight", "compression", guard=height),
+            hj.Transition("bottom", "compression", "extension", guard=lambda t, q, u: -q[1]),
+            hj.Transition("liftoff", "extension", "flight", guard=lambda t, q, u: -height(t, q, u)),
+        ]
+
+
+robot = Robot()
+
+# %% [markdown]
+# ## Let it hop
+#
+# Dropped from 90 cm, it loses height for some hops, and then repeats itself.
+
+# %%
+drop = hj.simulate(robot, "flight", (0.9, 0.0), duration=4.0)
+t, y = drop("y")
+figure, axes = plt.subplots(figsize=(6, 2.4), layout="constrained")
+axes.plot(t, 100 * y, lw=1)
+axes.axhline(100 * robot.l0, color="0.6", lw=0.8, zorder=0)
+axes.set(xlabel="time (s)", ylabel="height (cm)")
+print([event.name for event in drop.events[:6]])
+
+# %% [markdown]
+# ## Its limit cycle
+#
+# Nothing tells the time in this system, so that the cycle is sought from a section to itself:
+# here the apex, where the speed falls through zero in flight. Newton's method uses the exact
+# Jacobian of one hop, through all three events.
+
+# %%
+apex = hj.Crossing("v", "falling", charts=("flight",))
+cycle = hj.find_limit_cycle(robot, hj.Guess("flight", (0.6, 0.0)), section=apex)
+print(cycle)
+hj.plot.cycle(cycle)
+# %% [markdown]
+# One multiplier: of the two states, one is along the orbit. A hop takes away nearly half of what
+# a disturbance has left. That can be checked by hand: drop the robot a little above the apex, and
+# look where the next apex is.
+
+# %%
+height, nudge = cycle.state["y"], 1e-6
+
+
+def next_apex(y):
+    hop = hj.simulate(robot, "flight", (y, 0.0), duration=1.05 * float(cycle.period))
+    liftoff = next(event for event in hop.events if event.name == "liftoff")
+    y, v = liftoff.after["y"], liftoff.after["v"]
+    return float(y + v**2 / (2 * robot.g))
+
+
+slope = (next_apex(height + nudge) - next_apex(height - nudge)) / (2 * nudge)
+print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
+
+# %% [markdown]
+# ## Measure it
+#
+# Sixteen sections of the phase plane, evenly spaced in the angle of height and speed: of a system
+# without a clock, sections must be given by the state. (None of them may lie exactly on an event.
+# At the bottom the speed is zero, as it is at the apex, so that the centre is moved a little.)
+# Then multisine forces, held between sections, and the response.
+
+# %%
+_, *orbit = cycle.trajectory()("y", "v")
+center = [(np.min(x) + np.max(x)) / 2 + 0.1 * np.ptp(x) for x in orbit]
+scale = [(np.max(x) - np.min(x)) / 2 for x in orbit]
+phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, start=apex)
+model = hj.linearize(cycle, phase, outputs=("y", "v"))
+design = hj.multisine(sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
+data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))
+print(data.summary())
+estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
+exact = model.htf(estimate.f, harmonics=(-1, 0, 1))
+print("largest error, of max |H_0|:", estimate.error(exact))
+hj.plot.bode(estimate, exact)
+# %%
+fit = hj.fit_multipliers(estimate, order=1)
+print(fit.compare(cycle.multipliers))
+
+# %% [markdown]
+# ## Which parameter would help?
+#
+# All of it can be differentiated: here the multiplier, by all parameters at once. (Most of the
+# time goes into compiling. Forward mode does for a few parameters.)
+
+
+# %%
+def multiplier(robot):
+    neighbour = hj.find_limit_cycle(robot, guess=cycle)
+    return jnp.trace(hj.linearize(neighbour, [apex], outputs="y").monodromy())
+
+
+slopes = jax.jit(jax.jacfwd(multiplier))(robot)
+for name in ("m", "g", "l0", "k", "b", "thrust"):
+    value = getattr(robot, name)
+    print(f"1 % more {name:6s} changes it by {0.01 * value * getattr(slopes, name):+.1e}")
+
+# %% [markdown]
+# ## When something is wrong
+#
+# What is wrong is said at the call that was wrong: in a definition, in a design, on the way to
+# the cycle, or for each experiment.
+
+
+# %%
+class Forgetful(Robot):
+    def transitions(self):
+        return [hj.Transition("touchdown", "flight", "squat", guard=lambda t, q, u: q[0] - self.l0)]
+
+
+def attempt(action):
+    try:
+        action()
+    except hj.HybridJaxError as error:
+        print(f"{type(error).__name__}: {error}\n")
+
+
+limp = Robot(thrust=0.0)
+clock = hj.ClockPhase(16)
+attempt(lambda: hj.simulate(Forgetful(), "flight", (0.9, 0.0), duration=1.0))
+attempt(lambda: hj.find_limit_cycle(limp, hj.Guess("flight", (0.6, 0.0)), section=apex))
+attempt(lambda: hj.run_experiments(cycle, clock, design, outputs="y"))
+attempt(lambda: hj.run_experiments(cycle, phase, design, outputs="z"))
+print(hj.run_experiments(cycle, phase, design.scaled(rms=2.5), outputs="y").summary())
