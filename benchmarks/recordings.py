@@ -1,23 +1,23 @@
 """Recordings to multipliers: errors, dirt, coverage, a walker, time and memory.
 
-python benchmarks/recordings.py [errors] [dirt] [coverage] [walker] [size]      (all by default)
+python benchmarks/recordings.py [errors] [dirt] [walker] [size] [coverage]      (all by default)
 
 The systems are simulated and their multipliers known. Beside `fit_series` stands plain ARX: least
 squares on the same section data.
 """
 
 import resource
+import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.estimate import roots_of
-from hybridjax.identify.records import lay_out
-from hybridjax.identify.regression import lagged, set_up
 from hybridjax.recordings.spoil import spoil
 
 
@@ -48,30 +48,9 @@ def start_of(recording, strides):
     return eqx.tree_at(lambda r: r.trials, recording, tuple(map(cut, recording.trials)))
 
 
-def at_sections(recording, phase=PLANE, **options):
-    return hj.section_data(
-        recording, phase, inputs="u", outputs=("yM", "vM"), sections=32, **options
-    )
-
-
-def arx(data, order=2):
-    """Multipliers by least squares on chi y = B u: what noise in y biases."""
-    layout = lay_out(data.records)
-    problem = set_up(layout, order, layout.y.shape[2], False)
-    _, T, N, ny = problem.y.shape
-    gram = np.zeros((order + 1, order + 1))
-    for n in range(N):
-        V = lagged(problem.u, n, problem.lags, problem.lead) @ problem.maps[n]
-        for i in range(ny):
-            good, y = problem.good[:, :, n, i], problem.y[:, :, n, i]
-            rows, past = np.arange(T) >= problem.first[:, n, None] + problem.free, []
-            for j in range(order + 1):
-                past.append(np.roll(y, j, axis=1))
-                rows = rows & np.roll(good, j, axis=1)
-            Z = np.stack([p[rows] for p in past], axis=1)
-            Z = Z - V[rows] @ np.linalg.lstsq(V[rows], Z)[0]
-            gram += Z.T @ Z
-    return roots_of(-np.linalg.solve(gram[1:, 1:], gram[1:, 0]))
+def at_sections(recording, phase=PLANE, sections=32, **options):
+    options |= {"inputs": "u", "outputs": ("yM", "vM"), "sections": sections}
+    return hj.section_data(recording, phase, **options)
 
 
 def distance(multipliers, true):
@@ -91,8 +70,9 @@ def errors(seeds=10):
                 fit = hj.fit_series(data.records, 2, check=False)
                 found.append(distance(fit.multipliers, true))
                 said.append(fit.standard_errors[0])
-                plain.append(distance(arx(data), true))
-                rough.append(distance(arx(at_sections(dirty, bandwidth=np.inf)), true))
+                plain.append(distance(hj.plain_regression(data, 2), true))
+                through = at_sections(dirty, bandwidth=np.inf)
+                rough.append(distance(hj.plain_regression(through, 2), true))
             row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
             print(f"{strides:7d}  {noise:6.0e}  " + "  ".join(f"{x:9.1e}" for x in row), flush=True)
 
@@ -101,14 +81,17 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=500, strides=300, noise=1e-4, chunk=50):
-    print(f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, noise {noise:g}")
+def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16):
+    print(
+        f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {sections} sections, "
+        f"noise {noise:g}"
+    )
     hits, found, said = [], [], []
     for first in range(0, seeds, chunk):
         recordings, true = hopper(strides, range(1000 + first, 1000 + first + chunk))
         for seed, recording in enumerate(recordings, first):
             dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
-            fit = hj.fit_series(at_sections(dirty).records, 2, check=False)
+            fit = hj.fit_series(at_sections(dirty, sections=sections).records, 2, check=False)
             hits.append(bool(fit.contains(true[:1])[0]))
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
@@ -120,11 +103,110 @@ def coverage(seeds=500, strides=300, noise=1e-4, chunk=50):
         )
 
 
+def dirt(seeds=6, strides=500, noise=1e-4):
+    print(f"\nDirt: hopper, {strides} strides, noise {noise:g}, {seeds} seeds")
+    recordings, true = hopper(strides, range(seeds))
+    gap = (strides / 2, strides / 2 + 20)
+    cases = {
+        "clean": (PLANE, {}, {}),
+        "1 % of samples lost, gap of 20 strides": (PLANE, {"missing": 0.01, "gap": gap}, {}),
+        "the same, a third not there": (
+            PLANE, {"missing": 0.01, "gap": gap, "irregular": True}, {},
+        ),
+        "the same, rounded to 1e-4": (
+            PLANE, {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
+        ),
+        "drift of 5e-3, removed": (PLANE, {"drift": 5e-3}, {"drift": 50}),
+        "cycles from apex to apex, clean": (hj.EventPhase("apex"), {}, {}),
+        "1 % lost, gap, 5 events lost, 5 doubled": (
+            hj.EventPhase("apex"), {"missing": 0.01, "gap": gap, "lost": 5, "doubled": 5}, {},
+        ),
+    }  # fmt: skip
+    for label, (phase, spoiled, options) in cases.items():
+        found, said, hits = [], [], 0
+        for seed, recording in enumerate(recordings):
+            if isinstance(phase, hj.EventPhase):
+                noisy = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
+                marked = noisy.mark("apex", "vM", direction="falling", bandwidth=16)
+                dirty = spoil(marked, ("yM", "vM"), seed=seed, **spoiled)
+            else:
+                dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
+            fit = hj.fit_series(at_sections(dirty, phase, **options).records, 2, check=False)
+            found.append(distance(fit.multipliers, true))
+            said.append(fit.standard_errors[0])
+            hits += bool(fit.contains(true[:1])[0])
+        print(
+            f"{label:42s} rms error {rms(found):.1e}, said {rms(said):.1e}, region holds the truth "
+            f"{hits}/{seeds}",
+            flush=True,
+        )
+
+
+def walker(seeds=10, strides=100, trials=5, noise=1e-4):
+    print(f"\nWalkers without a clock: {trials} trials of {strides} strides, noise {noise:g}")
+    systems = {
+        "rimless wheel": (
+            hj.models.RimlessWheel(), "impact", ("th", "w"), "th", "rising", 0.004, 1,
+        ),
+        "compass gait": (
+            hj.models.CompassGait(), "heelstrike", ("n", "s", "vn", "vs"), "s", "falling", 0.1, 3,
+        ),
+    }  # fmt: skip
+    for label, (system, event, outputs, angle, direction, size, order) in systems.items():
+        cycle = hj.find_limit_cycle(system, section=hj.AtEvent(event))
+        period = float(cycle.period)
+        rate = 200 / period
+        force = [
+            hj.random_force(strides * period, rate, 8 / period, rms=size, seed=k)
+            for k in range(seeds * trials)
+        ]
+        made = hj.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
+        hits, widths, found = 0, [], []
+        for seed in range(seeds):
+            own = made.trials[seed * trials : (seed + 1) * trials]
+            one = spoil(
+                eqx.tree_at(lambda r: r.trials, made, own), outputs, noise=noise, seed=seed
+            ).mark("middle", angle, direction=direction, bandwidth=20 / period)
+            data = hj.section_data(
+                one, hj.EventPhase("middle"), inputs="u", outputs=outputs, sections=16,
+                time="duration",
+            )  # fmt: skip
+            fit = hj.fit_series(data.records, order, check=False)
+            hits += bool(fit.contains(cycle.multipliers).all())
+            found.append(fit.compare(cycle.multipliers).max_error)
+            widths.append([np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)])
+        print(
+            f"{label}: {data!r}\n  rms error {rms(found):.1e}, 95 % regions reach "
+            f"{np.mean(widths, axis=0)}, all held in {hits}/{seeds}",
+            flush=True,
+        )
+
+
+def size(trials=10, minutes=10, rate=1000):
+    print(f"\n{trials} trials of {minutes} minutes at {rate} Hz, CSV to report by the command")
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    force = [hj.random_force(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k) for k in range(trials)]
+    made = hj.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
+    made = spoil(made, ("yM", "vM"), noise=1e-4)
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(Path(folder) / f"trial{k}.csv") for k in range(trials)]
+        for file, trial in zip(files, made.trials, strict=True):
+            table = np.column_stack([trial.time, trial.values])
+            header = "time (s),force (N),yM (m),vM (m/s)"
+            np.savetxt(file, table, "%.7g", delimiter=",", header=header, comments="")
+        command = [sys.executable, "-m", "hybridjax", "identify", *files, "--input", "force"]
+        command += ["--outputs", "yM,vM", "--phase", "yM,vM", "--out", str(Path(folder) / "out")]
+        start = time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        wall = time.perf_counter() - start
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = used.ru_utime + used.ru_stime
+        print(f"{wall:.0f} s, {cpu:.0f} CPU s, largest memory {used.ru_maxrss / 2**20:.2f} GiB")
+
+
 if __name__ == "__main__":
     hj.enable_x64()
-    for name in sys.argv[1:] or ("errors", "coverage"):
+    for name in sys.argv[1:] or ("errors", "dirt", "walker", "size", "coverage"):
         start = time.process_time()
         globals()[name]()
         print(f"({time.process_time() - start:.0f} CPU s)")
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"\nlargest memory {memory:.2f} GiB")

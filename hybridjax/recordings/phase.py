@@ -20,6 +20,10 @@ _LEAP = 1e-6  # of a cycle, in which a phase leaps or waits
 _TAILS = 0.01  # of the samples at either end, which say nothing of the range
 
 
+Number = int | float
+Pair = tuple[Number, Number]
+
+
 class AnglePhase(eqx.Module):
     """Phase as the angle of two signals, a position and its velocity, say, around a centre.
 
@@ -38,10 +42,10 @@ class AnglePhase(eqx.Module):
 
     position: str = eqx.field(static=True)
     velocity: str = eqx.field(static=True)
-    center: tuple[float, float] | None = None
-    scale: tuple[float, float] | None = None
-    start: float = 0.0
-    bandwidth: float | None = None
+    center: Pair | None = None
+    scale: Pair | None = None
+    start: Number = 0.0
+    bandwidth: Number | None = None
 
 
 class EventPhase(eqx.Module):
@@ -163,13 +167,8 @@ def estimate_phase(recording: Recording, definition: Definition, *, causal: bool
         return _from_events(recording, definition, causal)
     if isinstance(definition, AnglePhase):
         angles = _angles(recording, definition, smooth=not causal)
-    elif callable(definition):
-        angles = [_from_function(recording, trial, definition) for trial in recording.trials]
     else:
-        raise DefinitionError(
-            "a phase is an AnglePhase, an EventPhase, or a function of time and signals, not "
-            f"{type(definition).__name__}."
-        )
+        angles = [_from_function(recording, trial, definition) for trial in recording.trials]
     rate = _turns_per_time(angles)
     backwards, total, stretches = 0, 0, []
     for time, angle in angles:

@@ -3,6 +3,7 @@
 import csv
 import os
 import re
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -103,7 +104,9 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
                     f"'{path}' begins with numbers: its first line must name the columns."
                 )
             try:
-                values = np.loadtxt(file, delimiter=separator, ndmin=2, comments=None)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of no data, which is told below
+                    values = np.loadtxt(file, delimiter=separator, ndmin=2, comments=None)
             except ValueError:
                 values = None
         if values is None or values.shape[1] != len(header):

@@ -162,9 +162,9 @@ class Recording(eqx.Module):
         event: str,
         signal: str,
         *,
-        level: float = 0.0,
+        level: int | float = 0.0,
         direction: Literal["rising", "falling"] = "rising",
-        bandwidth: float = np.inf,
+        bandwidth: int | float = np.inf,
     ) -> "Recording":
         """The same with one more event: a signal crosses a level.
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.errors import DefinitionError
+from ..experiments.data import ExperimentData
 from ..identify.records import Record
 from .phase import Definition, Phase, Winding, estimate_phase
 from .recording import Recording, Trial
@@ -67,6 +68,25 @@ class SectionData(eqx.Module):
         u, y = (np.concatenate([getattr(r, x) for r in self.records]) for x in "uy")
         return np.sqrt(np.nanmean(u**2, axis=0)), np.sqrt(np.nanmean(y**2, axis=0))
 
+    def experiments(self, periods: int) -> ExperimentData:
+        """The records as experiments with periodic inputs, for `estimate_htf` and its like.
+
+        Every record is cut to whole cycles from section 0, and all to the same length.
+
+        **Arguments:** `periods`: P, after which the inputs repeat.
+
+        **Raises:** `DefinitionError` for records that are shorter than P, or have gaps.
+        """
+        N, parts = self.sections, []
+        for r in self.records:
+            first = -r.start % N
+            parts.append((r.u[first:], r.y[first:]))
+        cycles = min(len(u) for u, _ in parts) // N
+        u = np.stack([u[: cycles * N] for u, _ in parts])
+        y = np.stack([y[: cycles * N] for _, y in parts])
+        about = {"inputs": self.inputs, "outputs": self.outputs, "family": "recorded"}
+        return ExperimentData(u, y, sections=N, periods=periods, **about)
+
     def __repr__(self) -> str:
         u, y = self.rms()
         values = zip(self.inputs + self.outputs, (*u, *y), self.units, strict=True)
@@ -85,11 +105,11 @@ def section_data(
     inputs: str | Sequence[str],
     outputs: str | Sequence[str],
     sections: int = 32,
-    bandwidth: float | None = None,
+    bandwidth: int | float | None = None,
     sampled: Literal["mean", "middle"] = "mean",
     time: Literal["clock", "duration"] | None = None,
-    drift: float | None = None,
-    max_gap: float | None = None,
+    drift: int | float | None = None,
+    max_gap: int | float | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
 
@@ -118,7 +138,10 @@ def section_data(
     inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in (*inputs, *outputs):
-        recording.column(name)
+        column = [t.values[:, recording.column(name)] for t in recording.trials]
+        if not any(np.nanmax(x) > np.nanmin(x) for x in column if np.isfinite(x).any()):
+            kind = "input" if name in inputs else "output"
+            raise DefinitionError(f"the {kind} {name} is constant in all trials.")
     if sections < 1:
         raise DefinitionError(f"there must be one section or more, not {sections}.")
     if drift is not None and drift < 4:
@@ -184,7 +207,7 @@ class _Sampler:
         self.outputs = [trial.values[:, recording.column(name)] for name in outputs]
         self.curves = [spline(trial.time, x, bandwidth) for x in self.outputs]
 
-    def __call__(self, winding: Winding, sections: int, longest: float) -> _Part | None:
+    def __call__(self, winding: Winding, sections: int, longest: int | float) -> _Part | None:
         first, last = winding.phase[[0, -1]] * sections
         k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(int)
         if len(k) <= sections:
@@ -197,7 +220,7 @@ class _Sampler:
             y[inside(holes, t[:-1], t[:-1]), i] = np.nan
         return _Part(k[:-1], t[:-1], u, y)
 
-    def _input(self, x, t, longest: float):
+    def _input(self, x, t, longest: int | float):
         seen = np.isfinite(x)
         if self.sampled == "middle":
             u = nearest(self.time, x, (t[:-1] + t[1:]) / 2)
@@ -232,7 +255,7 @@ def _with_times(parts: list[_Part], N: int, period: float, kind: str) -> list[_P
     ]
 
 
-def _deviations(parts: list[_Part], N: int, drift: float | None):
+def _deviations(parts: list[_Part], N: int, drift: int | float | None):
     """Each part minus the trial's average cycle, or its slow changes, and that cycle."""
     if not parts:
         return []

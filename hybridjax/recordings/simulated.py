@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy import signal
 
 from .._core.errors import DefinitionError
-from ..experiments.run import run_experiments
+from ..experiments.response import ResponseFunction, response_function
 from ..flow.sections import ClockPhase
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
@@ -70,7 +72,7 @@ def simulate_recording(
 
     **Returns:** a `Recording` with S trials. A trial that fails ends there.
 
-    **Raises:** `DefinitionError` as `run_experiments`.
+    **Raises:** `DefinitionError` as `response_function`.
     """
     force = np.asarray(force, float)
     period = float(cycle.period)
@@ -81,14 +83,19 @@ def simulate_recording(
     middle = (np.arange(steps) + 0.5) / steps
     u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
     u = u.reshape(S, -1, nu)
-    data = run_experiments(cycle, ClockPhase(K * steps), u, outputs, discard=0, accuracy=accuracy)
-    assert data.cycle_outputs is not None
-    y = data.y[:, ::steps] + np.tile(data.cycle_outputs[::steps], (cycles, 1))
+    response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
+    y = np.asarray(_respond(response, jnp.asarray(u)))[:, ::steps]
+    names = tuple(x if isinstance(x, str) else x.name for x in outputs)
     time = np.arange(y.shape[1]) * period / K
     trials = []
     for s in range(S):
         good = slice(0, min(n, int(np.isfinite(y[s]).all(axis=1).sum())))
-        signals = dict(zip(data.inputs, force[s, good].T, strict=True))
-        signals |= dict(zip(data.outputs, y[s, good].T, strict=True))
+        signals = dict(zip(cycle.system.inputs, force[s, good].T, strict=True))
+        signals |= dict(zip(names, y[s, good].T, strict=True))
         trials.append(Recording(time[good], signals, name=f"trial {s}"))
     return Recording.join(trials)
+
+
+@eqx.filter_jit
+def _respond(response: ResponseFunction, u: Float[Array, "S n nu"]) -> Float[Array, "S n ny"]:
+    return response(u).y

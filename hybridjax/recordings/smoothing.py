@@ -28,7 +28,7 @@ class Spline(eqx.Module):
 
 
 def spline(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], bandwidth: float
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], bandwidth: int | float
 ) -> Spline:
     r"""A natural cubic spline through samples; NaN are left out.
 
@@ -60,7 +60,7 @@ def spline(
 
 
 def gaps(
-    time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: float
+    time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: int | float
 ) -> Float[np.ndarray, "g 2"]:
     """First and last times of the stretches without a sample that are longer than `longest`."""
     there = time[seen]

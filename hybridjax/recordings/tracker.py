@@ -8,6 +8,9 @@ from jaxtyping import Float
 from .._core.errors import DefinitionError
 
 
+Number = int | float
+
+
 class PhaseTracker:
     """Follows a phase sample by sample, for hardware that acts at phases.
 
@@ -18,12 +21,12 @@ class PhaseTracker:
 
     def __init__(
         self,
-        center: tuple[float, float],
-        scale: tuple[float, float],
-        rate: float,
+        center: tuple[Number, Number],
+        scale: tuple[Number, Number],
+        rate: Number,
         *,
-        start: float = 0.0,
-        bandwidth: float | None = None,
+        start: Number = 0.0,
+        bandwidth: Number | None = None,
     ):
         """**Arguments:** `center`, `scale`, `start` as in `AnglePhase`; `rate`: cycles per second
         to begin with, negative if the angle decreases; `bandwidth` of the loop in Hz, by default
@@ -43,7 +46,7 @@ class PhaseTracker:
         self.time = self.phase = None
         self._loop = 0.0
 
-    def update(self, time: float, position: float, velocity: float) -> float | None:
+    def update(self, time: Number, position: Number, velocity: Number) -> float | None:
         """The phase in cycles after one more sample, counted from the first one; NaN are skipped.
 
         **Returns:** None before the first good sample.

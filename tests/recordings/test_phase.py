@@ -1,0 +1,134 @@
+"""Phase from angles and events, and splines, against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.interpolate import CubicSpline, make_smoothing_spline
+
+import hybridjax as hj
+from hybridjax.recordings.smoothing import means, spline
+
+
+CIRCLE = hj.AnglePhase("x", "v")
+
+
+def whole(phase, winding=0):
+    w = phase.stretches[0][winding]
+    return w.when(np.arange(np.ceil(w.phase[0]), np.floor(w.phase[-1]) + 1))
+
+
+def test_the_angle_of_a_circle_is_time(wave):
+    phase = hj.estimate_phase(wave, CIRCLE)
+    assert phase.period == pytest.approx(1.0, abs=1e-6)
+    assert phase.cycles >= 18 and phase.jitter < 1e-3 and phase.backwards == 0
+    inner = whole(phase)[1:-1]
+    np.testing.assert_allclose(inner, np.round(inner), atol=2e-5)
+    assert "cycles in 1 stretches of 1 trials; period 1" in repr(phase)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.0, 0.3), st.booleans())
+def test_noise_gaps_and_irregular_samples(seed, noise, turned):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.uniform(0, 12, 3000))
+    sense = -1 if turned else 1
+    x = 3 + 2 * np.cos(2 * np.pi * t) + 2 * noise * rng.normal(size=t.size)
+    v = 5 * sense * np.sin(2 * np.pi * t) + 5 * noise * rng.normal(size=t.size)
+    x[(t > 5.2) & (t < 7.1)] = np.nan
+    phase = hj.estimate_phase(hj.Recording(t, {"x": x, "v": v}), CIRCLE)
+    assert [len(s) for s in phase.stretches] == [2]
+    for k in (0, 1):
+        found = whole(phase, k)
+        assert np.abs(found - np.round(found)).max() < 0.02 + noise / 2
+        assert (np.diff(phase.stretches[0][k].time) > 0).all()
+        assert (np.diff(phase.stretches[0][k].phase) > 0).all()
+
+
+def test_a_function_and_a_start(wave):
+    other = hj.estimate_phase(wave, lambda t, signals: 2 * np.pi * t + 1.0)
+    np.testing.assert_allclose(np.diff(whole(other)), 1.0, atol=1e-9)
+    late = hj.estimate_phase(wave, hj.AnglePhase("x", "v", start=-np.pi / 2))
+    np.testing.assert_allclose(whole(late) % 1, 0.25, atol=2e-4)
+
+
+def test_in_real_time(wave):
+    phase = hj.estimate_phase(wave, CIRCLE, causal=True)
+    late = whole(phase)[2:-1]
+    assert np.abs(late - np.round(late)).max() < 1e-3
+    tracker = hj.PhaseTracker((0.0, 0.0), (1.0, 1.0), -1.0)
+    t, (x, v) = wave.trials[0].time, wave.trials[0].values[:, 1:].T
+    found = [tracker.update(*row) for row in zip(t, x, v, strict=True)]
+    assert (np.diff(found) >= 0).all() and found[-1] == pytest.approx(20.0, abs=1e-3)
+    assert tracker.update(t[-1] + 1, np.nan, 0.0) == found[-1]
+    with pytest.raises(hj.DefinitionError, match="time must grow"):
+        tracker.update(t[-1], 1.0, 0.0)
+    with pytest.raises(hj.DefinitionError, match="rate other than 0"):
+        hj.PhaseTracker((0, 0), (1, 1), 0.0)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_events_missed_and_doubled(wave, causal):
+    t = np.arange(0.3, 20)
+    events = np.sort(np.append(np.delete(t, 7), t[12] + 0.04))
+    recording = hj.Recording(
+        wave.trials[0].time, {"x": wave.trials[0].values[:, 0]}, events={"strike": events}
+    )
+    phase = hj.estimate_phase(recording, hj.EventPhase("strike"), causal=causal)
+    assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
+    assert phase.lead == (0 if causal else 1)
+    w = phase.stretches[0][0]
+    first = np.ceil(w.phase[0])
+    np.testing.assert_allclose(w.when(np.array([first, first + 0.25, first + 1])) % 1,
+                               [0.3, 0.55, 0.3], atol=2e-6)  # fmt: skip
+
+
+def test_marked_events(wave):
+    found = wave.mark("up", "v", direction="rising").trials[0].events["up"]
+    np.testing.assert_allclose(found, np.arange(20) + 0.5, atol=1e-7)
+    with pytest.raises(hj.DefinitionError, match="v never crosses 3, rising"):
+        wave.mark("up", "v", level=3.0)
+
+
+def test_what_is_no_phase(wave):
+    t = wave.trials[0].time
+    still = hj.Recording(t, {"x": np.cos(t) + 5, "v": np.sin(t) + 5, "c": 0 * t})
+    for definition, message in [
+        (hj.AnglePhase("x", "v", center=(0, 0), scale=(1, 1)), "the phase does not wind"),
+        (hj.AnglePhase("x", "c"), "needs a c that varies"),
+        (hj.AnglePhase("x", "q"), "no signal 'q'"),
+        (hj.EventPhase("strike"), "no event 'strike'; its events are: none"),
+        (lambda t, s: t[1:], "returned the shape"),
+        (lambda t, s: 0 * t, "the phase does not wind"),
+    ]:
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.estimate_phase(still, definition)
+    one = hj.Recording(
+        t[:180], {"x": np.cos(2 * np.pi * t[:180]), "v": np.sin(2 * np.pi * t[:180])}
+    )
+    with pytest.raises(hj.DefinitionError, match="does not wind: 1.8 turns"):
+        hj.estimate_phase(one, CIRCLE)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000), st.integers(8, 60), st.floats(0.02, 0.3))
+def test_splines_are_those_of_scipy(seed, n, bandwidth):
+    rng = np.random.default_rng(seed)
+    t, y = np.cumsum(rng.uniform(0.5, 1.5, n)), rng.normal(size=n)
+    x = np.linspace(t[0], t[-1], 200)
+    step = np.median(np.diff(t))
+    reference = make_smoothing_spline(t / step, y, lam=(2 * np.pi * bandwidth * step) ** -4)
+    np.testing.assert_allclose(spline(t, y, bandwidth)(x), reference(x / step), atol=1e-9)
+    through = CubicSpline(t, y, bc_type="natural")
+    np.testing.assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)
+
+
+def test_the_bandwidth_is_where_half_is_left():
+    t = np.arange(4000) / 100
+    y = spline(t, np.sin(2 * np.pi * 3.0 * t), 3.0)(t[1000:3000])
+    assert np.abs(y).max() == pytest.approx(0.5, rel=2e-3)
+
+
+def test_means_of_a_line_between_samples():
+    t = np.array([0.0, 1.0, 3.0])
+    found = means(t, np.array([0.0, 2.0, 2.0]), np.array([0.0, 0.5, 2.0, 3.0]))
+    np.testing.assert_allclose(found, [0.5, (0.75 + 2) / 1.5, 2.0])

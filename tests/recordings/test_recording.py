@@ -1,0 +1,114 @@
+"""Recordings, their files, and what is refused."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+T = np.arange(5.0)
+GOOD = {"a": T, "b": 2 * T}
+
+
+@pytest.mark.parametrize(
+    ("time", "signals", "options", "message"),
+    [
+        ([0, 1, 1, 2, 3], GOOD, {}, "time repeats at sample 2 "),
+        ([0, 1, 0.5, 2, 3], GOOD, {}, "time runs backwards at sample 2 "),
+        ([0, 1, np.nan, 2, 3], GOOD, {}, "time is not a finite number at sample 2"),
+        (T, {"a": T[1:]}, {}, "a has 4 samples, but time has 5"),
+        (T, {"a": [0, 1, np.inf, 0, 0]}, {}, "a is infinite at sample 2"),
+        (T, {"a": list("abcde")}, {}, "a must be real numbers"),
+        (T, {}, {}, "has no signals"),
+        ([0.0], {"a": [1.0]}, {}, "1 samples: nothing was recorded"),
+        (T, GOOD, {"units": {"c": "N"}}, "a unit for 'c', but the signals are a, b"),
+        (T, GOOD, {"events": {"e": [np.inf]}}, "event e has an infinite time"),
+    ],
+)
+def test_bad_recordings(time, signals, options, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.Recording(time, signals, **options)
+
+
+def test_trials_must_belong_together():
+    one = hj.Recording(T, GOOD, units={"a": "N"}, name="one")
+    other = hj.Recording(T, {"b": T, "a": T}, units={"a": "N"}, name="two")
+    both = hj.Recording.join([one, other])
+    np.testing.assert_array_equal(both.trials[1].values[:, both.column("b")], T)
+    assert "Recording(2 trials: a (N), b)" in repr(both)
+    with pytest.raises(hj.DefinitionError, match="a is in 'N' in trial 'one', but in 'kN'"):
+        hj.Recording.join([one, hj.Recording(T, GOOD, units={"a": "kN"}, name="two")])
+    with pytest.raises(hj.DefinitionError, match="different signals: a, b, and a"):
+        hj.Recording.join([one, hj.Recording(T, {"a": T})])
+    with pytest.raises(hj.DefinitionError, match="no signal 'c'; the recording has a, b"):
+        one.column("c")
+    with pytest.raises(hj.DefinitionError, match="no recording to join"):
+        hj.Recording.join([])
+
+
+def test_tables_with_columns():
+    one = hj.Recording.from_frame({"time": T, "a": T})
+    assert one.signals == ("a",)
+    with pytest.raises(hj.DefinitionError, match="no column 't'; its columns are time, a"):
+        hj.Recording.from_frame({"time": T, "a": T}, time="t")
+
+
+def test_pandas_and_parquet(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"time": T, "a": T, "event e": [0, 1, 0, 0, 1]})
+    assert hj.Recording.from_frame(frame[["time", "a"]]).signals == ("a",)
+    pytest.importorskip("pyarrow")
+    frame.to_parquet(tmp_path / "x.parquet")
+    np.testing.assert_array_equal(
+        hj.read_recording(tmp_path / "x.parquet").trials[0].events["e"], [1.0, 4.0]
+    )
+
+
+def test_csv_with_units_events_and_missing_samples(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("time (s);force [N];event strike\n0;1;0\n1;;1\n2;NA;0\n3;4;0\n")
+    found = hj.read_recording(path)
+    assert found.signals == ("force",) and found.units == ("N",)
+    np.testing.assert_array_equal(found.trials[0].values[:, 0], [1, np.nan, np.nan, 4])
+    np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
+    assert found.trials[0].name == "x"
+    np.savez(tmp_path / "x.npz", time=np.arange(4.0), force=np.ones(4), **{"event strike": [1.5]})
+    both = hj.read_recording(path, tmp_path / "x.npz", units={"force": "kN"})
+    assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("time,a\n", "has a header, but no samples"),
+        ("0,1\n1,2\n", "begins with numbers"),
+        ("\n1,2\n", "no line with the names"),
+        ("time,a\n0,1\n1,x\n", "line 3: column 'a' holds 'x', which is not a number"),
+        ("time,a\n0,1\n1\n", "line 3: 1 fields, but the header names 2"),
+        ("time,a,a\n0,1,1\n1,2,2\n", "two columns 'a'"),
+        ("t,a\n0,1\n1,2\n", "no column 'time'; its columns are t, a"),
+    ],
+)
+def test_bad_csv(tmp_path, text, message):
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(hj.HybridJaxError, match=message) as error:
+        hj.read_recording(path)
+    assert "\n" not in str(error.value)
+
+
+def test_other_bad_files(tmp_path):
+    with pytest.raises(hj.DefinitionError, match="cannot read .*No such file"):
+        hj.read_recording(tmp_path / "none.csv")
+    (tmp_path / "x.xls").write_text("?")
+    with pytest.raises(hj.DefinitionError, match="ends in '.xls'"):
+        hj.read_recording(tmp_path / "x.xls")
+    (tmp_path / "x.npz").write_text("not")
+    with pytest.raises(hj.FileFormatError, match="not an NPZ file"):
+        hj.read_recording(tmp_path / "x.npz")
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(hj.FileFormatError, match="not a text file"):
+        hj.read_recording(tmp_path / "b.csv")
+    with pytest.raises(hj.DefinitionError, match="no file to read"):
+        hj.read_recording()

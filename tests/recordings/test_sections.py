@@ -1,0 +1,164 @@
+"""Section data against closed forms, its masks, tables of designs, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.cli import main
+from hybridjax.recordings.spoil import spoil
+
+
+CIRCLE = hj.AnglePhase("x", "v", center=(0, 0), scale=(1, 1))
+
+
+def sample(recording, phase=CIRCLE, **options):
+    options = {"inputs": "f", "outputs": ("x", "v"), "sections": 8} | options
+    return hj.section_data(recording, phase, **options)
+
+
+def test_a_circle(wave):
+    data = sample(wave)
+    np.testing.assert_allclose(
+        data.cycle_outputs[:, 0], np.cos(np.pi / 4 * np.arange(8)), atol=2e-3
+    )
+    (record,), (times,) = data.records, data.times
+    np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
+    area = np.sin(3 * times)
+    np.testing.assert_allclose(
+        (record.u + data.cycle_inputs[(record.start + np.arange(len(times))) % 8])[:-1, 0],
+        np.diff(area) / 3 / np.diff(times), atol=2e-3,
+    )  # fmt: skip
+    assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
+    assert "SectionData(19.75 cycles of 8 sections in 1 records; period 1;" in repr(data)
+
+
+def test_gaps_are_masked_and_cut(wave):
+    t, values = wave.trials[0].time, wave.trials[0].values.copy()
+    values[(t > 4.3) & (t < 4.6), 1] = np.nan  # of an output, too short to lose the count
+    values[(t > 9.1) & (t < 9.2), 0] = np.nan  # of the input
+    values[(t > 14) & (t < 16), 1:] = np.nan
+    data = sample(hj.Recording(t, dict(zip("fxv", values.T, strict=True))))
+    assert len(data.records) == 2
+    for record, times in zip(data.records, data.times, strict=True):
+        lost = np.isnan(record.y[:, 0])
+        np.testing.assert_array_equal(lost & (times > 4.31) & (times < 4.59), lost)
+        end = np.append(times[1:], times[-1] + 0.125)
+        np.testing.assert_array_equal(
+            np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.19) & (end > 9.1)
+        )
+    assert 0 < data.missing < 0.1
+
+
+def test_slow_drift_is_taken_out(wave):
+    t, values = wave.trials[0].time, wave.trials[0].values
+    drifting = dict(zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True))
+    recording = hj.Recording(t, drifting)
+    phase = hj.estimate_phase(wave, CIRCLE)
+    assert sample(recording, phase).rms()[1][0] > 0.1
+    assert sample(recording, phase, drift=10).rms()[1][0] < 1e-2
+
+
+def test_times_of_crossings(wave):
+    data = sample(wave, time="clock")
+    assert data.outputs == ("x", "v", "time") and data.rms()[1][2] < 1e-4
+    assert sample(wave, time="duration").outputs[2] == "duration"
+
+
+def test_bad_arguments(wave):
+    for options, message in [
+        ({"inputs": "g"}, "no signal 'g'"),
+        ({"sections": 0}, "one section or more"),
+        ({"drift": 1}, "more than four cycles"),
+    ]:
+        with pytest.raises(hj.DefinitionError, match=message):
+            sample(wave, **options)
+
+
+def test_designs_as_tables(tmp_path, wave):
+    design = hj.multisine(sections=8, periods=16, f_max=2.0)
+    hj.write_design(tmp_path / "phase.csv", design, cycles=19)
+    table = hj.read_design(tmp_path / "phase.csv")
+    np.testing.assert_allclose(table["u"], design.inputs(19)[:, :, 0], atol=1e-9)
+    hj.write_design(tmp_path / "time.csv", design, period=0.5, rate=160)
+    with pytest.raises(hj.FileFormatError, match="no table by phase"):
+        hj.read_design(tmp_path / "time.csv")
+    with pytest.raises(hj.DefinitionError, match="both the period and the rate"):
+        hj.write_design(tmp_path / "time.csv", design, period=0.5)
+    # Applied at the phases of the recording, and found again in its section data.
+    phase = hj.estimate_phase(wave, CIRCLE)
+    told = hj.add_command(wave, phase, {"u": table["u"][:1]}, 8)
+    data = sample(told, phase, inputs="u", sampled="middle")
+    u = data.records[0].u[:, 0] + data.cycle_inputs[:, 0][
+        (data.records[0].start + np.arange(len(data.records[0].u))) % 8
+    ]  # fmt: skip
+    first = -data.records[0].start % 8
+    np.testing.assert_allclose(u[first : first + 150], table["u"][0, :150], atol=1e-9)
+    with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):
+        hj.add_command(wave, phase, table, 8)
+    experiments = data.experiments(periods=16)
+    assert experiments.u.shape[1] % 8 == 0 and experiments.sections == 8
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, hopper_recording):
+    folder = tmp_path_factory.mktemp("trials")
+    dirty = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
+    (trial,) = dirty.trials
+    half = len(trial.time) // 2
+    for k, rows in enumerate((slice(0, half), slice(half, None))):
+        table = np.column_stack([trial.time[rows], trial.values[rows]])
+        np.savetxt(folder / f"trial{k}.csv", table, "%.9g", delimiter=",", comments="",
+                   header="time (s),force (N),yM (m),vM (m/s)")  # fmt: skip
+    return folder
+
+
+def identify(files, out, *more):
+    trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
+    options = ["--input", "force", "--outputs", "yM,vM", "--phase", "yM,vM", "--sections", "16"]
+    main(["identify", *trials, *options, "--out", str(out), *more])
+
+
+def test_the_command(files, tmp_path, hopper_cycle):
+    out = tmp_path / "out"
+    identify(files, out)
+    summary = json.loads((out / "summary.json").read_text())
+    found = np.array(summary["multipliers"]) @ [1, 1j]
+    assert np.abs(found - hopper_cycle.multipliers).max() < 1e-2
+    assert summary["held_out_fit_percent"][0] > 80
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 7 and "<script" not in page
+    assert hj.load(out / "fit.npz").contains(hopper_cycle.multipliers, 0.999).all()
+    assert hj.load(out / "htf.npz").variance is not None
+    rows = (out / "sections.csv").read_text().splitlines()
+    assert rows[0] == "trial,record,cycle,section,time,force (N),yM (m),vM (m/s)"
+    assert len(rows) > 16 * 190
+    assert {p.suffix for p in (out / "figures").iterdir()} == {".png", ".pdf"}
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--outputs", "yM,q"], "no signal 'q'"),
+        (["--phase", "yM"], "--phase needs two entries"),
+        (["--time", "t"], "no column 't'"),
+        (["--sections", "200"], "are too few"),
+    ],
+)
+def test_the_command_writes_nothing_half(files, tmp_path, more, message):
+    with pytest.raises(SystemExit, match=message) as error:
+        identify(files, tmp_path / "out", *more)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(SystemExit, match="holds other files"):
+        identify(files, tmp_path)
+
+
+def test_constant_input(wave):
+    t, values = wave.trials[0].time, wave.trials[0].values
+    still = hj.Recording(t, {"f": 0 * t + 3, "x": values[:, 1], "v": values[:, 2]})
+    with pytest.raises(hj.DefinitionError, match="input f is constant"):
+        sample(still)
