@@ -108,11 +108,11 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "buck": lambda: Case(
         "buck converter, 20 V", m.BuckConverter(), hj.ClockPhase(8, start=0.06), "v",
-        "reference voltage", 1e-4, _pair(-0.691894155835222 + 0.447746968999235j), _MPMATH, _BUCK,
+        "reference voltage", 1e-5, _pair(-0.691894155835222 + 0.447746968999235j), _MPMATH, _BUCK,
     ),
     "buck, period 2": lambda: Case(
         "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, start=0.03),
-        "v", "reference voltage", 1e-4, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
+        "v", "reference voltage", 2e-6, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
         _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), turns=2,
     ),
     "Hopf": lambda: Case(

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import Phase, given, settings, strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
@@ -64,6 +65,26 @@ def test_neimark_sacker_of_the_juggler(juggling):
     assert "Neimark-Sacker at restitution = 1 (multipliers" in repr(branch)
     with pytest.raises(hj.DefinitionError, match="there is no kind 'Hopf'"):
         branch.find("Hopf")
+
+
+@settings(max_examples=6, deadline=None, phases=(Phase.generate,))
+@given(
+    st.sampled_from(["A", "restitution", "g", "T"]),
+    st.floats(0.75, 0.95) | st.floats(1.05, 1.3),
+    st.floats(0.02, 0.3),
+)
+def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
+    """Any parameter, either way, in long steps and short ones; with T the clock changes, too."""
+    own = float(getattr(juggling.system, parameter))
+    branch = hj.follow(juggling, parameter, np.sort([own, own * factor]), step=step)
+    for k in (0, len(branch) - 1):
+        p = branch[k].system
+        a, g, T = float(p.restitution), float(p.g), float(p.T)
+        bounce, multipliers = branch[k].trajectory().events[0], branch[k].multipliers
+        np.testing.assert_allclose(bounce.after["v"], g * T / 2, rtol=1e-9)
+        trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi / T) ** 2 * bounce.before["y"] / g
+        np.testing.assert_allclose(np.sum(multipliers), trace, atol=1e-7)
+        np.testing.assert_allclose(np.prod(multipliers), a**2, rtol=1e-9)
 
 
 def test_the_direction_of_values_is_that_of_the_branch(juggling):
