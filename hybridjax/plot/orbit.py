@@ -117,6 +117,7 @@ def _point(s: Structure, a: int, names, t, q) -> np.ndarray:
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
+    named = set()
     for k in np.flatnonzero(orbit.event >= 0):
         transition = s.transitions[orbit.event[k]]
         a, b = s.chart_index(transition.source), s.chart_index(transition.target)
@@ -129,7 +130,9 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
             ax.plot(*ends, "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
-        _text(ax, transition.name, before, center, distance=-9)
+        if transition.name not in named:
+            _text(ax, transition.name, before, center, distance=-9)
+        named.add(transition.name)
 
 
 def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
