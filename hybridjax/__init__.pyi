@@ -108,6 +108,7 @@ from .orbits.sweep import (
 from .periodic.htf import HTF as HTF
 from .periodic.ldtp import LDTP as LDTP
 from .periodic.synthetic import synthetic_ldtp as synthetic_ldtp
+from .recording_report import write_report as write_report
 from .recordings.advice import (
     Advice as Advice,
     advise as advise,
@@ -130,7 +131,6 @@ from .recordings.phase import (
 )
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
-from .recordings.report import write_report as write_report
 from .recordings.sections import SectionData as SectionData, section_data as section_data
 from .recordings.simulated import (
     random_force as random_force,

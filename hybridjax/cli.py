@@ -92,10 +92,10 @@ def _identify(options) -> None:
     matplotlib.use("Agg")  # files only
     from ._core.errors import DefinitionError
     from ._core.precision import enable_x64
+    from .recording_report import check_folder, write_report
     from .recordings.identification import identify_recording
     from .recordings.phase import AnglePhase, EventPhase
     from .recordings.read import read_recording
-    from .recordings.report import check_folder, write_report
 
     enable_x64()
     check_folder(pathlib.Path(options.out))

@@ -242,8 +242,9 @@ def _covariance(problem: Problem, c, found: Linearisation, errors: str):
     square = parts.sum(axis=(0, 1))
     if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
         return sandwich(square - noise, square)
-    # A residual is smaller than the error, by the share of its equation in the unknowns.
-    error = found.residual / np.sqrt(np.maximum(1 - found.leverage, 1e-3))[..., None]
+    # What a sample would miss a fit to the others by: errors that are large where inputs are, as
+    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
+    error = found.residual / np.maximum(1 - found.leverage, 1e-3)[..., None]
     score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
     gradient = np.einsum("sti,stj->ij", score, score)
     # The scores add up to zero at the minimum, which takes this part of their covariance away.

@@ -2,6 +2,12 @@ from .branch import branch as branch
 from .look import COLORS as COLORS, COLUMN as COLUMN, PAGE as PAGE, save as save, style as style
 from .orbit import cycle as cycle
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
+from .recorded import (
+    impulse_responses as impulse_responses,
+    multiplier_regions as multiplier_regions,
+    phase as phase,
+    section_data as section_data,
+)
 from .signals import experiment as experiment
 from .transfer import (
     bode as bode,

@@ -16,15 +16,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .. import __version__
-from .._core.errors import DefinitionError
-from ..io import save
-from ..periodic.htf import HTF
-from ..plot import look
-from ..plot.transfer import bode, magnitude
-from ..plot.validation import validation
-from .figures import plot_impulse_responses, plot_multipliers, plot_phase, plot_sections
-from .identification import Identification
+from . import __version__, plot
+from ._core.errors import DefinitionError
+from .io import save
+from .periodic.htf import HTF
+from .plot import look
+from .recordings.identification import Identification
 
 
 _PAGE = "report.html"
@@ -121,22 +118,23 @@ def _figures(found: Identification, htf: HTF) -> dict[str, Figure]:
 
     with matplotlib.rc_context({"backend": "agg"}):
         figures = {
-            "phase": plot_phase(found.phase),
-            "sections": plot_sections(found.data),
-            "multipliers": plot_multipliers(found.fit, found.advice.plain).get_figure(root=True),
-            "impulse_responses": plot_impulse_responses(found.responses),
-            "validation": validation(found.held_out.validation),
+            "phase": plot.phase(found.phase),
+            "sections": plot.section_data(found.data),
+            "multipliers": plot.multiplier_regions(found.fit, found.advice.plain),
+            "impulse_responses": plot.impulse_responses(found.responses),
+            "validation": plot.validation(found.held_out.validation),
         }
         for i, name in enumerate(htf.inputs):
             suffix = f"_{name}" if len(htf.inputs) > 1 else ""
-            figures[f"bode{suffix}"] = bode(htf, input=i)
+            figures[f"bode{suffix}"] = plot.bode(htf, input=i)
             with look.style():
                 figure, axes = look.new_figure(
                     len(htf.outputs), 1, width=look.COLUMN, height=0.3 + 1.6 * len(htf.outputs)
                 )
                 for k, output in enumerate(htf.outputs):
-                    magnitude(htf, output=output, input=i, decades=3, ax=axes[k, 0])
+                    plot.magnitude(htf, output=output, input=i, decades=3, ax=axes[k, 0])
             figures[f"harmonics{suffix}"] = figure
+    figures["multipliers"] = figures["multipliers"].get_figure(root=True)
     return figures
 
 

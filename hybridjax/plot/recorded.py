@@ -8,27 +8,27 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..identify.series import SeriesFit
-from ..plot.look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
-from .impulse import ImpulseResponses
-from .phase import Phase
-from .sections import SectionData
-from .spectra import input_spectrum
+from ..recordings.impulse import ImpulseResponses
+from ..recordings.phase import Phase
+from ..recordings.sections import SectionData
+from ..recordings.spectra import input_spectrum
+from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
 
 
-def plot_phase(phase: Phase) -> Figure:
+def phase(found: Phase) -> Figure:
     """Periods of the cycles, one after the other, and how they are distributed."""
     with style():
         figure, axes = new_figure(1, 2, width=PAGE, height=2.2, width_ratios=(3, 1))
         left, right = axes[0]
         first = 0
-        for k, periods in enumerate(phase.periods):
+        for k, periods in enumerate(found.periods):
             at = first + np.arange(len(periods))
             left.plot(at, periods, ".", ms=2, color=CYCLE[k % len(CYCLE)])
             first += len(periods)
-        left.axhline(phase.period, color="black", lw=0.6)
+        left.axhline(found.period, color="black", lw=0.6)
         left.set(xlabel="cycle (trials in different colours)", ylabel="period (s)")
         right.hist(
-            np.concatenate(phase.periods), bins=30, orientation="horizontal", color=COLORS["grey"]
+            np.concatenate(found.periods), bins=30, orientation="horizontal", color=COLORS["grey"]
         )
         right.set_ylim(left.get_ylim())
         right.tick_params(labelleft=False)
@@ -37,25 +37,25 @@ def plot_phase(phase: Phase) -> Figure:
     return figure
 
 
-def plot_sections(data: SectionData, *, labels: Mapping[str, str] | None = None) -> Figure:
+def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) -> Figure:
     """For each signal the average cycle, the deviations from it, and the input's spectrum.
 
     Left: the average cycle. Middle: deviations against phase, grey, with twice their standard
-    deviation. Right: the power of inputs against frequency, for outputs the deviation at section 0
-    from cycle to cycle.
+    deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
+    cycle, at the section where it is largest.
     """
     N = data.sections
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     f, power = input_spectrum(data)
-    phase = np.arange(N) / N
+    at_phase = np.arange(N) / N
     with style():
         figure, axes = new_figure(len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names))
         for i, name in enumerate(names):
             average, spread, last = axes[i]
             unit = f" ({data.units[i]})" if data.units[i] else ""
             label = label_of(name, labels)
-            average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
+            average.plot(at_phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(label + unit)
             values = np.concatenate(
                 [np.concatenate([r.u, r.y], axis=1)[:, i] for r in data.records]
@@ -65,14 +65,16 @@ def plot_sections(data: SectionData, *, labels: Mapping[str, str] | None = None)
             spread.plot(at[thin] / N, values[thin], ",", color=COLORS["grey"], rasterized=True)
             std = np.array([np.nanstd(values[at == n]) for n in range(N)])
             for sign in (-2, 2):
-                spread.plot(phase, sign * std, color=CYCLE[0])
+                spread.plot(at_phase, sign * std, color=CYCLE[0])
             spread.set_ylabel(rf"$\delta$ {label}{unit}")
             if i < len(data.inputs):
                 last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
                 last.set(xlabel="frequency (cycles/period)", ylabel="power")
             else:
+                most = int(np.argmax(std))
                 each = [
-                    np.flatnonzero((r.start + np.arange(len(r.u))) % N == 0) for r in data.records
+                    np.flatnonzero((r.start + np.arange(len(r.u))) % N == most)
+                    for r in data.records
                 ]
                 y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]
                 last.plot(np.concatenate(y), lw=0.5, color=CYCLE[1])
@@ -84,7 +86,7 @@ def plot_sections(data: SectionData, *, labels: Mapping[str, str] | None = None)
     return figure
 
 
-def plot_impulse_responses(
+def impulse_responses(
     found: ImpulseResponses, *, input: int = 0, labels: Mapping[str, str] | None = None
 ) -> Figure:
     """Left: responses to a push against its phase and the time since. Right: some of them with
@@ -119,7 +121,7 @@ def plot_impulse_responses(
     return figure
 
 
-def plot_multipliers(
+def multiplier_regions(
     fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: Axes | None = None
 ) -> Axes:
     """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
@@ -132,8 +134,8 @@ def plot_multipliers(
             reach = 2 * np.abs(fit.ellipse(0) - leading).max()
         boxes = [ax]
         if 0 < reach < 0.1:
-            corner = 0.02 if leading.real > 0 else 0.64
-            boxes.append(ax.inset_axes((corner, 0.02, 0.34, 0.34)))
+            corner = 0.2 if leading.real > 0 else 0.52
+            boxes.append(ax.inset_axes((corner, 0.33, 0.32, 0.32)))
             boxes[1].set(
                 xlim=(leading.real - reach, leading.real + reach),
                 ylim=(leading.imag - reach, leading.imag + reach),
@@ -154,7 +156,8 @@ def plot_multipliers(
                     border = fit.ellipse(i)
                     box.fill(border.real, border.imag, color=CYCLE[0], alpha=0.3, lw=0)
             box.set_aspect("equal")
-        far = 1.1 * max(1.0, np.abs(fit.multipliers).max())
+        far = 1.25 * max(1.0, np.abs(fit.multipliers).max())
         ax.set(xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$")
+        ax.locator_params(nbins=5)
         ax.legend(loc="upper left")
     return ax
