@@ -43,7 +43,7 @@ class _Problem(eqx.Module):
     @property
     def weighted(self) -> bool:
         """Whether all data came with their standard deviations."""
-        return all(one.weighted for one in self.observations)
+        return all(bool(one.weighted) for one in self.observations)
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
         """Infinite where there is no limit cycle, or nothing to be observed on it."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -28,10 +28,11 @@ from ..systems.structure import Structure
 class AbstractObservation(eqx.Module):
     """Something that was measured, as `fit_model` takes it. Subclass it for data of other kinds.
 
-    **Fields:** `weighted`: whether residuals are in units of their standard deviations.
+    **Fields:** `weighted`: whether residuals are in units of their standard deviations (an array,
+    like all that may change without another compilation).
     """
 
-    weighted: eqx.AbstractVar[bool]
+    weighted: eqx.AbstractVar[Bool[Array, ""]]
 
     @abc.abstractmethod
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
@@ -54,10 +55,14 @@ class ObservedHTF(AbstractObservation):
     output's HTFs.
     """
 
-    htf: HTF
+    f: Float[Array, " F"]
+    H: Complex[Array, "M F ny nu"]
+    harmonics: tuple[int, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
     sections: AbstractSections
     weights: Float[Array, "M F ny nu"]
-    weighted: bool = eqx.field(static=True)
+    weighted: Bool[Array, ""]
 
     def __init__(self, htf: HTF, sections):
         """**Arguments:** `htf`, of outputs and inputs that the system knows by name; `sections`,
@@ -65,22 +70,23 @@ class ObservedHTF(AbstractObservation):
 
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
-        self.htf, self.sections = htf, as_sections(sections)
+        self.f, self.H, self.sections = htf.f, htf.H, as_sections(sections)
+        self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
         if self.sections.count != htf.sections:
             raise DefinitionError(
                 f"the HTFs belong to {htf.sections} sections, the family has {self.sections.count}."
             )
         self.weights = jnp.asarray(weights_of(htf, check_values(htf)))
-        self.weighted = htf.variance is not None
+        self.weighted = jnp.asarray(htf.variance is not None)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
-        model = linearize(cycle, self.sections, self.htf.outputs, self.htf.inputs)
-        error = (model.htf(self.htf.f, self.htf.harmonics).H - self.htf.H) * self.weights
+        model = linearize(cycle, self.sections, self.outputs, self.inputs)
+        error = (model.htf(self.f, self.harmonics).H - self.H) * self.weights
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        Structure(cycle.system).resolve_outputs(self.htf.outputs)
-        unknown = [name for name in self.htf.inputs if name not in cycle.system.inputs]
+        Structure(cycle.system).resolve_outputs(self.outputs)
+        unknown = [name for name in self.inputs if name not in cycle.system.inputs]
         if unknown:
             raise DefinitionError(
                 f"the HTFs have the input '{unknown[0]}'; those of the system are "
@@ -105,7 +111,7 @@ class ObservedSeries(AbstractObservation):
     absolute: bool = eqx.field(static=True)
     sections: AbstractSections
     scale: Float[Array, " ny"]
-    weighted: bool = eqx.field(static=True)
+    weighted: Bool[Array, ""]
     flow: tuple[Plan, Settings] | None
 
     def __init__(self, data: ExperimentData, sections, std: ArrayLike | None = None):
@@ -131,7 +137,8 @@ class ObservedSeries(AbstractObservation):
                 if std is not None
                 else "an output does not move in any experiment: leave it out, or give `std`."
             )
-        self.scale, self.weighted = jnp.broadcast_to(scale, (ny,)), std is not None
+        self.scale = jnp.broadcast_to(scale, (ny,))
+        self.weighted = jnp.asarray(std is not None)
         self.absolute = data.cycle_outputs is not None
         if self.absolute:
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.sections, 1))
@@ -175,7 +182,7 @@ class ObservedCycle(AbstractObservation):
     seen: tuple[Float[Array, "..."], ...]
     scales: tuple[Float[Array, "..."], ...]
     which: tuple[str, ...] = eqx.field(static=True)
-    weighted: bool = eqx.field(static=True)
+    weighted: Bool[Array, ""]
 
     def __init__(
         self,
@@ -218,7 +225,7 @@ class ObservedCycle(AbstractObservation):
             _scale(name, std, x)
             for x, (name, (_, std, _)) in zip(self.seen, given.items(), strict=True)
         )
-        self.weighted = all(std is not None for _, std, _ in given.values())
+        self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
     def of(cls, cycle: LimitCycle, sections, outputs: Sequence[str] | str = ()) -> "ObservedCycle":
@@ -271,8 +278,8 @@ def _scale(name: str, std: ArrayLike | None, seen: Array) -> Float[Array, "..."]
     """Standard deviations that were given, or sizes."""
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))
-        return jnp.where(size > 0, size, 1.0)
+        return jnp.where(size > 0, size, 1.0)  # of the shape seen.shape[1:], as below
     std = jnp.asarray(std, float)
     if std.shape not in ((), seen.shape[1:]) or not jnp.all(jnp.isfinite(std) & (std > 0)):
         raise DefinitionError(f"the standard deviation of `{name}` must be positive, not {std}.")
-    return std
+    return jnp.broadcast_to(std, seen.shape[1:])

@@ -1,6 +1,8 @@
 """A smooth stand-in for the largest modulus of the multipliers."""
 
+import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._core.errors import DefinitionError
@@ -9,33 +11,49 @@ from ..periodic.ldtp import LDTP
 from ..periodic.response import monodromy
 
 
-def spectral_radius(model: LDTP | LimitCycle, doublings: int = 6) -> Float[Array, ""]:
+def spectral_radius(model: LDTP | LimitCycle, smoothing: float = 1e-3) -> Float[Array, ""]:
     r"""A smooth upper bound of the largest modulus of the Floquet multipliers.
 
-    $$\rho_k = \lVert \Phi^k \rVert_F^{1/k}, \qquad k = 2^{doublings},$$
+    The number $\rho_\epsilon$ with
 
-    with the monodromy matrix $\Phi$ and the Frobenius norm. Multipliers themselves have no
-    derivative where two of them meet; $\rho_k$ does everywhere (except at $\Phi^k = 0$). It is
-    biased: $\rho \le \rho_k \le (\kappa \sqrt d)^{1/k} \rho$ for d multipliers and the condition
-    number $\kappa$ of the eigenvectors, and where multipliers coalesce the logarithm of the bias
-    goes to zero like $(\log k)/k$ (Gelfand's formula; Horn and Johnson, *Matrix Analysis*, 5.6).
-    It depends on the section and the coordinates, the true radius does not.
+    $$\sum_{j \ge 0} \rho_\epsilon^{-2j}\, \lVert \Phi^j \rVert_F^2 = d / \epsilon$$
+
+    for the monodromy matrix $\Phi$ (d, d) and the Frobenius norm. Multipliers have no derivative
+    where two of them meet, and their largest modulus has kinks; $\rho_\epsilon$ is smooth wherever
+    $\Phi \ne 0$, and so is $\lVert\Phi^k\rVert^{1/k}$, but the derivatives of that do not tend to
+    those of the radius. It is biased upwards:
+
+    $$\rho / \sqrt{1 - \epsilon/d} \le \rho_\epsilon \le \rho / \sqrt{1 - \kappa^2 \epsilon}$$
+
+    with the condition number $\kappa$ of the eigenvectors (the upper bound where
+    $\kappa^2 \epsilon < 1$). It depends on the section and its coordinates, as the true radius does
+    not. (J. Vanbiervliet, B. Vandereycken, W. Michiels, S. Vandewalle, M. Diehl, The smoothed
+    spectral abscissa for robust stability optimization, SIAM J. Optim. 20, 2009; here for maps.)
 
     `LDTP.characteristic_polynomial` is smooth as well, and without bias: trace and determinant are
     $-c_1$ and $(-1)^d c_d$.
 
     **Arguments:** `model`: from `linearize` or `find_limit_cycle`; of a batch, one at a time
-    (`jax.vmap`). `doublings`: more make the bias smaller and the function less smooth: where
-    multipliers meet, its second derivative is of order k.
+    (`jax.vmap`). `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
 
-    **Raises:** `DefinitionError` if `doublings` is negative.
+    **Raises:** `DefinitionError` if `smoothing` is out of range.
     """
-    if doublings < 0:
-        raise DefinitionError(f"doublings must not be negative, but is {doublings}.")
+    if not 0 < smoothing < 1:
+        raise DefinitionError(f"smoothing lies between 0 and 1, not at {smoothing}.")
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
-    size = jnp.zeros(())  # the logarithm of what the power was divided by
-    for _ in range(doublings):
-        norm = jnp.linalg.norm(power)
-        power = (power / norm) @ (power / norm)
-        size = 2 * (size + jnp.log(norm))
-    return jnp.exp((size + jnp.log(jnp.linalg.norm(power))) / 2**doublings)
+    d = power.shape[0]
+
+    def excess(x, power):
+        """Logarithm of the sum over that of d / epsilon, at rho = e^x: convex and falling."""
+        identity = jnp.eye(d)
+        twice = jnp.kron(power, power)  # its powers map vec(I) to vec(P P^T)
+        total = jnp.linalg.solve(jnp.eye(d * d) - jnp.exp(-2 * x) * twice, identity.ravel())
+        return jnp.log(identity.ravel() @ total) - jnp.log(d / smoothing)
+
+    fixed = jax.lax.stop_gradient(power)
+    true = jnp.max(jnp.abs(jnp.linalg.eigvals(fixed)))
+    least = 1e-6 * jnp.linalg.norm(fixed)
+    begin = jnp.log(jnp.maximum(true / jnp.sqrt(1 - smoothing / d), least))
+    # Newton's method goes up from the lower bound and never beyond the root.
+    solver = optx.Newton(rtol=1e-12, atol=1e-12)
+    return jnp.exp(optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value)

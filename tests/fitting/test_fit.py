@@ -12,19 +12,21 @@ from .conftest import HOPPER, SECTIONS, Oscillator
 PHASES = hj.ClockPhase(4, start=hj.Crossing("v", "falling"))
 
 
-def observed(cycle, **noise):
+STD = {"std": 1e-3, "period_std": 1e-3}
+
+
+def observed(cycle, noise=0.0):
     """Outputs at four phases, and the period."""
-    true = hj.ObservedCycle.of(cycle, PHASES, ("x", "v"))
-    values, _, period = true.seen
-    shift = np.random.default_rng(0).normal(size=values.shape) * noise.get("std", 0.0)
-    late = noise.get("period_std", 0.0)
-    return hj.ObservedCycle(PHASES, ("x", "v"), values + shift, period=period + late, **noise)
+    values, _, period = hj.ObservedCycle.of(cycle, PHASES, ("x", "v")).seen
+    drawn = noise * np.random.default_rng(0).normal(size=9)
+    values = values + drawn[:8].reshape(4, 2)
+    return hj.ObservedCycle(PHASES, ("x", "v"), values, period=period + drawn[8], **STD)
 
 
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
     fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
-    assert fit.result == hj.Result.OK and fit.cost < 1e-20
+    assert fit.result == hj.Result.OK and fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p / fit.system.q == pytest.approx(0.6 / 2.1, rel=1e-6)  # it did not move
@@ -35,7 +37,7 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 
 
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
-    data = observed(oscillation, std=1e-3, period_std=1e-3)
+    data = observed(oscillation, noise=1e-3)
     fit = hj.fit_model(oscillation.system, data, ("p", "q", "w"), guess=oscillation)
     assert fit.weighted and fit.freedom == 7
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
@@ -47,7 +49,7 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
 
 def test_more_starts_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
-        PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period
+        PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period, **STD
     )
     several = hj.fit_model(
         oscillation.system, nothing_fits, ("p", "q", "w"), guess=oscillation, starts=3
