@@ -1,0 +1,149 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # From a recording to Floquet multipliers
+#
+# A laboratory has sampled signals, a measured perturbation, and the dirt of reality. This notebook
+# goes from there to multipliers with honest intervals. The recording is made here, by a simulated
+# hopper, so that the truth is known at the end; with your own data, begin at *The five lines* with
+# `recording = hj.read_recording("trial1.csv", "trial2.csv")`.
+
+# %%
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import hybridjax as hj
+from hybridjax.recordings.spoil import spoil
+
+
+hj.enable_x64()
+
+# %% [markdown]
+# ## A recording
+#
+# Two trials of 250 strides at 200 samples per second: position and velocity of the body, and a
+# random force with power up to 8 Hz, which knows nothing of strides. Then the dirt: noise,
+# rounding, 1 % of the samples lost, and a gap of ten strides.
+
+# %%
+cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+force = np.stack([hj.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)])
+clean = hj.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
+recording = spoil(
+    clean, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0), seed=0
+)
+print(recording)
+
+# %% [markdown]
+# ## The five lines
+#
+# Phase is the angle of position and velocity about the centre of their loop, which is estimated;
+# each cycle is sampled at 32 phases; two multipliers are fitted.
+
+# %%
+phase = hj.estimate_phase(recording, hj.AnglePhase("yM", "vM"))
+data = hj.section_data(recording, phase, inputs="u", outputs=("yM", "vM"), sections=32)
+fit = hj.fit_series(data.records, order=2)
+print(phase, data, fit, sep="\n")
+
+# %% [markdown]
+# The truth lies within the 95 % region.
+
+# %%
+print(fit.compare(cycle.multipliers))
+print("held by the 95 % regions:", fit.contains(cycle.multipliers))
+
+# %% [markdown]
+# ## Look at the data first
+#
+# The periods of the cycles, the average cycle, the deviations from it, and the force's spectrum.
+
+# %%
+figure = hj.plot.phase(phase)
+
+# %%
+figure = hj.plot.section_data(data)
+
+# %% [markdown]
+# ## How many multipliers, and is the model good?
+#
+# The order that predicts strides best that it was not fitted to; and a model of the first three
+# quarters, simulated on the last. What is left is correlated in time since the splines smooth over
+# neighbouring sections.
+
+# %%
+print("order:", hj.choose_order(data))
+held_out = hj.hold_out(data, order=2)
+print(held_out.validation)
+figure = hj.plot.validation(held_out.validation)
+
+# %% [markdown]
+# ## What the data cannot carry
+#
+# In plain words, with the multipliers that plain regression would have given, and the standard
+# errors that other numbers of strides would give.
+
+# %%
+advice = hj.advise(data, fit)
+print(advice)
+for strides, errors in zip(advice.strides, advice.expected, strict=True):
+    print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
+axes = hj.plot.multiplier_regions(fit, advice.plain)
+
+# %% [markdown]
+# ## Transfer functions and impulse responses
+#
+# Harmonic transfer functions beside the exact ones of the linearised hopper, and what a brief push
+# does at each phase.
+
+# %%
+sections = hj.KinematicPhase(
+    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
+    start=hj.Crossing("vM", "falling"),
+)  # fmt: skip
+exact = hj.linearize(cycle, sections, outputs=("yM", "vM"))
+f = np.arange(1, 161) / 20
+figure = hj.plot.bode(fit.htf(f), exact.htf(f))
+
+# %%
+figure = hj.plot.impulse_responses(hj.impulse_responses(fit, data))
+
+# %% [markdown]
+# ## The next experiment
+#
+# A multisine as a table: by phase, for hardware that triggers on it, or against time.
+
+# %%
+design = hj.multisine(periods=64, f_max=8.0, lines="odd").scaled(rms=0.02)
+with tempfile.TemporaryDirectory() as folder:
+    hj.write_design(Path(folder) / "by_phase.csv", design)
+    print((Path(folder) / "by_phase.csv").read_text()[:120])
+
+# %% [markdown]
+# ## All of it in one command
+#
+# ```
+# hybridjax identify trial1.csv trial2.csv --input force --outputs yM,vM --phase yM,vM --out results
+# ```
+#
+# does the same and writes one page for a colleague. From Python:
+
+# %%
+found = hj.identify_recording(
+    recording, hj.AnglePhase("yM", "vM"), inputs="u", outputs=("yM", "vM"), order=2
+)
+with tempfile.TemporaryDirectory() as folder:
+    page = hj.write_report(found, Path(folder) / "results")
+    print(sorted(path.name for path in page.parent.iterdir()), page.stat().st_size // 1000, "kB")
