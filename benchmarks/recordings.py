@@ -146,10 +146,10 @@ def walker(seeds=10, strides=100, trials=5, noise=1e-4):
     print(f"\nWalkers without a clock: {trials} trials of {strides} strides, noise {noise:g}")
     systems = {
         "rimless wheel": (
-            hj.models.RimlessWheel(), "impact", ("th", "w"), "th", "rising", 0.004, 1,
+            hj.models.RimlessWheel(), "impact", ("th", "w"), "th", "rising", 0.0015, 1,
         ),
         "compass gait": (
-            hj.models.CompassGait(), "heelstrike", ("n", "s", "vn", "vs"), "s", "falling", 0.1, 3,
+            hj.models.CompassGait(), "heelstrike", ("n", "s", "vn", "vs"), "s", "falling", 0.02, 3,
         ),
     }  # fmt: skip
     for label, (system, event, outputs, angle, direction, size, order) in systems.items():

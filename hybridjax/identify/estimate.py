@@ -51,9 +51,12 @@ class MultiplierEstimate(eqx.Module):
         a real $\lambda$, two for a complex one. The result is
         $p^T \mathrm{Cov}(p)^{-1} p$, chi-squared distributed with one or two degrees of freedom at
         a true multiplier (Hotelling's $T^2$ where the covariance is estimated), also where
-        multipliers are close to each other (Fieller 1954).
+        multipliers are close to each other (Fieller 1954). Zero where the covariance is infinite:
+        then nothing is known.
         """
         true = np.atleast_1d(np.asarray(true, complex)).ravel()
+        if not np.isfinite(self.covariance).all():
+            return np.zeros(len(true))
         powers = true[:, None] ** np.arange(len(self.coefficients), -1, -1)
         value = powers @ np.concatenate([[1.0], self.coefficients])
         out = np.empty(len(true))

@@ -16,7 +16,7 @@ from .tracker import track
 
 _BREAK = 0.25  # of a cycle: the turns in a longer gap cannot be counted
 _HARMONICS = 32  # bandwidth of the angle's signals, in cycles per cycle
-_LEAP = 1e-6  # of a cycle, in which a phase leaps or waits
+_SLOWEST = 0.1  # cycles that a causal phase goes on until the next event, at least
 _TAILS = 0.01  # of the samples at either end, which say nothing of the range
 
 
@@ -155,7 +155,8 @@ def estimate_phase(recording: Recording, definition: Definition, *, causal: bool
       signals by name, that returns an angle (n,) in rad, with or without its whole turns, NaN where
       it is not known.
     - `causal`: from the past only, as hardware in real time would find it: an angle by a
-      `PhaseTracker`; from events by the duration of the last cycle.
+      `PhaseTracker`; from events by the duration of the last cycle, which remembers three cycles
+      (fit it with `overhang=2 * sections`).
 
     Angles that run backwards in noise are replaced by the mean of the two monotone envelopes, one
     from below and one from above. Stretches end at gaps longer than a quarter of a cycle.
@@ -300,18 +301,12 @@ def _from_events(recording: Recording, definition: EventPhase, causal: bool) -> 
 
 
 def _extrapolated(t: Float[np.ndarray, " n"]) -> Winding:
-    """Each cycle goes on at the rate of the one before, and waits for its event where that is late.
-
-    Where the event is early the phase leaps.
-    """
-    before, own = np.diff(t[:-1]), np.diff(t[1:])
-    k = np.arange(1.0, len(t) - 1)
-    turn = t[1:-1] + np.minimum(before, own) * (1 - _LEAP)
-    phase = k + np.minimum(own / before, 1.0) * (1 - _LEAP)
-    time = np.stack([t[1:-1], turn], axis=1).ravel()
-    return Winding(
-        np.append(time, t[-1]), np.append(np.stack([k, phase], axis=1).ravel(), k[-1] + 1), True
-    )
+    """In each cycle the rate that would make the phase right at the next event, if that comes after
+    as long a time as the last one did."""
+    phase = [1.0]
+    for k, (before, own) in enumerate(zip(np.diff(t[:-1]), np.diff(t[1:]), strict=True), 1):
+        phase.append(phase[-1] + max(k + 1 - phase[-1], _SLOWEST) * own / before)
+    return Winding(t[1:], np.array(phase), True)
 
 
 def _phase(stretches, backwards, dropped=0, missed=0, lead=0) -> Phase:

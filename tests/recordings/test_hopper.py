@@ -1,5 +1,8 @@
 """From a recording to multipliers, where the truth is known."""
 
+import numpy as np
+import pytest
+
 import hybridjax as hj
 from hybridjax.recordings.spoil import spoil
 
@@ -21,3 +24,46 @@ def test_dirt(hopper_recording, hopper_cycle, angle):
     assert len(data.records) == 2
     assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
+
+
+@pytest.mark.slow
+def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
+    """Against the exact linearisation, averaged over the push."""
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    data = hj.section_data(hopper_recording, angle, **options)
+    fit = hj.fit_series(data.records, order=2)
+    found = hj.impulse_responses(fit, data, cycles=2, width=0.08)
+    sections = hj.KinematicPhase(
+        16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
+        start=hj.Crossing("vM", "falling"),
+    )  # fmt: skip
+    exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
+    reach, step = 4, found.period / 16
+    k = np.arange(-reach, reach + 1)
+    push = np.exp(-0.5 * (k / (16 * found.width)) ** 2)
+    for m in (0, 5, 11):
+        for r in (8, 20, 31):
+            n = (m + r) % 16
+            value = sum(w * exact[n, r - j] for w, j in zip(push / push.sum(), k, strict=True))
+            miss = np.abs(found.values[m, r, :, 0] - value[:, 0] / step)
+            assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()
+
+
+def test_order_and_advice(hopper_recording, angle):
+    noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-3)
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    data = hj.section_data(noisy, angle, **options)
+    fit = hj.fit_series(data.records, order=2)
+    advice = hj.advise(data, fit)
+    assert hj.choose_order(data) == 2
+    assert any("plain regression (ARX) would give" in w for w in advice.warnings)
+    assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
+    assert (np.diff(advice.expected[:, 0]) <= 0).all()
+    slow = hj.Recording(
+        noisy.trials[0].time,
+        {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
+            ("yM", "vM"), noisy.trials[0].values[:, 1:].T, strict=True))},
+    )  # fmt: skip
+    poor = hj.section_data(slow, angle, **options)
+    said = hj.advise(poor, hj.fit_series(poor.records, order=2, check=False)).warnings
+    assert any(w.startswith("Narrow excitation") for w in said)
