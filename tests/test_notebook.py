@@ -6,6 +6,7 @@ import re
 import sys
 import types
 
+import numpy as np
 import pytest
 from matplotlib import pyplot
 
@@ -49,7 +50,26 @@ def own_system(found):
     assert found.fit.compare(found.cycle.multipliers).max_error < 1e-5
 
 
-CHECKS = {"own_system": own_system, "paper": paper, "strides": strides}
+def fit(found):
+    assert found.fit.identifiability.rank == 5 and found.fit.contains(found.truth, 0.999)
+    error, before = (np.abs(c.multipliers - found.real.multipliers).max()
+                     for c in (found.found, found.guess))  # fmt: skip
+    assert error < before
+
+
+def sweep(found):
+    radius = np.abs(found.best.multipliers).max()
+    assert abs(radius - found.winner[2]) < 1e-3
+
+
+def recording(found):
+    assert found.fit.contains(found.cycle.multipliers, 0.999).all()
+
+
+CHECKS = {
+    "fit": fit, "own_system": own_system, "paper": paper, "recording": recording,
+    "strides": strides, "sweep": sweep,
+}  # fmt: skip
 
 
 @pytest.mark.slow

@@ -25,6 +25,9 @@ from ..periodic.htf import HTF
 from ..systems.structure import Structure
 
 
+Numbers = ArrayLike | Sequence
+
+
 class AbstractObservation(eqx.Module):
     """Something that was measured, as `fit_model` takes it. Subclass it for data of other kinds.
 
@@ -114,7 +117,7 @@ class ObservedSeries(AbstractObservation):
     weighted: Bool[Array, ""]
     flow: tuple[Plan, Settings] | None
 
-    def __init__(self, data: ExperimentData, sections, std: ArrayLike | None = None):
+    def __init__(self, data: ExperimentData, sections, std: Numbers | None = None):
         """**Arguments:** `data` of experiments with `start="cycle"`; `sections`, their family;
         `std`, the standard deviation of the measurement noise, one number or one for each output.
 
@@ -188,13 +191,13 @@ class ObservedCycle(AbstractObservation):
         self,
         sections,
         outputs: Sequence[str] | str = (),
-        values: ArrayLike | None = None,
+        values: Numbers | None = None,
         *,
-        times: ArrayLike | None = None,
-        period: ArrayLike | None = None,
-        std: ArrayLike | None = None,
-        times_std: ArrayLike | None = None,
-        period_std: ArrayLike | None = None,
+        times: Numbers | None = None,
+        period: Numbers | None = None,
+        std: Numbers | None = None,
+        times_std: Numbers | None = None,
+        period_std: Numbers | None = None,
     ):
         """**Arguments:**
 
@@ -267,14 +270,14 @@ def _times(placed: PlacedSections) -> Float[Array, " N"]:
     return t if placed.cycle.clocked else t - t[0]
 
 
-def _finite(name: str, x: ArrayLike, shape: tuple[int, ...]) -> Float[Array, "..."]:
+def _finite(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."]:
     x = jnp.asarray(x, float)
     if x.shape != shape or not jnp.isfinite(x).all():
         raise DefinitionError(f"`{name}` must be finite and of the shape {shape}, not {x.shape}.")
     return x
 
 
-def _scale(name: str, std: ArrayLike | None, seen: Array) -> Float[Array, "..."]:
+def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
     """Standard deviations that were given, or sizes."""
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))

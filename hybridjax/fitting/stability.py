@@ -41,6 +41,11 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: float = 1e-3) -> Float[
     if not 0 < smoothing < 1:
         raise DefinitionError(f"smoothing lies between 0 and 1, not at {smoothing}.")
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
+    return _smooth_radius(power, jnp.asarray(smoothing, float))
+
+
+@jax.jit
+def _smooth_radius(power: Float[Array, "d d"], smoothing: Float[Array, ""]) -> Float[Array, ""]:
     d = power.shape[0]
 
     def excess(x, power):

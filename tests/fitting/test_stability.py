@@ -14,7 +14,7 @@ def model(A):
     return hj.LDTP(A, jnp.ones((len(A), d, 1)), jnp.ones((len(A), 1, d)))
 
 
-@settings(deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**16), st.floats(1e-6, 0.5))
 def test_it_is_bounded_as_stated(seed, smoothing):
     A = np.random.default_rng(seed).normal(size=(2, 3, 3))
@@ -28,8 +28,8 @@ def test_it_is_bounded_as_stated(seed, smoothing):
 def test_it_is_the_sum_that_it_is_said_to_be():
     A = jnp.array([[[0.5, 0.7], [-0.2, 0.3]]])
     found = float(hj.spectral_radius(model(A), 1e-2))
-    powers = [np.linalg.matrix_power(np.asarray(A[0]), j) for j in range(5000)]
-    total = sum(found ** (-2 * j) * np.sum(p**2) for j, p in enumerate(powers))
+    powers = [np.linalg.matrix_power(np.asarray(A[0]) / found, j) for j in range(3000)]
+    total = sum(np.sum(p**2) for p in powers)
     assert total == pytest.approx(2 / 1e-2, rel=1e-9)
 
 
