@@ -57,7 +57,7 @@ def distance(multipliers, true):
     return np.abs(multipliers - true).max()
 
 
-def errors(seeds=10):
+def errors(seeds=5):
     print(f"\nHopper, {RATE} Hz, force of {BANDWIDTH:g} Hz and rms {RMS} N; {seeds} seeds")
     recordings, true = hopper(1000, range(seeds))
     print("strides  noise    rms error  (median)   said     plain ARX, rms; on splines through all")
@@ -103,7 +103,7 @@ def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16):
         )
 
 
-def dirt(seeds=6, strides=500, noise=1e-4):
+def dirt(seeds=5, strides=500, noise=1e-4):
     print(f"\nDirt: hopper, {strides} strides, noise {noise:g}, {seeds} seeds")
     recordings, true = hopper(strides, range(seeds))
     gap = (strides / 2, strides / 2 + 20)
@@ -147,9 +147,6 @@ def walker(seeds=10, strides=100, trials=5, noise=1e-4):
     systems = {
         "rimless wheel": (
             hj.models.RimlessWheel(), "impact", ("th", "w"), "th", "rising", 0.0015, 1,
-        ),
-        "compass gait": (
-            hj.models.CompassGait(), "heelstrike", ("n", "s", "vn", "vs"), "s", "falling", 0.02, 3,
         ),
     }  # fmt: skip
     for label, (system, event, outputs, angle, direction, size, order) in systems.items():

@@ -169,6 +169,10 @@ def _write_sections(found: Identification, folder: Path) -> None:
             table.writerow([n, n / data.sections, *(f"{x:.9g}" for x in row)])
 
 
+_CAPTIONS = {
+    "bode": "Magnitude and phase of H_0, with bands of 95 %.",
+    "harmonics": "Magnitudes of H_0, H_1 and H_-1, with bands of 95 %.",
+}
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; } h1, h2 { line-height: 1.2; } h2 { margin-top: 2.5rem; }
@@ -248,7 +252,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         _figure(images["impulse_responses"], "Bands hold the true response with 95 %."),
         "<h2>Harmonic transfer functions</h2>",
         *(
-            _figure(image, f"{_safe(name.replace('_', ', '))}; bands of 95 %.")
+            _figure(image, _CAPTIONS[name.split("_")[0]])
             for name, image in images.items()
             if name.startswith(("bode", "harmonics"))
         ),
@@ -262,7 +266,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         _figure(
             images["sections"],
             "Average cycle; deviations with twice their standard deviation; power of inputs, and "
-            "outputs at section 0.",
+            "outputs from cycle to cycle at the section where they vary most.",
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
         f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags; regions "

@@ -210,4 +210,4 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
 
 
 def _list(values) -> str:
-    return ", ".join(f"{z:.3g}" for z in values)
+    return ", ".join(f"{z:.4f}" for z in values)

@@ -15,7 +15,7 @@ from .recording import Recording, Trial
 from .smoothing import gaps, inside, means, nearest, spline
 
 
-_GAP = 0.5  # of the time between sections: a longer one leaves a sample out
+_GAP = 1.0  # times the time between sections: a longer one leaves a sample out
 
 
 class SectionData(eqx.Module):
@@ -129,7 +129,7 @@ def section_data(
     - `drift`: changes of the cycle that take longer than so many cycles are taken out of
       inputs and outputs, section by section (least squares on cosines). By default only the
       average cycle of each trial is.
-    - `max_gap`: the longest time without a sample that a spline may bridge; by default half of the
+    - `max_gap`: the longest time without a sample that a spline may bridge; by default the
       mean time between sections, but not less than three samples.
 
     **Raises:** `DefinitionError` for names that are not there, and a recording without a whole
