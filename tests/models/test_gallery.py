@@ -161,4 +161,4 @@ def test_energy_is_conserved_in_running():
     y, vx = cycle.state["y"], cycle.state["vx"]
     # Every cycle of the family has one multiplier 1; this one has the energy that Newton led to.
     assert np.min(np.abs(cycle.multipliers - 1)) < 1e-7
-    assert np.isfinite(runner.energy(jnp.array([y, vx, 0.0])))
+    assert np.isfinite(runner.energy(0.0, jnp.array([y, vx, 0.0]), 0.0))
