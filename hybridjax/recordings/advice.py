@@ -22,6 +22,7 @@ from .spectra import input_band, input_spectrum
 _FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are few
 _WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
 _LOST = 0.2  # of all samples
+_ENOUGH = 1000  # cycles to choose an order from, and to try it on
 _TIE = 0.02  # relative difference of misfits that are as good as equal
 
 
@@ -53,7 +54,7 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
 
     For each number a first, consistent estimate (total least squares) is made from all but the last
     `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
-    within 2 % of the best one.
+    within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
@@ -88,6 +89,8 @@ class HeldOut(NamedTuple):
 def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
     """Fit all but the last `share` of every record, and simulate that.
 
+    Of long recordings the first 1000 cycles are looked at.
+
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
     if not 0 < share < 1:
@@ -99,10 +102,12 @@ def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
 
 def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
     early, late = [], []
+    enough = min(1.0, _ENOUGH / data.cycles)
     for r in data.records:
-        cut = round(len(r.u) * (1 - share))
+        end = round(len(r.u) * enough)
+        cut = round(end * (1 - share))
         early.append(_part(r, slice(0, cut)))
-        late.append(_part(r, slice(cut, None)))
+        late.append(_part(r, slice(cut, end)))
     return early, late
 
 
