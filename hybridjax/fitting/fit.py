@@ -5,91 +5,26 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle, find_limit_cycle
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from .candidate import candidate_cycle
 from .identifiability import Identifiability, diagnose
 from .model_fit import ModelFit, Starts
 from .observations import AbstractObservation
 from .parameters import Free, Parameters, free_parameters
+from .problem import MAX_STEPS, Problem, evaluate, levenberg_marquardt
 
 
 # The iteration ends when neither coordinates nor residuals move by more than this part.
 _RTOL = 1e-9
-# Evaluations of the model for one start.
-_MAX_STEPS = 64
-# Along directions whose sensitivity is below this part of the largest one no step is taken.
-_RCOND = 1e-8
 # Without variances, a fit that explains all but this part of the data (mean square) is perfect.
 _PERFECT = 1e-12
-
-
-class _Problem(eqx.Module):
-    """Weighted residuals as a function of the coordinates x of the free parameters."""
-
-    parameters: Parameters
-    observations: tuple[AbstractObservation, ...]
-
-    @property
-    def weighted(self) -> bool:
-        """Whether all data came with their standard deviations."""
-        return all(bool(one.weighted) for one in self.observations)
-
-    def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
-        """Infinite where there is no limit cycle, or nothing to be observed on it."""
-        system = self.parameters.insert(guess.system, self.parameters.decode(x))
-        cycle = candidate_cycle(system, guess)
-        r = jnp.concatenate([one.residuals(cycle) for one in self.observations])
-        return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
-
-
-@quick_jit
-def _with_jacobian(problem: _Problem, x, guess):
-    """Residuals (r,) and Jacobian (r, p): all columns in one pass, forwards."""
-    push = jax.vmap(
-        lambda t: jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,)), out_axes=(None, -1)
-    )
-    return push(jnp.eye(x.shape[0]))
-
-
-@eqx.filter_custom_jvp
-def _residuals(x, problem, guess):
-    return _with_jacobian(problem, x, guess)[0]
-
-
-@_residuals.def_jvp
-def _residuals_jvp(primals, tangents):
-    """optimistix linearises at every trial point, so that this is one evaluation for each."""
-    x, problem, guess = primals
-    r, J = _with_jacobian(problem, x, guess)
-    return r, J @ tangents[0]
-
-
-@quick_jit
-def _levenberg_marquardt(problem: _Problem, x, guess, tolerance, max_steps: int):
-    """From one start: coordinates, residuals and Jacobian there, steps, whether it converged. With
-    an infinite tolerance, those of the start."""
-    solution = optx.least_squares(
-        lambda x, args: _residuals(x, *args),
-        optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=lx.SVD(rcond=_RCOND)),
-        x,
-        (problem, guess),
-        max_steps=max_steps,
-        throw=False,
-    )
-    last = solution.state.f_info  # what was computed at the coordinates that it gives back
-    done = solution.result == optx.RESULTS.successful
-    return solution.value, last.residual, last.jac.as_matrix(), solution.stats["num_steps"], done
 
 
 def fit_model(
@@ -101,7 +36,7 @@ def fit_model(
     starts: int = 1,
     spread: float = 0.2,
     seed: int = 0,
-    max_steps: int = _MAX_STEPS,
+    max_steps: int = MAX_STEPS,
     progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
@@ -161,7 +96,7 @@ def fit_model(
             f"none of {starts} starts has a limit cycle on which the data can be observed "
             f"({best.result.message}): start elsewhere, or give more `starts`."
         )
-    return _summary(parameters, tried, best, weighted)
+    return _summary(problem, tried, best)
 
 
 def identifiability(
@@ -183,13 +118,13 @@ def identifiability(
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system))
-    _, r, J, _, _ = _levenberg_marquardt(problem, x, cycle, jnp.asarray(jnp.inf), _MAX_STEPS)
+    r, J = evaluate(problem, x, cycle)
     if not np.isfinite(r).all():
         raise ComputationError("the system has a limit cycle, but the data cannot be had from it.")
     return diagnose(parameters.names, _relative(parameters, x, J))
 
 
-def _prepare(system, data, free, guess) -> tuple[_Problem, LimitCycle]:
+def _prepare(system, data, free, guess) -> tuple[Problem, LimitCycle]:
     """The problem, and a limit cycle near which to look for others."""
     parameters = free_parameters(system, free)
     observations = (data,) if isinstance(data, AbstractObservation) else tuple(data)
@@ -199,7 +134,7 @@ def _prepare(system, data, free, guess) -> tuple[_Problem, LimitCycle]:
         )
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
-    return _Problem(parameters, tuple(one.prepare(near) for one in observations)), near
+    return Problem(parameters, tuple(one.prepare(near) for one in observations)), near
 
 
 def _anchored(cycle: LimitCycle) -> LimitCycle:
@@ -242,14 +177,14 @@ class _Found(eqx.Module):
     jacobian: Float[np.ndarray, "r p"]
 
 
-def _from(problem: _Problem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
+def _from(problem: Problem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
     p = problem.parameters
     cycle = find_limit_cycle(p.insert(system, p.decode(x)), near, throw=False)
     nothing = np.zeros(0), np.zeros((0, len(x)))
     if int(cycle.result) != Result.OK:
         return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
     tolerance = jnp.asarray(_RTOL)
-    end, r, J, steps, done = _levenberg_marquardt(problem, x, cycle, tolerance, max_steps)
+    end, r, J, steps, done = levenberg_marquardt(problem, x, cycle, tolerance, max_steps)
     r, steps = np.asarray(r), int(steps)
     if not np.isfinite(r).all():  # there is a cycle, but not what was observed on it
         return _Found(x, x, np.inf, steps, Result.NOT_CONVERGED, cycle, *nothing)
@@ -266,7 +201,8 @@ def _goal(count: int, parameters: int, weighted: bool) -> float:
     return freedom + 4 * np.sqrt(2 * freedom)
 
 
-def _summary(parameters: Parameters, tried: list[_Found], best: _Found, weighted) -> ModelFit:
+def _summary(problem: Problem, tried: list[_Found], best: _Found) -> ModelFit:
+    parameters, weighted = problem.parameters, problem.weighted
     decode = lambda x: np.asarray(parameters.decode(x))  # noqa: E731
     starts = Starts(
         np.stack([decode(one.start) for one in tried]),
@@ -281,10 +217,9 @@ def _summary(parameters: Parameters, tried: list[_Found], best: _Found, weighted
     seen = diagnose(parameters.names, sensitivity)
     freedom = len(best.residuals) - seen.rank
     unit = 1.0 if weighted else max(best.cost / max(freedom, 1), np.finfo(float).tiny)
-    information = sensitivity.T @ sensitivity / (unit * np.outer(size, size))
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     some = left[:, : seen.rank] / singular[: seen.rank] * size[:, None]
     return ModelFit(
-        best.cycle.system, best.cycle, parameters.names, values, unit * some @ some.T, information,
-        best.residuals, best.cost, freedom, weighted, seen, starts, int(best.result),
+        best.cycle.system, best.cycle, parameters.names, values, unit * some @ some.T,
+        best.residuals, best.cost, freedom, seen, starts, int(best.result), problem,
     )  # fmt: skip

@@ -4,6 +4,7 @@ import operator
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
@@ -13,6 +14,7 @@ from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem
 from .identifiability import Identifiability
+from .problem import Problem, evaluate
 
 
 class Starts(eqx.Module):
@@ -50,15 +52,15 @@ class ModelFit(eqx.Module):
 
     - `system`: with the fitted parameters. `cycle`: its limit cycle.
     - `names`, `values` (p,): the free parameters.
-    - `covariance` (p, p): of the values, the pseudo-inverse of `information`, so that it is zero
-        along combinations that the data do not see.
-    - `information` (p, p): $J^T J$ with the Jacobian J of the residuals in units of their standard
-        deviations; where the data have none, the unit is what the misfit itself says.
+    - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
+        of their standard deviations (where the data have none, what the misfit says); zero along
+        combinations that the data do not see.
     - `residuals` (r,): weighted, those of all observations one after the other.
     - `cost`: sum of their squares. `freedom`: r less the number of combinations that are seen; the
-        cost to be expected where `weighted`, i.e. all data came with their standard deviations.
+        cost to be expected where all data came with their standard deviations.
     - `identifiability`: which combinations of parameters the data see.
     - `starts`: what became of each start. `result`: code of the best one.
+    - `problem`: what was made small.
     """
 
     system: HybridSystem
@@ -66,14 +68,18 @@ class ModelFit(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     values: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
-    information: Float[np.ndarray, "p p"]
     residuals: Float[np.ndarray, " r"]
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
-    weighted: bool = eqx.field(static=True)
     identifiability: Identifiability
     starts: Starts
     result: int = eqx.field(static=True)
+    problem: Problem
+
+    @property
+    def weighted(self) -> bool:
+        """Whether all data came with their standard deviations."""
+        return self.problem.weighted
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " p"]:
@@ -82,8 +88,12 @@ class ModelFit(eqx.Module):
         return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
 
     def chi_square(self, true: HybridSystem | Mapping[str, float]) -> float:
-        r"""Squared distance of the values from others, $e^T J^T J e$: that from the truth has a chi
-        square distribution with `identifiability.rank` degrees of freedom.
+        r"""How much worse other values explain the data: their cost less that of the fit.
+
+        That of the truth has a chi square distribution with `identifiability.rank` degrees of
+        freedom (Wilks 1938). Unlike $e^T J^T J e$ with the errors e of the values, it does not
+        depend on how the parameters are written, and follows curved regions. Where the data have no
+        standard deviations the unit is what the misfit says.
 
         **Arguments:** `true`: a system, or values by name.
 
@@ -94,8 +104,10 @@ class ModelFit(eqx.Module):
         missing = [name for name in self.names if name not in true]
         if missing:
             raise DefinitionError(f"there is no true value of '{missing[0]}'.")
-        error = self.values - np.array([float(true[name]) for name in self.names])
-        return float(error @ self.information @ error)
+        values = jnp.array([float(true[name]) for name in self.names])
+        r, _ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
+        more = float(r @ r) - self.cost
+        return more if self.weighted else more / (self.cost / self.freedom)
 
     def contains(self, true: HybridSystem | Mapping[str, float], level: float = 0.95) -> bool:
         """Whether other values lie in the joint confidence region of all that the data see."""
