@@ -28,13 +28,15 @@ fits with several estimates of it, the closest).
 import argparse
 
 import numpy as np
-from estimation import RMS, Family, N
+from estimation import Family, N
 from scipy import stats
 from second_order import OUTPUTS, sections
 
 import hybridjax as hj
 
 
+# rms of the inputs where distortion is a small and a large part of the variance.
+RMS = {"isochron": (0.005, 1.0), "kinematic": (0.005, 0.2)}
 STEPS = ("paper", "noise", "white", "coverage")
 BAND = (-4, -3, -2, -1, 0, 1, 2, 3, 4)  # further harmonics tell nothing more about multipliers
 

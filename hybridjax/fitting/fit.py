@@ -21,8 +21,6 @@ from .parameters import Free, Parameters, free_parameters
 from .problem import MAX_STEPS, Problem, evaluate, levenberg_marquardt
 
 
-# The iteration ends when neither coordinates nor residuals move by more than this part.
-_RTOL = 1e-9
 # Without variances, a fit that explains all but this part of the data (mean square) is perfect.
 _PERFECT = 1e-12
 
@@ -183,8 +181,7 @@ def _from(problem: Problem, x, system: HybridSystem, near: LimitCycle, max_steps
     nothing = np.zeros(0), np.zeros((0, len(x)))
     if int(cycle.result) != Result.OK:
         return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
-    tolerance = jnp.asarray(_RTOL)
-    end, r, J, steps, done = levenberg_marquardt(problem, x, cycle, tolerance, max_steps)
+    end, r, J, steps, done = levenberg_marquardt(problem, x, cycle, max_steps)
     r, steps = np.asarray(r), int(steps)
     if not np.isfinite(r).all():  # there is a cycle, but not what was observed on it
         return _Found(x, x, np.inf, steps, Result.NOT_CONVERGED, cycle, *nothing)

@@ -16,6 +16,8 @@ from .observations import AbstractObservation
 from .parameters import Parameters
 
 
+# The iteration ends when neither coordinates nor residuals move by more than this part.
+_RTOL = 1e-9
 # Evaluations of the model for one start.
 MAX_STEPS = 64
 # Along directions whose sensitivity is below this part of the largest one no step is taken.
@@ -51,37 +53,41 @@ def _with_jacobian(problem: Problem, x, guess):
 
 
 @eqx.filter_custom_jvp
-def _residuals(x, problem, guess):
-    return _with_jacobian(problem, x, guess)[0]
+def _residuals(x, problem, guess, free):
+    r, J = _with_jacobian(problem, x, guess)
+    return r, (r, J)
 
 
 @_residuals.def_jvp
 def _residuals_jvp(primals, tangents):
     """optimistix linearises at every trial point, so that this is one evaluation for each."""
-    x, problem, guess = primals
+    x, problem, guess, free = primals
     r, J = _with_jacobian(problem, x, guess)
-    return r, J @ tangents[0]
+    return (r, (r, J)), (free * (J @ tangents[0]), (None, None))
 
 
 @quick_jit
-def levenberg_marquardt(problem: Problem, x, guess, tolerance, max_steps: int):
-    """From one start: coordinates, residuals and Jacobian there, steps, whether it converged. With
-    an infinite tolerance, those of the start."""
+def _iterate(problem: Problem, x, guess, free, max_steps: int):
     solution = optx.least_squares(
         lambda x, args: _residuals(x, *args),
-        optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=lx.SVD(rcond=_RCOND)),
+        optx.LevenbergMarquardt(_RTOL, _RTOL, linear_solver=lx.SVD(rcond=_RCOND)),
         x,
-        (problem, guess),
+        (problem, guess, free),
+        has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    last = solution.state.f_info  # what was computed at the coordinates that it gives back
     done = solution.result == optx.RESULTS.successful
-    return solution.value, last.residual, last.jac.as_matrix(), solution.stats["num_steps"], done
+    return solution.value, *solution.aux, solution.stats["num_steps"], done
+
+
+def levenberg_marquardt(problem: Problem, x: Float[Array, " p"], guess: LimitCycle, max_steps: int):
+    """From one start: coordinates, residuals and Jacobian there, steps, whether it converged."""
+    return _iterate(problem, x, guess, jnp.asarray(1.0), max_steps)
 
 
 def evaluate(problem: Problem, x: Float[Array, " p"], guess: LimitCycle):
-    """Residuals (r,) and Jacobian (r, p) at x, by the program of the iteration."""
-    nowhere = jnp.asarray(jnp.inf)
-    _, r, J, _, _ = levenberg_marquardt(problem, x, guess, nowhere, MAX_STEPS)
+    """Residuals (r,) and Jacobian (r, p) at x. By the program of the iteration, since another would
+    compile for as long: a derivative that is zero moves nothing."""
+    _, r, J, _, _ = _iterate(problem, x, guess, jnp.asarray(0.0), MAX_STEPS)
     return np.asarray(r), J
