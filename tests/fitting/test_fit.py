@@ -97,7 +97,9 @@ def test_the_hopper_comes_back_from_its_htfs(hopper_cycle, hopper_htf, seen_in_h
     fit = hj.fit_model(wrong, data, HOPPER, guess=hopper_cycle, starts=4)
     true = hopper_cycle.system
     for name in ("m", "M", "k", "b"):
-        assert float(getattr(fit.system, name)) == pytest.approx(getattr(true, name), rel=1e-9)
+        assert float(getattr(fit.system, name)) == pytest.approx(
+            float(getattr(true, name)), rel=1e-9
+        )
     assert float(fit.system.a / fit.system.g) == pytest.approx(10.0, rel=1e-9)
 
 
