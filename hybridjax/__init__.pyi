@@ -136,6 +136,7 @@ from .recordings.simulated import (
     random_force as random_force,
     simulate_recording as simulate_recording,
 )
+from .recordings.spoil import spoil as spoil
 from .recordings.tables import (
     add_command as add_command,
     read_design as read_design,

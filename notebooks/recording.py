@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.recordings.spoil import spoil
 
 
 hj.enable_x64()
@@ -41,7 +40,7 @@ hj.enable_x64()
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 force = np.stack([hj.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)])
 clean = hj.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
-recording = spoil(
+recording = hj.spoil(
     clean, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0), seed=0
 )
 print(recording)

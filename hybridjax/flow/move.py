@@ -87,7 +87,8 @@ def record(
     """
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     arguments = system, lanes, u, target, setout, result
-    return _search(*(_constant(x) for x in arguments), settings, _How(True, False, new_input, tangents))
+    how = _How(True, False, new_input, tangents)
+    return _search(*(_constant(x) for x in arguments), settings, how)
 
 
 def follow(

@@ -43,6 +43,7 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
+    assert abs(fit.chi_square(fit.system)) < 1e-6
     with pytest.raises(hj.DefinitionError, match="no true value of 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
 
