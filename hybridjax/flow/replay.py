@@ -16,7 +16,7 @@ from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import apply_resets, scheduled_time
 from .lanes import Lanes, for_each_chart, needed, only
-from .step import rk_step
+from .step import Step, rk_step
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .target import Target
 from .watch import chart_field, settle, watched
@@ -79,7 +79,12 @@ def _advance(s, t, q, chart, moves, u, target, h, which, unroll):
         own, goal = Structure(own), dataclasses.replace(target, levels=levels)
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
         index, crossing = only(here, target.index), jnp.where(here, which, -1)
-        step = rk_step(chart_field(own, a, u0), t0, q0, h0, unroll)
+        # (A branch of its own, lest XLA masks the states again in every stage.)
+        step = jax.lax.cond(
+            here.any(),
+            lambda: rk_step(chart_field(own, a, u0), t0, q0, h0, unroll),
+            lambda: Step(q0, q0, q0, q0),
+        )
         q1, t1 = step.q, t0 + h0
 
         def land():
