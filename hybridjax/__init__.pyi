@@ -116,6 +116,7 @@ from .recordings.advice import (
     hold_out as hold_out,
     plain_regression as plain_regression,
 )
+from .recordings.drift import without_drift as without_drift
 from .recordings.identification import (
     Identification as Identification,
     identify_recording as identify_recording,

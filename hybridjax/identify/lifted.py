@@ -60,8 +60,8 @@ class Model(NamedTuple):
 
 class Misfit(NamedTuple):
     cost: float
-    square: Float[np.ndarray, "N ny"]
-    """Sum of the squares of what is left."""
+    left: Float[np.ndarray, "S T N ny"]
+    """Over the noise."""
     freedom: Float[np.ndarray, "N ny"]
     hessian: Float[np.ndarray, "P P"] | None
     gradient: Float[np.ndarray, " P"] | None
@@ -113,13 +113,14 @@ def refine(
 
 def _pays(lifted: Lifted, second: Lifted, plain: Refined, full: Refined) -> bool:
     """Do products explain more than they would of noise, and make the coefficients surer?"""
-    chance, entering = [], second.w.shape[2] - lifted.w.shape[2]
+    chance = []
     for (good, few), (_, many) in zip(_pairs(lifted), _pairs(second), strict=True):
-        rows, more = good.sum(), many.shape[1] - few.shape[1] + entering
+        rows, more = good.sum(), many.shape[1] - few.shape[1]
         chance.append(np.sqrt(2 * more / (rows * (rows - more))))
     explained = -2 * np.log(second.noise / lifted.noise).mean()
     sizes = [np.linalg.slogdet(x.covariance)[1] / (2 * len(x.covariance)) for x in (full, plain)]
-    return explained > _SIGNIFICANT * np.mean(chance) and sizes[0] < sizes[1] + np.log(_SURER)
+    significant = explained > _SIGNIFICANT * np.mean(chance)
+    return bool(significant and sizes[0] < sizes[1] + np.log(_SURER))
 
 
 def _pairs(lifted: Lifted):
@@ -262,15 +263,15 @@ def _sections(lifted: Lifted, model: Model, slopes: bool = True):
 
 def _evaluate(lifted: Lifted, model: Model, slopes: bool = True) -> Misfit:
     N, ny = lifted.noise.shape
-    square, freedom = np.zeros((N, ny)), np.zeros((N, ny))
+    left, freedom = np.zeros(lifted.y.shape), np.zeros((N, ny))
     P = model.A.size + model.B.size
     hessian, gradient = np.zeros((P, P)), np.zeros(P)
-    for n, i, _, e, J, leverage in _sections(lifted, model, slopes):
-        square[n, i], freedom[n, i] = e @ e, len(e) - leverage.sum()
+    for n, i, good, e, J, leverage in _sections(lifted, model, slopes):
+        left[good, n, i], freedom[n, i] = e, len(e) - leverage.sum()
         if slopes:
             hessian += J.T @ J
             gradient += J.T @ e
-    return Misfit(float(square.sum()), square, freedom, hessian, gradient)
+    return Misfit(float((left**2).sum()), left, freedom, hessian, gradient)
 
 
 def _inverse(hessian: np.ndarray) -> np.ndarray:
@@ -295,9 +296,12 @@ def _fit(lifted: Lifted, model: Model, max_steps: int) -> tuple[Lifted, Model, b
     for _ in range(2):
         model, ended = _minimise(lifted, model, max_steps)
         found = _evaluate(lifted, model, False)
-        # What enters the state may all be used up on noise that enters it, too.
-        freedom = np.maximum(found.freedom - lifted.w.shape[2], 1.0)
-        noise = lifted.noise * np.sqrt(found.square / freedom)
+        each = found.left.reshape(-1, found.freedom.size)
+        square = each.T @ each
+        # A and B are used up on as many independent errors as there are in a cycle.
+        independent = np.trace(square) ** 2 / (square**2).sum()
+        freedom = np.maximum(found.freedom - model.B.size / independent, 1.0)
+        noise = lifted.noise * np.sqrt(np.diag(square).reshape(freedom.shape) / freedom)
         lifted = lifted._replace(noise=np.maximum(noise, _rounding(lifted.y, lifted.good)))
     return lifted, model, ended
 
@@ -346,23 +350,27 @@ def _covariance(lifted: Lifted, model: Model, errors: str):
     if errors == "white":
         return c, white, np.inf
     # In units in which white noise makes the covariance of c one.
-    to_c = np.linalg.solve(np.linalg.cholesky(white), to_c)
+    half = np.linalg.cholesky(white)
+    to_c = np.linalg.solve(half, to_c)
     values, vectors = np.linalg.eigh(inverse)
     root = vectors * np.sqrt(np.maximum(values, 0))
-    S, T = lifted.w.shape[:2]
-    score, share = np.zeros((S, T, d)), np.zeros((S, T, d, len(inverse)))
-    for _, _, good, e, J, leverage in _sections(lifted, model):
-        # What a sample would miss a fit to the others by: errors that are large where inputs are,
-        # as those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
-        own = J @ to_c.T
-        score[good] += own * (e / np.maximum(1 - leverage, 1e-3))[:, None]
-        share[good] += own[:, :, None] * J[:, None]
-    parts = share @ to_c.T
+    S, T, N, ny = lifted.y.shape
+    error, slopes = np.zeros((S, T, N, ny)), np.zeros((S, T, N, ny, len(inverse)), np.float32)
+    for n, i, good, e, J, leverage in _sections(lifted, model):
+        error[good, n, i] = e / np.maximum(1 - leverage, 1e-3)
+        slopes[good, n, i] = J @ root
+    error, slopes = error.reshape(S, T, -1), slopes.reshape(S, T, N * ny, -1)
+    # What each cycle would miss a fit to the others by: errors that are large where inputs are, as
+    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
+    own = np.eye(N * ny) * (1 + 1e-6) - slopes @ slopes.swapaxes(2, 3)
+    error = np.linalg.solve(own, error[..., None])[..., 0]
+    mine = slopes @ (to_c @ found.hessian @ root).T
+    score = np.einsum("stad,sta->std", mine, error)
+    parts = np.einsum("stad,stae->stde", mine, mine)
     slowest = np.clip(np.abs(np.linalg.eigvals(model.A)).max(), 1e-3, 0.99)
     lags = int(min(np.ceil(np.log(0.1) / np.log(slowest)), T // 4))
-    gradient, terms = dependent(score, share @ root, lags)
+    gradient, terms = dependent(score, lags)
     scaled, freedom = sandwich(np.eye(d), gradient, parts.reshape(-1, d, d))
-    half = np.linalg.cholesky(white)
     return c, half @ scaled @ half.T, freedom / terms
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 
 from ..identify.series import SeriesFit, fit_series
 from .advice import Advice, HeldOut, advise, choose_order, hold_out
+from .drift import without_drift
 from .impulse import ImpulseResponses, impulse_responses
 from .phase import AnglePhase, Definition, Phase, estimate_phase
 from .recording import Recording
@@ -63,7 +64,7 @@ def identify_recording(
         moved = {outputs} if isinstance(outputs, str) else set(outputs)
         if isinstance(definition, AnglePhase):
             moved |= {definition.position, definition.velocity}
-        recording = recording.without_drift(sorted(moved), drift * phase.period)
+        recording = without_drift(recording, phase, sorted(moved), drift)
         if not isinstance(definition, Phase):
             phase = estimate_phase(recording, definition)
     about = {"inputs": inputs, "outputs": outputs, "sections": sections, "drift": drift}

@@ -129,7 +129,7 @@ def section_data(
     - `drift`: the outputs may drift, more slowly than in so many cycles, for reasons other than
       the inputs (those of the sensors, say): fits allow for it, section by section, by cosines. By
       default only for the average cycle of each trial not being known exactly. It also moves the
-      phase: take it out of the signals before (`Recording.without_drift`), as `identify_recording`
+      phase: take it out of the signals before (`without_drift`), as `identify_recording`
       does.
     - `max_gap`: the longest time without a sample that a spline may bridge; by default the
       mean time between sections, but not less than three samples.

@@ -132,6 +132,61 @@ def test_multipliers_that_noise_would_invent_are_refused(small):
     assert len(hj.fit_series(data, 3, check=False).multipliers) == 3
 
 
+ANGLES = (0.3, 0.8, 0.5, 0.4)
+
+
+def quadratic(seed, size, cycles=300):
+    """y = x + x**2 / 2 of a system with products of states and inputs, about a fixed point."""
+    rng = np.random.default_rng(seed)
+    N, u = 4, size * rng.normal(size=(4 * cycles, 1))
+    turn = [0.9 * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in ANGLES]
+    bend = rng.normal(size=(N, 2, 3, 3)) / 4
+    push = rng.normal(size=(N, 2))
+    x, y = np.zeros(2), []
+    for k, force in enumerate(u[:, 0]):
+        y.append(x + x**2 / 2)
+        z = np.append(x, force)
+        x = turn[k % N] @ x + push[k % N] * force + bend[k % N] @ z @ z
+    true = 0.9**N * np.exp([1j * sum(ANGLES), -1j * sum(ANGLES)])
+    return hj.Record(u, np.array(y), sections=N, drift=np.inf), true
+
+
+def test_distortion_of_second_order():
+    """What is left is of third order: with a tenth of the input it is a hundredth, not a tenth."""
+    errors = {}
+    for size in (0.03, 0.003):
+        for distortion in (False, True):
+            both = []
+            for seed in range(3):
+                data, true = quadratic(seed, size)
+                fit = hj.fit_series(data, 2, distortion=distortion)
+                assert fit.distortion == distortion
+                both.append(fit.compare(true).max_error)
+            errors[size, distortion] = np.sqrt(np.mean(np.square(both)))
+    assert errors[0.003, True] < errors[0.003, False] / 20
+    assert 5 < errors[0.03, False] / errors[0.003, False] < 20
+    assert errors[0.03, True] / errors[0.003, True] > 40
+    assert hj.fit_series(data, 2).distortion
+
+
+def test_drift_is_no_response(small):
+    """Slow changes of each section's outputs, of any size, change nothing if they are announced."""
+    plain = record(small, 4 * 150, noise=0.1)
+    T = 150
+    cycle = (np.arange(4 * T) // 4 + 0.5) / T
+    wave = 5 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * T) % 4) + 7
+    about = dict(sections=4, inputs=plain.inputs, outputs=plain.outputs, drift=50)
+    fits = [
+        hj.fit_series(hj.Record(plain.u, y, **about), 2) for y in (plain.y, plain.y + wave[:, None])
+    ]
+    np.testing.assert_allclose(fits[0].coefficients, fits[1].coefficients, atol=1e-6)
+    assert fits[1].contains(small.multipliers(), 0.999).all()
+    found = hj.validate(fits[1], hj.Record(plain.u, plain.y + wave[:, None], **about))
+    assert found.fit.min() > 90
+    with pytest.raises(hj.DefinitionError, match="positive number of cycles"):
+        hj.Record(plain.u, plain.y, sections=4, drift=0)
+
+
 def test_bad_records(small):
     good = record(small, 400)
     with pytest.raises(hj.DefinitionError, match="section 0 was sampled 10 times, too few"):

@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -55,9 +56,17 @@ def test_slow_drift_is_taken_out(wave):
     t, values = wave.trials[0].time, wave.trials[0].values
     drifting = dict(zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True))
     recording = hj.Recording(t, drifting)
-    phase = hj.estimate_phase(wave, CIRCLE)
-    assert sample(recording, phase).rms()[1][0] > 0.1
-    assert sample(recording, phase, drift=10).rms()[1][0] < 1e-2
+    assert sample(recording).rms()[1][0] > 0.1
+    rough = hj.estimate_phase(recording, CIRCLE)
+    flat = hj.without_drift(recording, rough, ("f", "x", "v"), 4)
+    assert sample(flat).rms()[1][0] < 0.02
+    assert sample(flat).records[0].drift == np.inf and sample(flat, drift=9).records[0].drift == 9
+    for phase, cycles, message in [
+        (rough, 3, "four cycles or more"),
+        (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
+    ]:
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.without_drift(wave, phase, "x", cycles)
 
 
 def test_times_of_crossings(wave):
