@@ -1,6 +1,5 @@
 """A branch of limit cycles along a parameter, and the points at which its stability changes."""
 
-import functools as ft
 import operator
 from typing import NamedTuple, SupportsIndex
 
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from .._core.errors import DefinitionError
+from .._core.remember import remembered
 from .._core.results import Result
 from .cycle import LimitCycle
 from .sweep import LimitCycles
@@ -73,7 +73,7 @@ class Branch(eqx.Module):
             raise DefinitionError(f"there is no kind '{kind}' of points; kinds are {KINDS}.")
         return tuple(p for p in self.points if p.kind == kind)
 
-    @ft.cached_property
+    @remembered
     def multipliers(self) -> Complex[np.ndarray, "K r"]:
         """Floquet multipliers of every cycle, the largest first, filled up with zeros."""
         rows = [self[k].multipliers for k in range(len(self))]
@@ -82,7 +82,7 @@ class Branch(eqx.Module):
             row[: len(values)] = values
         return out
 
-    @ft.cached_property
+    @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
         """Which cycles are stable. At a marked point itself this is left to rounding."""
         return np.array([self[k].stable for k in range(len(self))])

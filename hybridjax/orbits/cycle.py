@@ -1,6 +1,5 @@
 """Limit cycles: fixed points of the return map, by Newton with its exact Jacobian."""
 
-import functools
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -12,6 +11,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
+from .._core.remember import remembered
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..flow.lanes import Lanes
@@ -65,7 +65,7 @@ class LimitCycle(eqx.Module):
         """Whether a clock drives the system."""
         return self.system.period() is not None
 
-    @functools.cached_property
+    @remembered
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, the largest first (on the host).
 

@@ -1,6 +1,5 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
-import functools as ft
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -11,6 +10,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
+from .._core.remember import remembered
 from .._core.results import Result
 from .._core.threads import thread_count
 from ..flow.lanes import Lanes
@@ -73,7 +73,7 @@ class LimitCycles(eqx.Module):
         """Indices of the systems without a cycle."""
         return np.flatnonzero(~self.ok)
 
-    @ft.cached_property
+    @remembered
     def multipliers(self) -> Complex[np.ndarray, "S d"]:
         """Floquet multipliers, the largest first; NaN where there is no cycle.
 
