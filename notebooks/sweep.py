@@ -36,8 +36,9 @@ POINTS = 100  # in each direction
 # %% [markdown]
 # ## Limit cycles and multipliers of all of them
 #
-# One call. Newton starts from one hopper's cycle; where that fails a hopper is left to itself for
-# 40 periods first. What has no cycle of this kind is listed by index, with the reason.
+# One call. Newton starts from one hopper's cycle, and then from those of neighbours; where that
+# fails a hopper is left to itself for 40 periods first. What has no cycle of this kind is listed by
+# index, with the reason.
 
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
