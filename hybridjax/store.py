@@ -227,6 +227,7 @@ def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
         "family": placed.sections.label,
         "parameters": _digest(jax.tree_util.tree_leaves((system, placed.sections))),
         "accuracy": campaign.accuracy,
+        "precision": campaign.precision,
         "design": inputs,
         "cycle": np.concatenate(
             [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, campaign.scales)]

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .errors import PrecisionError
 
@@ -36,3 +38,25 @@ def require_x64(*trees: Any) -> None:
                 f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`. Switch 64-bit "
                 "mode on first, then build it again."
             )
+
+
+def at_precision(threshold: float) -> float:
+    """A threshold that is a matter of rounding errors, in the precision that JAX computes in.
+
+    It stands for a share of the digits: in double precision it is `threshold`, and in single
+    precision, which has 23 binary digits for 52, its power 23/52 (1e-12 becomes 5e-6).
+    """
+    return threshold ** (jnp.finfo(jnp.result_type(float)).nmant / 52)
+
+
+def single(tree: Any) -> Any:
+    """`tree` with its arrays rounded to 32 bits, for a program in `jax.enable_x64(False)`."""
+    narrow = {"f": np.float32, "i": np.int32}
+
+    def convert(x):
+        if not eqx.is_array(x):
+            return x
+        x = np.asarray(x)
+        return jnp.asarray(x.astype(narrow.get(x.dtype.kind, x.dtype)))
+
+    return jax.tree_util.tree_map(convert, tree)

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
-from .._core.precision import require_x64
+from .._core.precision import require_x64, single
 from .._core.results import Result
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
@@ -28,11 +28,14 @@ from ..systems.structure import Outputs, Structure
 from .data import ExperimentData
 from .design import Design
 from .respond import observe, respond
+from .single import plan_single
 
 
 # Experiments in one compiled call: on CPU, where more of them leave the cache and fewer share the
 # cost of what is done once for all; and elsewhere.
 _BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+# The accuracy where none is asked for.
+_ACCURACY = {"double": 1e-9, "single": 1e-4}
 # Splitting fewer than this among workers gains nothing.
 _FEW = 32
 # A multiple of the numbers that processors add at once: other batches are up to a third slower.
@@ -52,6 +55,9 @@ class Campaign:
     periods: int
     outputs: Outputs
     accuracy: float
+    precision: str
+    rounding: float
+    """The error that this precision leaves, beside that of the steps."""
     scales: Float[np.ndarray, "N n"]
     settings: Settings
     plan: Plan
@@ -76,7 +82,7 @@ class Campaign:
             require_x64()
             some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
             with jax.default_device(device):
-                part = _once_compiled(
+                arguments = (
                     self.placed,
                     self.plan,
                     jnp.asarray(start[:, some]),
@@ -84,12 +90,18 @@ class Campaign:
                     tuple(self.outputs.items),
                     self.settings,
                 )
+                if self.precision == "double":
+                    part = _once_compiled(*arguments)
+                else:
+                    with jax.enable_x64(False):
+                        part = _once_compiled(*single(arguments))
                 return [np.asarray(x)[: S - k] for x in part]
 
         with ThreadPoolExecutor(workers) as pool:
             parts = pool.map(work, range(0, S, size))
             bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
             y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
+        y, error = y.astype(float), error.astype(float) + self.rounding
         base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
         if not (np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)).all():
             for a in np.unique(self.placed.lanes.chart):
@@ -132,7 +144,7 @@ _compiling, _compiled = threading.Lock(), set()
 def _once_compiled(*arguments):
     """`_respond`, where threads that need the same program wait until one has compiled it."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    program = structure, tuple(getattr(x, "shape", x) for x in leaves)
+    program = structure, tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
     if program in _compiled:
         return _respond(*arguments)
     with _compiling:
@@ -150,8 +162,9 @@ def prepare(
     start: str = "cycle",
     discard: int | None = None,
     periods: int | None = None,
-    accuracy: float = 1e-9,
+    accuracy: float | None = None,
     scale: Mapping[str, float] | None = None,
+    precision: str = "double",
 ) -> Campaign:
     """Check what `run_experiments` was given, and do what is done once for all experiments."""
     placed = as_placed(cycle, sections)
@@ -173,6 +186,8 @@ def prepare(
             "experiments would leave it: stabilise the system, or use the exact linearisation "
             "(`linearize`), which needs no experiments."
         )
+    if precision not in _ACCURACY:
+        raise DefinitionError(f"precision is 'double' or 'single', not {precision!r}.")
     nu = len(cycle.system.inputs)
     source, count, cycles, periods = _source(design, placed.count, nu, start, discard, periods)
     model = None
@@ -182,10 +197,16 @@ def prepare(
                 "a periodic start needs inputs of a whole number of windows: use `discard=0`."
             )
         model = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
-    plan, settings, scales = plan_flow(placed, accuracy, scale)
+    accuracy = _ACCURACY[precision] if accuracy is None else float(accuracy)
+    if precision == "double":
+        planned, rounding = plan_flow(placed, accuracy, scale), 0.0
+    else:
+        planned, rounding = plan_single(placed, accuracy, scale)
+    plan, settings, scales = planned
     return Campaign(
-        placed, source, count, cycles, periods, z, float(accuracy), scales, settings, plan, model
-    )
+        placed, source, count, cycles, periods, z, accuracy, precision, rounding, scales, settings,
+        plan, model,
+    )  # fmt: skip
 
 
 def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.precision import at_precision
 from ..systems.structure import Structure
 from .aim import Aim
 from .hermite import NEAR, control_points, root_near_end
@@ -182,7 +183,8 @@ def _go_home(
     end = settle(s, a, target, t + tau, step.q, step.f1, u, index, which, first)
     share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
     rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
-    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + 1e-14 * span
+    rounding = at_precision(1e-14) * span
+    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + rounding
     lands = near & fine & (share <= _SHORT) & (jnp.abs(rough) <= 1.0)
     return _Home(
         jnp.where(lands, end.q, step.q),

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.precision import at_precision
+
 
 # An extremum within this fraction of the guard's values at the step's ends is a touch (grazing) ...
 TOUCH = 1e-10
@@ -75,11 +77,12 @@ def first_crossing(
         s = jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
+    small = at_precision(TOUCH) * scale
     touch = near = jnp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
-        touch = touch | (dips & (jnp.abs(value) <= TOUCH * scale))
-        near = near | (dips & (value > TOUCH * scale) & (value < NEAR * scale))
+        touch = touch | (dips & (jnp.abs(value) <= small))
+        near = near | (dips & (value > small) & (value < NEAR * scale))
     return Crossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
 
 
