@@ -72,7 +72,7 @@ def store_experiments(
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
     campaign = prepare(cycle, sections, design, outputs, **options)
     parts = chunks(campaign.count, chunk)
-    together, workers = divide(parts[0].stop, batch, workers)
+    together, workers = divide(parts[0].stop, batch, workers, campaign.precision)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)

@@ -1,5 +1,7 @@
-"""Double precision: switched on by the user, required by the solvers."""
+"""Double precision: switched on by the user, required by the solvers. Single precision, where it
+will do."""
 
+import contextlib
 from typing import Any
 
 import equinox as eqx
@@ -49,8 +51,17 @@ def at_precision(threshold: float) -> float:
     return threshold ** (jnp.finfo(jnp.result_type(float)).nmant / 52)
 
 
+def single_precision() -> contextlib.AbstractContextManager:
+    """A context in which this thread computes in 32 bits, with what `single` returns."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(False)
+    from jax.experimental import disable_x64  # before JAX 0.8
+
+    return disable_x64()
+
+
 def single(tree: Any) -> Any:
-    """`tree` with its arrays rounded to 32 bits, for a program in `jax.enable_x64(False)`."""
+    """`tree` with its arrays rounded to 32 bits."""
     narrow = {"f": np.float32, "i": np.int32}
 
     def convert(x):

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
-from .._core.precision import require_x64, single
+from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
@@ -33,7 +33,7 @@ from .single import plan_single
 
 # Experiments in one compiled call: on CPU, where more of them leave the cache and fewer share the
 # cost of what is done once for all; and elsewhere.
-_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+_BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
 # The accuracy where none is asked for.
 _ACCURACY = {"double": 1e-9, "single": 1e-4}
 # Splitting fewer than this among workers gains nothing.
@@ -93,7 +93,7 @@ class Campaign:
                 if self.precision == "double":
                     part = _once_compiled(*arguments)
                 else:
-                    with jax.enable_x64(False):
+                    with single_precision():
                         part = _once_compiled(*single(arguments))
                 return [np.asarray(x)[: S - k] for x in part]
 
@@ -209,7 +209,9 @@ def prepare(
     )  # fmt: skip
 
 
-def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:
+def divide(
+    S: int, batch: int | None, workers: int | None, precision: str = "double"
+) -> tuple[int, int]:
     """The size of batches for S experiments, and how many threads share them.
 
     **Raises:** `DefinitionError` for numbers below one.
@@ -224,7 +226,7 @@ def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:
     if batch is not None:
         size = min(batch, S)
     else:
-        most = _BATCH if on_cpu else _BATCH_ON_ACCELERATOR
+        most = _BATCH[precision] if on_cpu else _BATCH_ON_ACCELERATOR
         # As many batches as there are turns of all workers, and all batches of one size.
         turns = -(-S // (most * workers))
         size = max(-(-S // (turns * workers)), min(_FEW, S))

@@ -81,7 +81,7 @@ def run_experiments(
         process_noise=process_noise, seed=seed, accuracy=accuracy, scale=scale,
         precision=precision,
     )  # fmt: skip
-    size, workers = divide(campaign.count, batch, workers)
+    size, workers = divide(campaign.count, batch, workers, campaign.precision)
     return campaign.run(slice(0, campaign.count), size, workers, progress)
 
 
@@ -112,7 +112,7 @@ def stream_experiments(
     """
     campaign = _prepare(cycle, sections, design, outputs, **options)
     parts = chunks(campaign.count, chunk)
-    size, workers = divide(parts[0].stop, batch, workers)
+    size, workers = divide(parts[0].stop, batch, workers, campaign.precision)
     return (campaign.run(rows, size, workers) for rows in parts)
 
 

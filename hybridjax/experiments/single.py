@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._core.compile import quick_jit
 from .._core.errors import DefinitionError
-from .._core.precision import single
+from .._core.precision import single, single_precision
 from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
@@ -83,7 +83,7 @@ def rounding_error(
     start = np.where(moves, np.float32(cycle + scale * aside), cycle)
     arguments = placed, plan, settings, jnp.asarray(start.reshape(-1, n).T)
     exact = np.asarray(_sections(*arguments))
-    with jax.enable_x64(False):
+    with single_precision():
         rounded = np.asarray(_sections(*single(arguments)), float)
     ends, added = (
         x.T.reshape(_LANES, N, n) / np.roll(scale, -1, axis=0) for x in (exact, rounded - exact)
