@@ -42,13 +42,9 @@ def require_x64(*trees: Any) -> None:
             )
 
 
-def at_precision(threshold: float) -> float:
-    """A threshold that is a matter of rounding errors, in the precision that JAX computes in.
-
-    It stands for a share of the digits: in double precision it is `threshold`, and in single
-    precision, which has 23 binary digits for 52, its power 23/52 (1e-12 becomes 5e-6).
-    """
-    return threshold ** (jnp.finfo(jnp.result_type(float)).nmant / 52)
+def at_precision(double: float, single: float) -> float:
+    """A threshold that is a matter of rounding, for the precision that JAX computes in."""
+    return single if jnp.result_type(float) == jnp.float32 else double
 
 
 def single_precision() -> contextlib.AbstractContextManager:

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float
 from .._core.precision import at_precision
 
 
-# An extremum within this fraction of the guard's values at the step's ends is a touch (grazing) ...
-TOUCH = 1e-10
+# An extremum within this fraction of the guard's values at the step's ends (in double and in single
+# precision) is a touch (grazing) ...
+TOUCH = 1e-10, 1e-6
 # ... and within this fraction a near miss, which a shorter step must settle.
 NEAR = 1e-2
 # Newton steps to the zero: enough to tell apart guards that fall almost together.
@@ -77,7 +78,7 @@ def first_crossing(
         s = jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
-    small = at_precision(TOUCH) * scale
+    small = at_precision(*TOUCH) * scale
     touch = near = jnp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
