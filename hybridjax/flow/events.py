@@ -38,7 +38,7 @@ def start_lanes(
     return Lanes(t, chart, q, armed, jnp.zeros(L, jnp.int32), pace)
 
 
-def width(t: Float[Array, " L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
+def width(t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
     """Values of watched functions that count as zero: what their rates make of rounding errors."""
     zero, rounding = at_precision(*ZERO), at_precision(*_ROUNDING)
     return (zero * span + rounding * jnp.abs(t)) * jnp.abs(rate)

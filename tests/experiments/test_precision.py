@@ -43,7 +43,6 @@ def test_errors_are_those_reported(both):
 def test_transfer_functions_are_those_of_double_precision(both):
     _, double, single = both
     exact, rounded = (hj.estimate_htf(data) for data in (double, single))
-    print('HTF', np.max(rounded.error(exact)))
     assert np.max(rounded.error(exact)) < 5e-4
 
 
