@@ -131,6 +131,8 @@ def dirt(seeds=5, strides=500, noise=1e-4):
                 dirty = spoil(marked, ("yM", "vM"), seed=seed, **spoiled)
             else:
                 dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
+            if "drift" in options:
+                dirty = dirty.without_drift(("yM", "vM"), options["drift"])
             fit = hj.fit_series(at_sections(dirty, phase, **options).records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])

@@ -1,10 +1,8 @@
 """Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
 
 import dataclasses
-import os
 import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -17,6 +15,7 @@ from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
+from .._core.threads import in_threads, thread_count
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
@@ -76,31 +75,27 @@ class Campaign:
         u = self.inputs(rows)
         S = len(u)
         start = self._start(u)
-        device = jax.config.jax_default_device  # which other threads would not know
 
         def work(k):
-            require_x64()
             some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
-            with jax.default_device(device):
-                arguments = (
-                    self.placed,
-                    self.plan,
-                    jnp.asarray(start[:, some]),
-                    jnp.asarray(u[some]),
-                    tuple(self.outputs.items),
-                    self.settings,
-                )
-                if self.precision == "double":
-                    part = _once_compiled(*arguments)
-                else:
-                    with single_precision():
-                        part = _once_compiled(*single(arguments))
-                return [np.asarray(x)[: S - k] for x in part]
+            arguments = (
+                self.placed,
+                self.plan,
+                jnp.asarray(start[:, some]),
+                jnp.asarray(u[some]),
+                tuple(self.outputs.items),
+                self.settings,
+            )
+            if self.precision == "double":
+                part = _once_compiled(*arguments)
+            else:
+                with single_precision():
+                    part = _once_compiled(*single(arguments))
+            return [np.asarray(x)[: S - k] for x in part]
 
-        with ThreadPoolExecutor(workers) as pool:
-            parts = pool.map(work, range(0, S, size))
-            bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
-            y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
+        parts = in_threads(work, range(0, S, size), workers)
+        bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
+        y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
         y, error = y.astype(float), error.astype(float) + self.rounding
         base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
         if not (np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)).all():
@@ -218,26 +213,17 @@ def divide(
     """
     if batch is not None and batch < 1:
         raise DefinitionError(f"batch is the number of experiments per call, not {batch}.")
-    if workers is not None and workers < 1:
-        raise DefinitionError(f"workers is the number of threads, not {workers}.")
-    on_cpu = jax.default_backend() == "cpu"
-    if workers is None:
-        workers = _cores() if on_cpu else 1
+    workers = thread_count(workers)
     if batch is not None:
         size = min(batch, S)
     else:
+        on_cpu = jax.default_backend() == "cpu"
         most = _BATCH[precision] if on_cpu else _BATCH_ON_ACCELERATOR
         # As many batches as there are turns of all workers, and all batches of one size.
         turns = -(-S // (most * workers))
         size = max(-(-S // (turns * workers)), min(_FEW, S))
         size = min(-(-size // _VECTOR) * _VECTOR, max(S, 1))
     return size, min(workers, -(-S // size))
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _source(design, N: int, nu: int, start: str, discard, periods):

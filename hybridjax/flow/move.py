@@ -55,6 +55,7 @@ def move(
     setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
     new_input: bool = True,
+    glide: bool = False,
 ) -> Moved:
     """Flow every lane to its target under a constant input.
 
@@ -62,10 +63,10 @@ def move(
     derivatives (first and second, through crossings too) with respect to everything that is a
     floating-point array: states, times, inputs, parameters, the target.
 
-    `setout` is the first step, or a `Stride`: then one step is thought to be enough for most.
-    With `new_input`, the guards are armed anew; otherwise the lanes go on as they are.
+    `setout` is the first step, or a `Stride`. With `new_input`, the guards are armed anew;
+    otherwise the lanes go on as they are. With `glide`, one step is thought to be enough for most.
     """
-    how = _How(False, isinstance(setout, Stride), new_input, False)
+    how = _How(False, glide, new_input, False)
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
     return _move(system, lanes, u, target, setout, result, settings, how)
 

@@ -159,3 +159,27 @@ def sandwich(
         share = np.einsum("ij,ejk,ik->ei", half, shares, half)
         freedom = float(1 / (share**2).sum(axis=0).mean())
     return inverse @ gradient @ inverse, freedom
+
+
+def dependent(
+    score: Float[np.ndarray, "S T d"], share: Float[np.ndarray, "S T d P"], lags: int
+) -> tuple[Float[np.ndarray, "d d"], float]:
+    """The covariance of a gradient that is a sum over cycles, which depend on their neighbours.
+
+    With the weights of Newey and West (1987). At the minimum the sum is zero for every parameter,
+    which takes a part away from the covariance of its terms; it is given back.
+
+    **Arguments:** `share`: what each term does to all P parameters, in units in which their
+    Hessian is one.
+
+    **Returns:** the covariance, and how many terms stand for one that is independent.
+    """
+    gradient = np.einsum("sti,stj->ij", score, score)
+    taken = (share**2).sum()
+    weights = 1 - np.arange(1, lags + 1) / (lags + 1)
+    for k, w in enumerate(weights, 1):
+        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
+        gradient += w * (product + product.T)
+        taken += 2 * w * (share[:, k:] * share[:, :-k]).sum()
+    gradient /= max(1 - taken / score.shape[2], 0.5)
+    return gradient, 1 + 2 * float((weights**2).sum())

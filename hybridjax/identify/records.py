@@ -24,6 +24,9 @@ class Record(eqx.Module):
     - `sections`: N. `start`: the section of sample 0. `inputs`, `outputs`: names.
     - `lead`: y[i] may depend on inputs up to `u[i + lead]`: smoothing, or sections that were placed
       by what came later.
+    - `drift`: the outputs at each section also hold an unknown part that changes more slowly than
+      in so many cycles; infinite: a constant, as where an average cycle was subtracted. None: they
+      hold nothing but the response.
     """
 
     u: Float[np.ndarray, "n nu"]
@@ -33,6 +36,7 @@ class Record(eqx.Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
+    drift: float | None = eqx.field(static=True, default=None)
 
     def __init__(
         self,
@@ -44,6 +48,7 @@ class Record(eqx.Module):
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         lead: int = 0,
+        drift: int | float | None = None,
     ):
         """**Raises:** `DefinitionError` for shapes that do not fit together, or infinite values."""
         self.u, self.y = _columns("u", u), _columns("y", y)
@@ -59,7 +64,10 @@ class Record(eqx.Module):
             )
         if lead < 0:
             raise DefinitionError(f"lead must not be negative, but is {lead}.")
+        if drift is not None and not drift > 0:
+            raise DefinitionError(f"drift must be a positive number of cycles, not {drift}.")
         self.sections, self.start, self.lead = sections, start, lead
+        self.drift = None if drift is None else float(drift)
         self.inputs = names("inputs", inputs, self.u.shape[1])
         self.outputs = names("outputs", outputs, self.y.shape[1])
 
@@ -96,6 +104,7 @@ class Piece(NamedTuple):
     start: int
     u: Float[np.ndarray, "n nu"]
     y: Float[np.ndarray, "n ny"]
+    drift: float | None = None
 
 
 class Pieces(NamedTuple):
@@ -106,6 +115,7 @@ class Pieces(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     lead: int
+    drift: float | None
 
 
 def pieces_of(data: Recorded) -> Pieces:
@@ -119,7 +129,7 @@ def pieces_of(data: Recorded) -> Pieces:
     records = [r for part in _parts(data) for r in _records(part)]
     if not records:
         raise DefinitionError("there is no experiment that ran to its end.")
-    kinds = {(r.sections, r.inputs, r.outputs, r.lead) for r in records}
+    kinds = {(r.sections, r.inputs, r.outputs, r.lead, r.drift) for r in records}
     if len(kinds) > 1:
         a, b = sorted(kinds, key=str)[:2]
         raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
@@ -141,6 +151,8 @@ class Layout(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     lead: int
+    slow: Float[np.ndarray, "S T K"]
+    """What an unknown drift of each section's outputs is composed of; zero outside a record."""
 
 
 def lay_out(data: Recorded) -> Layout:
@@ -148,19 +160,32 @@ def lay_out(data: Recorded) -> Layout:
 
     **Raises:** `DefinitionError` as `pieces_of`.
     """
-    pieces, N, inputs, outputs, lead = pieces_of(data)
-    T = max(-(-(first + len(u)) // N) for first, u, _ in pieces)
+    pieces, N, inputs, outputs, lead, drift = pieces_of(data)
+    T = max(-(-(p.start + len(p.u)) // N) for p in pieces)
     U = np.zeros((len(pieces), T * N, len(inputs)))
     Y = np.full((len(pieces), T * N, len(outputs)), np.nan)
     inside = np.zeros((len(pieces), T * N), bool)
-    for s, (first, u, y) in enumerate(pieces):
-        place = slice(first, first + len(u))
-        U[s, place], Y[s, place], inside[s, place] = u, y, True
+    for s, p in enumerate(pieces):
+        place = slice(p.start, p.start + len(p.u))
+        U[s, place], Y[s, place], inside[s, place] = p.u, p.y, True
+    waves = [slow_waves(p, N, drift) for p in pieces]
+    slow = np.zeros((len(pieces), T, max(w.shape[1] for w in waves)))
+    for s, w in enumerate(waves):
+        slow[s, : len(w), : w.shape[1]] = w
 
     def cycles(x):
         return x.reshape(len(pieces), T, N, *x.shape[2:])
 
-    return Layout(cycles(U), cycles(Y), cycles(inside), inputs, outputs, lead)
+    return Layout(cycles(U), cycles(Y), cycles(inside), inputs, outputs, lead, slow)
+
+
+def slow_waves(piece: Piece, sections: int, drift: float | None) -> Float[np.ndarray, "T K"]:
+    """A constant and cosines in the cycles of a piece, down to a wavelength of `drift`."""
+    T = -(-(piece.start + len(piece.u)) // sections)
+    if drift is None:
+        return np.zeros((T, 0))
+    waves = np.arange(int(2 * T / drift) + 1)
+    return np.cos(np.pi / T * (np.arange(T)[:, None] + 0.5) * waves)
 
 
 def _parts(data: Recorded) -> list[ExperimentData | Record]:
@@ -181,4 +206,4 @@ def _cut(record: Record):
         start = int(record.start + first) % record.sections
         y = record.y[first:last].copy()
         y[max(len(y) - record.lead, 0) :] = np.nan
-        yield Piece(start, record.u[first:last], y)
+        yield Piece(start, record.u[first:last], y, record.drift)

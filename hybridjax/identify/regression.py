@@ -39,6 +39,8 @@ class Problem(NamedTuple):
     """K: the cycles at the start of each record in which g is free."""
     maps: list[Float[np.ndarray, "columns r"]]
     """For each section: the combinations of lagged inputs that are linearly independent."""
+    slow: Float[np.ndarray, "S T K"]
+    """What an unknown drift of the outputs is composed of."""
     scale: Float[np.ndarray, " ny"]
 
 
@@ -65,6 +67,7 @@ def set_up(layout: Layout, order: int, overhang: int, rest: bool) -> Problem:
         layout.lead,
         free,
         maps,
+        layout.slow,
         scale,
     )
 
@@ -94,26 +97,29 @@ def along_cycles(c: Coefficients, x: np.ndarray, delay: int = 0) -> np.ndarray:
 
 
 class Regression(NamedTuple):
-    """Inputs and unknown starts of one section, for the outputs sampled in the same rows."""
+    """Inputs, unknown starts and drift of one section, for outputs sampled in the same rows."""
 
     V: Float[np.ndarray, "S T r"]
     E: Float[np.ndarray, "S T K"]
+    """Responses to unknown starts; these and the slow changes are unknown in each record."""
     good: Bool[np.ndarray, "S T 1"]
     left: Float[np.ndarray, "S T K"]
-    """Orthonormal basis of the sampled rows of E, and what takes its coefficients to g."""
+    """Orthonormal basis of the sampled rows of both, and what takes its coefficients to g."""
     to_free: Float[np.ndarray, "S K K"]
     rest: Float[np.ndarray, "rows r"]
-    """Sampled rows of V without what E explains."""
+    """Sampled rows of V without what these explain."""
     inverse: Float[np.ndarray, "r r"]
     """Of the Gram matrix of `rest`."""
 
     @classmethod
-    def make(cls, V, E, good):
+    def make(cls, V, E, slow, good):
         good = good[:, :, None]
-        left, s, right = np.linalg.svd(good * E, full_matrices=False)
+        both = good * np.concatenate([E, slow], axis=2)
+        left, s, right = np.linalg.svd(both, full_matrices=False)
         kept = s > _RANK * s.max(initial=0)
         left = left * kept[:, None]
         to_free = np.swapaxes(right, 1, 2) * np.where(kept, 1 / np.where(kept, s, 1), 0)[:, None]
+        to_free = to_free[:, : E.shape[2]]
         rest = good * V
         rest = (rest - left @ (left.swapaxes(1, 2) @ rest)).reshape(-1, V.shape[2])
         inverse = scipy.linalg.pinvh(rest.T @ rest, rtol=1e-12)
@@ -131,7 +137,7 @@ class Regression(NamedTuple):
         return (self.left**2).sum(axis=2) + own.reshape(self.left.shape[:2])
 
     def solve(self, x: Float[np.ndarray, "S T C"]):
-        """Coefficients of V, the fit at all rows, and what is left at those sampled."""
+        """Coefficients of V, the response at all rows, and what is left at those sampled."""
         a, left = np.zeros((self.rest.shape[1], x.shape[2])), self.good * x
         for _ in range(2):  # the second time for accuracy
             left = left - self.left @ (self.left.swapaxes(1, 2) @ left)
@@ -178,7 +184,7 @@ def linearise(
         for i in range(ny):
             good = problem.good[:, :, n, i]
             if regression is None or not np.array_equal(good, regression.good[..., 0]):
-                regression = Regression.make(V, E, good)
+                regression = Regression.make(V, E, problem.slow, good)
                 left, share = regression.freedom, regression.leverage
                 w, q = np.linalg.eigh(regression.inverse)
                 root = problem.maps[n] @ (q * np.sqrt(np.maximum(w, 0)))
@@ -220,12 +226,12 @@ def delayed_outputs(problem: Problem, order: int) -> Delayed:
         known = (cycle >= problem.first[:, n] + problem.free).T
         for i in range(ny):
             good, y = problem.good[:, :, n, i], problem.y[:, :, n, i]
-            past = [_later(y, j) for j in range(order + 1)]
+            past = np.stack([_later(y, j) for j in range(order + 1)], axis=2)
             rows = known & np.all([_later(good, j, not problem.free) for j in range(order + 1)], 0)
-            X, Z = V[rows], np.stack([p[rows] for p in past], axis=1)
-            Z = Z - X @ np.linalg.lstsq(X, Z)[0]
+            regression = Regression.make(V, problem.slow[:, :, :0], problem.slow, rows)
+            Z = regression.solve(past)[2].reshape(-1, order + 1)
             gram += Z.T @ Z
-            freedom += max(len(X) - X.shape[1], 0)
+            freedom += max(regression.freedom, 0)
     return Delayed(gram, freedom)
 
 

@@ -14,7 +14,8 @@ from ..periodic.htf import HTF
 from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
-from .likelihood import gauss_newton, sandwich
+from .lifted import HORIZON, Refined, refine
+from .likelihood import gauss_newton
 from .order import refuse_invented
 from .projection import chi
 from .records import Layout, Recorded, lay_out
@@ -27,9 +28,6 @@ from .regression import (
     rescale,
     set_up,
 )
-
-
-_PROBES = 4  # outputs of pure noise, from which the noise in the Jacobian is estimated
 
 
 class SeriesFit(MultiplierEstimate):
@@ -49,7 +47,8 @@ class SeriesFit(MultiplierEstimate):
       excited have none.
     - `slopes` (d, N, R, ny, nu): their derivatives with respect to c.
     - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
-    - `noise` (ny,): standard deviation of what the model does not explain.
+    - `noise` (ny,): standard deviation of what the numerators do not explain.
+    - `distortion`: whether a part of second order was taken into account.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, where the
       records say so.
@@ -68,6 +67,7 @@ class SeriesFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
+    distortion: bool = eqx.field(static=True, default=False)
 
     def impulse_response(self, n_lags: int) -> Float[np.ndarray, "N lags ny nu"]:
         """Markov parameters: the response at section n to a unit input r sections earlier."""
@@ -125,6 +125,7 @@ def fit_series(
     overhang: int | None = None,
     start: Literal["free", "rest"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
+    distortion: bool | None = None,
     check: bool = True,
     max_steps: int = 50,
 ) -> SeriesFit:
@@ -175,18 +176,29 @@ def fit_series(
         delayed = delayed_outputs(rescale(problem, _noise(found, order)), order)
         rows = max(delayed.freedom, 1)
         refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
-    about = _covariance(problem, c, found, errors)
-    result = Result.OK if converged else Result.NOT_CONVERGED
-    return _as_fit(problem, c, found, layout, *about, result)
+    first = quick_fit(problem, c, found, layout)
+    refined = refine(
+        layout,
+        first.impulse_response((1 + HORIZON + order + -(-overhang // N)) * N),
+        order,
+        overhang,
+        _section_noise(found) * problem.scale,
+        rest=start == "rest",
+        errors=errors,
+        distortion=distortion,
+        max_steps=max_steps,
+    )
+    c = refined.coefficients
+    return _as_fit(problem, c, linearise(problem, c), layout, refined)
 
 
 def quick_fit(problem: Problem, c: np.ndarray, found: Linearisation, layout: Layout) -> SeriesFit:
     """A fit with these coefficients, whatever they are worth, and an unknown covariance."""
     unknown = np.full((len(c), len(c)), np.inf)
-    return _as_fit(problem, c, found, layout, unknown, np.inf, Result.NOT_CONVERGED)
+    return _as_fit(problem, c, found, layout, Refined(c, unknown, np.inf, False, False))
 
 
-def _as_fit(problem, c, found, layout, covariance, freedom, result) -> SeriesFit:
+def _as_fit(problem, c, found, layout, refined: Refined) -> SeriesFit:
     N, nu, ny = layout.y.shape[2], layout.u.shape[3], layout.y.shape[3]
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
@@ -201,17 +213,18 @@ def _as_fit(problem, c, found, layout, covariance, freedom, result) -> SeriesFit
     return SeriesFit(
         multipliers=roots_of(c),
         coefficients=c,
-        covariance=covariance,
+        covariance=refined.covariance,
         numerators=by_input(found.numerators),
         slopes=by_input(found.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(found, len(c)) * problem.scale,
-        covariance_freedom=freedom,
-        result=result,
+        covariance_freedom=refined.freedom,
+        result=Result.OK if refined.converged else Result.NOT_CONVERGED,
         sections=N,
         inputs=layout.inputs,
         outputs=layout.outputs,
         lead=layout.lead,
+        distortion=refined.distortion,
     )
 
 
@@ -231,36 +244,9 @@ def _noise(found: Linearisation, order: int) -> Float[np.ndarray, " ny"]:
     return np.maximum(np.sqrt(square / left), 1e-15)
 
 
-def _covariance(problem: Problem, c, found: Linearisation, errors: str):
-    """Of c, and its degrees of freedom; by cycles, which may depend on their neighbours."""
-    d = len(c)
-    rng = np.random.default_rng(0)
-    probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.good[..., None]
-    noise = linearise(problem, c, probes).jacobian.reshape(d, -1)
-    noise = noise @ noise.T / _PROBES
-    parts = np.einsum("istnac,jstnac->stij", found.jacobian, found.jacobian)
-    square = parts.sum(axis=(0, 1))
-    if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
-        return sandwich(square - noise, square)
-    # What a sample would miss a fit to the others by: errors that are large where inputs are, as
-    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
-    error = found.residual / np.maximum(1 - found.leverage, 1e-3)[..., None]
-    score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
-    gradient = np.einsum("sti,stj->ij", score, score)
-    # The scores add up to zero at the minimum, which takes this part of their covariance away.
-    half = np.linalg.inv(np.linalg.cholesky(square))
-    share = np.einsum("ij,stjk,lk->stil", half, parts, half)
-    taken = (share**2).sum()
-    slowest = np.clip(np.abs(roots_of(c)).max(), 1e-3, 0.99)
-    lags = int(min(np.ceil(np.log(0.1) / np.log(slowest)), problem.y.shape[1] // 4))
-    weights = 1 - np.arange(1, lags + 1) / (lags + 1)
-    for k, w in enumerate(weights, 1):
-        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
-        gradient += w * (product + product.T)
-        taken += 2 * w * (share[:, k:] * share[:, :-k]).sum()
-    gradient /= max(1 - taken / d, 0.5)
-    covariance, freedom = sandwich(square - noise, gradient, parts.reshape(-1, d, d))
-    return covariance, freedom / (1 + 2 * float((weights**2).sum()))
+def _section_noise(found: Linearisation) -> Float[np.ndarray, "N ny"]:
+    square = (found.residual**2).sum(axis=(0, 1, 4))
+    return np.sqrt(square / np.maximum(found.freedom, 1))
 
 
 def _check(layout: Layout) -> None:

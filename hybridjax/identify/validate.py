@@ -114,7 +114,7 @@ def validate(
     """
     if not 0 < level < 1:
         raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
-    pieces, N, inputs, outputs, _ = pieces_of(data)
+    pieces, N, inputs, outputs, *_ = pieces_of(data)
     check_model(model, N, inputs, outputs)
     simulated = [simulate_piece(model, piece, start == "free") for piece in pieces]
     seen = np.concatenate([np.isfinite(p.y) for p in pieces])
@@ -163,9 +163,7 @@ def check_model(model: LDTP | SeriesFit, N: int, inputs, outputs) -> None:
             )
 
 
-def simulate_piece(
-    model: LDTP | SeriesFit, piece: Piece, free: bool
-) -> Float[np.ndarray, "n ny"]:
+def simulate_piece(model: LDTP | SeriesFit, piece: Piece, free: bool) -> Float[np.ndarray, "n ny"]:
     """The outputs of the model, from the state that fits the record best, or from rest."""
     if isinstance(model, SeriesFit):
         return predict(model, piece, free)

@@ -20,7 +20,8 @@ from .._core.tracing import is_traced
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .cycle import LimitCycle
 from .solution_curve import Curve, Failure, Point
-from .sweep import LimitCycles, front
+from .sweep import LimitCycles
+from .tiles import front
 
 
 # Where the step is made shorter and longer: cosine of the turn of the tangent, Newton steps.

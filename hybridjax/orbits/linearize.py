@@ -88,9 +88,8 @@ def _section_jacobians(placed: PlacedSections, settings):
     turns = jnp.where(following == 0, 1, 0)
     target = placed.target(following, placed.lanes.t, turns)
     settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
-    jacobian, moved, _ = flow_jacobian(
-        placed.cycle.system, placed.lanes, target, settings, 0.5 * placed.duration
-    )
+    h = 1.05 * placed.duration  # one step to each section, where that is accurate enough
+    jacobian, moved, _ = flow_jacobian(placed.cycle.system, placed.lanes, target, settings, h)
     jacobian = jnp.where((moved.result == Result.OK)[:, None, None], jacobian, jnp.nan)
     embed, select = placed.frames()
     after = select[following]

@@ -31,6 +31,10 @@ LEGS = 16
 _FREE = 0.75
 # J - I counts as singular if its smallest singular value is below this.
 _SINGULAR = 1e-7
+# Newton's method ends with a step below this, absolute and relative to the state.
+_ATOL, _RTOL = 1e-12, 1e-11
+# Along a direction in which J - I is singular, neither Newton nor a derivative moves.
+_SOLVER = lx.SVD(rcond=_SINGULAR)
 
 
 class ReturnMap(eqx.Module):
@@ -50,6 +54,17 @@ class ReturnMap(eqx.Module):
     turns: int = eqx.field(static=True)
 
 
+class Turn(eqx.Module):
+    """What Newton sees on one turn."""
+
+    legs: Lanes
+    factors: Float[Array, "K d d"]
+    codes: Int[Array, "K R"]
+    period: Float[Array, ""]
+    distance: Float[Array, ""]
+    result: Int[Array, ""]
+
+
 @quick_jit
 def solve(
     system,
@@ -66,12 +81,31 @@ def solve(
     **Arguments:** `damped` takes the smaller steps of Levenberg and Marquardt; `follow` goes round
     once more on the cycle found, so that what is seen has the derivatives of the cycle.
     """
-    s = Structure(system)
-    n = s.d
-    valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
     q, seen, steps = _root(system, start, kind, expected, settings, damped, max_steps)
     if follow:
         _, seen, _ = _turn_with_jacobian(q, system, start, kind, expected, settings)
+    period, factors, code = _judged(q, seen, system, start, kind, expected, settings)
+    lanes = departure(Structure(system), q, start, kind.base, expected)
+    return lanes, period, factors, seen, steps, code
+
+
+def newton_step(system, start: Lanes, kind: ReturnMap, expected, settings):
+    """One step of Newton's method from a start: where it leads to, its largest part relative to
+    the tolerance of `solve`, and what was seen on the turn before it, as `solve` returns it."""
+    q = start.q[:, 0]
+    residual, seen, jacobian = _turn_with_jacobian(q, system, start, kind, expected, settings)
+    step = -lx.linear_solve(lx.MatrixLinearOperator(jacobian), residual, _SOLVER, throw=False).value
+    size = jnp.max(jnp.abs(step) / (_ATOL + _RTOL * jnp.abs(q)))
+    period, factors, code = _judged(q, seen, system, start, kind, expected, settings)
+    lanes = departure(Structure(system), q + step, start, kind.base, expected)
+    return lanes, size, period, factors, seen, code
+
+
+def _judged(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, settings):
+    """The period, the factors of the monodromy, and whether q lies on a cycle."""
+    s = Structure(system)
+    n = s.d
+    valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
     period = expected if kind.base is None else seen.period
     factors = seen.factors
     if kind.base is not None:
@@ -88,32 +122,16 @@ def solve(
         apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
-    lanes = departure(s, q, start, kind.base, expected)
-    return lanes, period, factors, seen, steps, code.astype(jnp.int32)
-
-
-class Turn(eqx.Module):
-    """What Newton sees on one turn."""
-
-    legs: Lanes
-    factors: Float[Array, "K d d"]
-    codes: Int[Array, "K R"]
-    period: Float[Array, ""]
-    distance: Float[Array, ""]
-    result: Int[Array, ""]
-
-
-# Along a direction in which J - I is singular, neither Newton nor a derivative moves.
-_SOLVER = lx.SVD(rcond=_SINGULAR)
+    return period, factors, code.astype(jnp.int32)
 
 
 @eqx.filter_custom_jvp
 def _root(system, start, kind, expected, settings, damped, max_steps):
     """The state that the return map leaves where it is, what was seen there, and steps taken."""
     if damped:
-        solver = optx.LevenbergMarquardt(rtol=1e-11, atol=1e-12)
+        solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
     else:
-        solver = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=_SOLVER)
+        solver = optx.Newton(rtol=_RTOL, atol=_ATOL, linear_solver=_SOLVER)
     solution = optx.root_find(
         lambda q, args: _residual(q, *args, settings),
         solver,

@@ -1,7 +1,6 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
 import functools as ft
-import operator
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -9,25 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
-from tqdm import tqdm
 
 from .._core.errors import DefinitionError
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.threads import thread_count
 from ..flow.lanes import Lanes
-from ..flow.move import Settings, move
-from ..flow.sections import AtEvent, ListLevels
-from ..flow.target import toward, until
-from ..systems.structure import Structure, check_system
+from ..flow.move import Settings
+from ..systems.structure import check_system
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
-from .return_map import ReturnMap, solve
-
-
-# Newton steps of a batch, in which all systems wait for the last one.
-_NEWTON = 6
-# Periods for which a system flows freely before Newton tries again.
-_SETTLE = 40
+from .tiles import Tiles
 
 
 class LimitCycles(eqx.Module):
@@ -118,12 +109,14 @@ def find_limit_cycles(
     *,
     settings: Settings | None = None,
     batch: int = 250,
+    workers: int | None = None,
     progress: bool = False,
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    Newton starts from the guess for all of them side by side. Systems for which that fails flow
-    freely for some periods, and Newton starts again from where they are then.
+    Newton starts from the guess for some of them, side by side, and then for as many again from
+    the cycles of their neighbours, until all are done. Systems for which that fails flow freely
+    for some periods, and Newton starts again from where they are then.
 
     **Arguments:**
 
@@ -131,15 +124,18 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
-    - `settings`: accuracy of the flow; 1e-10 by default.
+    - `settings`: accuracy of the flow; by default 1e-9 per step, in at most 64 steps for each
+        sixteenth of a period.
     - `batch`: systems per compiled call.
+    - `workers`: threads that run calls at the same time; by default all cores on CPU.
+    - `progress`: show a progress bar over the systems.
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
 
     **Raises:** `DefinitionError` for systems that do not belong together.
     """
-    settings = Settings(rtol=1e-10, atol=1e-10) if settings is None else settings
+    settings = Settings(rtol=1e-9, atol=1e-9, max_steps=64) if settings is None else settings
     systems = _stacked(systems)
     require_x64(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)
@@ -150,17 +146,13 @@ def find_limit_cycles(
             f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
             "find_limit_cycle first."
         )
-    out = _tiles(systems, guess, settings, False, np.arange(S), batch, progress)
-    again = np.flatnonzero(out[-2] != Result.OK)
-    if len(again):
-        second = _tiles(systems, guess, settings, True, again, batch, progress)
-        for x, y in zip(*map(jax.tree_util.tree_leaves, (out, second)), strict=True):
-            x[again] = y
-    start, period, factors, seen, steps, result, dims = out
-    codes = front(seen.codes.reshape(S, -1))
+    tiles = Tiles(systems, guess, settings, min(batch, S), thread_count(workers))
+    found = tiles.solve(S, progress)
+    seen = found.seen
     return LimitCycles(
-        systems, guess.base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
-        codes, settings, guess.conserved, guess.turns,
+        systems, guess.base, found.period, found.start, seen.legs, found.factors, found.dims,
+        seen.distance, found.steps, found.result, seen.codes, settings, guess.conserved,
+        guess.turns,
     )  # fmt: skip
 
 
@@ -180,63 +172,3 @@ def _stacked(systems) -> HybridSystem:
     arrays = [eqx.filter(x, eqx.is_array) for x in systems]
     stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
     return eqx.combine(stacked, eqx.filter(systems[0], eqx.is_array, inverse=True))
-
-
-def _tiles(systems, guess, settings, settle: bool, rows, batch: int, progress: bool):
-    """`_tile` for some rows, in calls of one size, gathered as numpy arrays."""
-    arrays, rest = eqx.partition(systems, eqx.is_array)
-    arrays = jax.tree_util.tree_map(np.asarray, arrays)
-    size = min(batch, len(jax.tree_util.tree_leaves(arrays)[0]))  # one program for all calls
-    parts = []
-    for k in tqdm(range(0, len(rows), size), disable=not progress, desc="cycles"):
-        some = rows[np.arange(k, k + size) % len(rows)]
-        tile = jax.tree_util.tree_map(operator.itemgetter(some), arrays)
-        part = _tile(eqx.combine(tile, rest), guess, settings, jnp.asarray(settle))
-        keep = slice(min(size, len(rows) - k))
-        part = jax.tree_util.tree_map(np.asarray, part)
-        parts.append(jax.tree_util.tree_map(operator.itemgetter(keep), part))
-    return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
-
-
-@eqx.filter_jit
-def _tile(systems, guess: LimitCycle, settings, settle: Bool[Array, ""]):
-    def one(system):
-        start, expected, result = guess.start, guess.period, jnp.zeros(1, jnp.int32)
-        if guess.clocked:
-            expected = guess.turns * jnp.asarray(system.period(), float)
-            start = eqx.tree_at(lambda x: x.t, start, start.t / guess.period * expected)
-        start, result = _settled(system, guess.base, start, expected, settle)
-        kind = ReturnMap(guess.base, guess.conserved, guess.turns)
-        *found, code = solve(system, start, kind, expected, settings, False, False, _NEWTON)
-        code = jnp.where(result[0] == Result.OK, code, result[0])
-        return *found, code, jnp.array(Structure(system).dims)[found[3].legs.chart]
-
-    return eqx.filter_vmap(one)(systems)
-
-
-def _settled(system, base, start: Lanes, expected, settle: Bool[Array, ""]):
-    """Where a system is after it has flowed freely for a while, at the guess's phase or section;
-    or without `settle`, where it was."""
-    u = jnp.zeros((len(system.inputs), 1))
-    patient = Settings(rtol=1e-8, atol=1e-8, max_steps=512 * _SETTLE)
-    turns = jnp.where(settle, _SETTLE, 0) * expected
-    moved = move(system, start, u, until(start.t + turns), patient)
-    if base is not None:
-        event = Structure(system).transition_index(base.name) if isinstance(base, AtEvent) else -1
-        target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
-        if event < 0:
-            target = eqx.tree_at(
-                lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
-            )
-        again = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
-        pick = lambda new, old: jnp.where(settle, new, old)  # noqa: E731
-        moved = jax.tree_util.tree_map(pick, again, moved)
-    lanes = eqx.tree_at(lambda x: (x.t, x.events), moved.lanes, (start.t, start.events))
-    return lanes, moved.result
-
-
-def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
-    """Codes of events moved to the front of each row, and the columns without any left out."""
-    order = np.argsort(codes < 0, axis=1, kind="stable")
-    codes = np.take_along_axis(codes, order, axis=1)
-    return codes[:, : max(int((codes >= 0).sum(axis=1).max(initial=0)), 1)]

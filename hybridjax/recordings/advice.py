@@ -12,7 +12,7 @@ from ..identify.compare import compare_multipliers
 from ..identify.estimate import roots_of
 from ..identify.prediction import predict
 from ..identify.records import Record, lay_out, pieces_of
-from ..identify.regression import initial, lagged, linearise, set_up
+from ..identify.regression import Regression, initial, lagged, linearise, set_up
 from ..identify.series import SeriesFit, fit_series, quick_fit
 from ..identify.validate import Validation, validate
 from .sections import SectionData
@@ -43,8 +43,9 @@ def plain_regression(
         for i in range(ny):
             delays = range(order + 1)
             rows = late & np.all([np.roll(problem.good[:, :, n, i], j, 1) for j in delays], axis=0)
-            Z = np.stack([np.roll(problem.y[:, :, n, i], j, 1)[rows] for j in delays], axis=1)
-            Z = Z - V[rows] @ np.linalg.lstsq(V[rows], Z)[0]
+            past = np.stack([np.roll(problem.y[:, :, n, i], j, 1) for j in delays], axis=2)
+            regression = Regression.make(V, problem.slow[:, :, :0], problem.slow, rows)
+            Z = regression.solve(past)[2].reshape(-1, order + 1)
             gram += Z.T @ Z
     return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
 
@@ -121,6 +122,7 @@ def _part(record: Record, rows: slice) -> Record:
         inputs=record.inputs,
         outputs=record.outputs,
         lead=record.lead,
+        drift=record.drift,
     )
 
 

@@ -8,7 +8,7 @@ import equinox as eqx
 from ..identify.series import SeriesFit, fit_series
 from .advice import Advice, HeldOut, advise, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
-from .phase import Definition, Phase, estimate_phase
+from .phase import AnglePhase, Definition, Phase, estimate_phase
 from .recording import Recording
 from .sections import SectionData, section_data
 
@@ -41,6 +41,7 @@ def identify_recording(
     outputs: str | Sequence[str],
     sections: int = 32,
     order: int | None = None,
+    drift: int | float | None = None,
     **options: Any,
 ) -> Identification:
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
@@ -49,12 +50,23 @@ def identify_recording(
     **Arguments:** as for `section_data`, and
 
     - `order`: the number of multipliers; None lets `choose_order` find it.
+    - `drift`: changes that take longer than so many cycles are no response to the inputs: they are
+      taken out of the outputs, and of the signals of an `AnglePhase`, before the phase is found;
+      the fit allows for what is left.
 
     **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
     """
+    definition = phase
     if not isinstance(phase, Phase):
-        phase = estimate_phase(recording, phase)
-    about = {"inputs": inputs, "outputs": outputs, "sections": sections}
+        phase = estimate_phase(recording, definition)
+    if drift is not None:
+        moved = {outputs} if isinstance(outputs, str) else set(outputs)
+        if isinstance(definition, AnglePhase):
+            moved |= {definition.position, definition.velocity}
+        recording = recording.without_drift(sorted(moved), drift * phase.period)
+        if not isinstance(definition, Phase):
+            phase = estimate_phase(recording, definition)
+    about = {"inputs": inputs, "outputs": outputs, "sections": sections, "drift": drift}
     data = section_data(recording, phase, **about, **options)
     order = choose_order(data) if order is None else order
     fit = fit_series(data.records, order, check=False)

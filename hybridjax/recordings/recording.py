@@ -1,6 +1,6 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -194,6 +194,32 @@ class Recording(eqx.Module):
                 low, high = np.where(below, middle, low), np.where(below, high, middle)
             events = trial.events | {event: (low + high) / 2}
             trials.append(Trial(trial.time, trial.values, events, trial.name))
+        return eqx.tree_at(lambda r: r.trials, self, tuple(trials))
+
+    def without_drift(self, signals: str | Sequence[str], slower_than: int | float) -> "Recording":
+        """The same without slow changes of some signals, such as the drift of sensors.
+
+        In each trial, least squares on a constant, which stays, and cosines with wavelengths down
+        to `slower_than`, which do not.
+
+        **Arguments:** `slower_than`: in units of time; much longer than a cycle.
+
+        **Raises:** `DefinitionError` for signals that are not there, or a time that is not
+        positive.
+        """
+        if not slower_than > 0:
+            raise DefinitionError(f"slower_than must be a positive time, not {slower_than}.")
+        signals = (signals,) if isinstance(signals, str) else signals
+        columns, trials = [self.column(x) for x in signals], []
+        for trial in self.trials:
+            values, turn = trial.values.copy(), trial.time - trial.time[0]
+            waves = np.arange(int(2 * turn[-1] / slower_than) + 1)
+            basis = np.cos(np.pi * turn[:, None] / turn[-1] * waves)
+            for k in columns:
+                seen = np.isfinite(values[:, k])
+                part = np.linalg.lstsq(basis[seen], values[seen, k])[0]
+                values[:, k] -= basis[:, 1:] @ part[1:]
+            trials.append(Trial(trial.time, values, trial.events, trial.name))
         return eqx.tree_at(lambda r: r.trials, self, tuple(trials))
 
     def column(self, name: str) -> int:

@@ -126,9 +126,11 @@ def section_data(
     - `time`: an extra output that tells when a section was crossed: "clock" for systems that are
       driven by a clock, the time minus the clock's; "duration" for others, the time since the
       section before.
-    - `drift`: changes of the cycle that take longer than so many cycles are taken out of
-      inputs and outputs, section by section (least squares on cosines). By default only the
-      average cycle of each trial is.
+    - `drift`: the outputs may drift, more slowly than in so many cycles, for reasons other than
+      the inputs (those of the sensors, say): fits allow for it, section by section, by cosines. By
+      default only for the average cycle of each trial not being known exactly. It also moves the
+      phase: take it out of the signals before (`Recording.without_drift`), as `identify_recording`
+      does.
     - `max_gap`: the longest time without a sample that a spline may bridge; by default the
       mean time between sections, but not less than three samples.
 
@@ -165,7 +167,7 @@ def section_data(
         parts = [p for p in parts if p is not None]
         if time is not None:
             parts = _with_times(parts, sections, phase.period, time)
-        found += _deviations(parts, sections, drift)
+        found += _deviations(parts, sections)
         trials += [number] * len(parts)
     if not found:
         raise DefinitionError("the recording holds no whole cycle to sample.")
@@ -173,6 +175,7 @@ def section_data(
     # A smoothing spline averages over neighbours to both sides.
     lead = phase.lead * sections + (0 if np.isinf(bandwidth) else 1)
     about = {"sections": sections, "inputs": inputs, "outputs": names, "lead": lead}
+    about["drift"] = np.inf if drift is None else drift
     records = [Record(p.u, p.y, start=int(p.k[0]) % sections, **about) for p, _ in found]
     units = [recording.unit(name) for name in (*inputs, *outputs)]
     weights = [len(p.k) for p, _ in found]
@@ -255,27 +258,19 @@ def _with_times(parts: list[_Part], N: int, period: float, kind: str) -> list[_P
     ]
 
 
-def _deviations(parts: list[_Part], N: int, drift: int | float | None):
-    """Each part minus the trial's average cycle, or its slow changes, and that cycle."""
+def _deviations(parts: list[_Part], N: int):
+    """Each part minus the trial's average cycle, and that cycle."""
     if not parts:
         return []
     section = np.concatenate([p.k % N for p in parts])
     values = np.concatenate([np.concatenate([p.u, p.y], axis=1) for p in parts])
-    t = np.concatenate([p.t for p in parts])
+    seen = np.isfinite(values)
     mean = np.full((N, values.shape[1]), np.nan)
-    turn = (t - t.min()) / max(np.ptp(t), 1e-300)
-    cycles = len(t) / N
-    waves = 0 if drift is None else int(2 * cycles / drift)
-    for n in range(N):
-        rows = np.flatnonzero(section == n)
-        basis = np.cos(np.pi * turn[rows, None] * np.arange(waves + 1))
-        for i in range(values.shape[1]):
-            seen = np.isfinite(values[rows, i])
-            if not seen.any():
-                continue
-            mean[n, i] = values[rows[seen], i].mean()
-            a = np.linalg.lstsq(basis[seen], values[rows[seen], i])[0]
-            values[rows, i] -= basis @ a
+    for n, i in np.ndindex(mean.shape):
+        rows = (section == n) & seen[:, i]
+        if rows.any():
+            mean[n, i] = values[rows, i].mean()
+    values = values - mean[section]
     nu = parts[0].u.shape[1]
     edges = np.cumsum([len(p.k) for p in parts])[:-1]
     return [

@@ -16,7 +16,7 @@ def input_spectrum(
     data: SectionData,
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Frequencies in cycles per period, and power spectral densities there (Welch 1967)."""
-    pieces, N, inputs, _, _ = pieces_of(data.records)
+    pieces, N, inputs, *_ = pieces_of(data.records)
     length = N * max(1, min(_CYCLES, max(len(p.u) for p in pieces) // (2 * N)))
     total, weight = np.zeros((length // 2 + 1, len(inputs))), 0
     f = np.fft.rfftfreq(length, 1 / N)

@@ -1,0 +1,40 @@
+"""Compiled calls on several cores."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+
+from .errors import DefinitionError
+from .precision import require_x64
+
+
+def thread_count(workers: int | None) -> int:
+    """How many threads to use: by default all cores on CPU, and one on an accelerator.
+
+    **Raises:** `DefinitionError` for numbers below one.
+    """
+    if workers is not None:
+        if workers < 1:
+            raise DefinitionError(f"workers is the number of threads, not {workers}.")
+        return workers
+    if jax.default_backend() != "cpu":
+        return 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
+    """`work` of each item, in order, under the caller's configuration of JAX."""
+    device = jax.config.jax_default_device  # which other threads would not know
+
+    def configured(item):
+        require_x64()
+        with jax.default_device(device):
+            return work(item)
+
+    with ThreadPoolExecutor(workers) as pool:
+        yield from pool.map(configured, items)

@@ -1,0 +1,234 @@
+"""Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+from tqdm import tqdm
+
+from .._core.results import Result
+from .._core.threads import in_threads
+from ..flow.lanes import Lanes
+from ..flow.move import Settings, move
+from ..flow.sections import AtEvent, ListLevels
+from ..flow.target import toward, until
+from ..systems.structure import Structure
+from .cycle import LimitCycle
+from .return_map import ReturnMap, Turn, newton_step
+
+
+# Newton steps before a system is given up, or tried again.
+_NEWTON = 8
+# Periods for which a system flows freely before Newton tries again.
+_SETTLE = 40
+# Up to this many parameters, guesses from neighbours are quadratic.
+_FEW = 4
+
+
+class Rounds(NamedTuple):
+    """What the last Newton step of S systems saw; S is the leading axis of every array."""
+
+    start: Lanes
+    size: Float[np.ndarray, " S"]
+    """Of that step, relative to the tolerance."""
+    period: Float[np.ndarray, " S"]
+    factors: Float[np.ndarray, "S K d d"]
+    seen: Turn
+    """With all codes of events of a turn in one row."""
+    result: Int[np.ndarray, " S"]
+    dims: Int[np.ndarray, "S K"]
+    steps: Int[np.ndarray, " S"]
+
+
+class Tiles(NamedTuple):
+    """How the systems are solved."""
+
+    systems: Any
+    """Their arrays have a leading axis of S systems."""
+    guess: LimitCycle
+    settings: Settings
+    size: int
+    """Systems in one compiled call."""
+    workers: int
+
+    @property
+    def parameters(self) -> Float[np.ndarray, "S p"]:
+        """The numbers in which the systems differ, each in units of its spread."""
+        arrays = jax.tree_util.tree_leaves(eqx.filter(self.systems, eqx.is_inexact_array))
+        flat = np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+        spread = flat.std(axis=0)
+        return flat[:, spread > 0] / spread[spread > 0]
+
+    def solve(self, S: int, progress: bool) -> Rounds:
+        """Newton for all systems: first for some, spread over all, from the one guess there is,
+        then for as many again from where their neighbours' cycles are, and so on."""
+        parameters = self.parameters
+        order = np.random.default_rng(0).permutation(S)
+        bar = tqdm(total=S, disable=not progress, desc="cycles")
+        rows = order[: self.size]
+        out = self._again(rows, self._newton(rows, *self._given(len(rows))))
+        bar.update(len(rows))
+        while (done := len(out.result)) < S:
+            rows = order[done : 2 * done]
+            guesses = self._by_neighbours(parameters[order[:done]], out, parameters[rows])
+            out = _join(out, self._newton(rows, *guesses))
+            bar.update(len(rows))
+        bar.close()
+        return _pick(self._again(order, out), np.argsort(order))
+
+    def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
+        return _pick(
+            jax.tree_util.tree_map(lambda x: x[None], (self.guess.start, self.guess.period)),
+            np.zeros(count, int),
+        )
+
+    def _again(self, rows, out: Rounds) -> Rounds:
+        """Another try for the systems that failed, from where they are after flowing freely."""
+        failed = np.flatnonzero(out.result != Result.OK)
+        if not len(failed):
+            return out
+        begin = self._in_tiles(_settled, rows[failed], *self._given(len(failed)))
+        there = np.isfinite(begin[0].q).all(axis=(1, 2))
+        if not there.any():
+            return out
+        failed, begin = failed[there], _pick(begin, there)
+        return _replace(out, failed, self._newton(rows[failed], *begin))
+
+    def _by_neighbours(self, known, out: Rounds, wanted) -> tuple[Lanes, Float[np.ndarray, " S"]]:
+        """The cycle of the nearest system, moved as those around it in the same chart suggest."""
+        ok = np.flatnonzero(out.result == Result.OK)
+        if not len(ok):
+            return self._given(len(wanted))
+        known = known[ok]
+        terms = _powers(known[:1]).shape[1]
+        _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
+        near = near.reshape(len(wanted), -1)
+        first = near[:, 0]
+        start, period = _pick((out.start, out.period), ok)
+        values = np.concatenate([start.q[..., 0], period[:, None]], axis=1)
+        same = start.chart[near] == start.chart[first][:, None]
+        apart = _powers(known[near] - known[first][:, None]) * same
+        change = (values[near] - values[first][:, None]) * same
+        slope = np.linalg.pinv(apart, rcond=1e-6) @ change
+        guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
+        return eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :-1, None]), guess[:, -1]
+
+    def _newton(self, rows, start: Lanes, period) -> Rounds:
+        """Newton's method; systems that are done make room for others."""
+        out = self._in_tiles(_step, rows, start, period)
+        for _ in range(_NEWTON - 1):
+            going = np.flatnonzero(np.isfinite(out.size) & (out.size > 1))
+            if not len(going):
+                break
+            part = self._in_tiles(_step, rows[going], _pick(out.start, going), period[going])
+            out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
+        return out
+
+    def _in_tiles(self, work, rows, start: Lanes, period):
+        """`work` for some systems, in calls of one size, so that there is one program for all."""
+        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+
+        def tile(k):
+            some = np.arange(k, k + self.size) % len(rows)
+            systems = eqx.combine(_pick(arrays, rows[some]), rest)
+            part = work(systems, self.guess, *_pick((start, period), some), self.settings)
+            part = _pick(part, slice(len(rows) - k))
+            return _fronted(part) if work is _step else part
+
+        return _join(*in_threads(tile, range(0, len(rows), self.size), self.workers))
+
+
+def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:
+    """x, and for few parameters the products of two of its columns."""
+    p = x.shape[-1]
+    i, j = np.triu_indices(p if p <= _FEW else 0)
+    return np.concatenate([x, x[..., i] * x[..., j]], axis=-1)
+
+
+def _pick(tree, rows):
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], tree)
+
+
+def _join(*parts):
+    if isinstance(parts[0], Rounds):
+        width = max(part.seen.codes.shape[1] for part in parts)
+        parts = [_with_codes(part, _widened(part.seen.codes, width)) for part in parts]
+    return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
+
+
+def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
+    place = np.arange(len(out.result))
+    place[rows] = len(place) + np.arange(len(rows))
+    return _pick(_join(out, new), place)
+
+
+def _with_codes(rounds: Rounds, codes: Int[np.ndarray, "S E"]) -> Rounds:
+    return rounds._replace(seen=eqx.tree_at(lambda x: x.codes, rounds.seen, codes))
+
+
+def _widened(codes: Int[np.ndarray, "S E"], width: int) -> Int[np.ndarray, "S W"]:
+    return np.pad(codes, ((0, 0), (0, width - codes.shape[1])), constant_values=-1)
+
+
+def _fronted(rounds: Rounds) -> Rounds:
+    return _with_codes(rounds, front(rounds.seen.codes.reshape(len(rounds.result), -1)))
+
+
+def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
+    """Codes of events moved to the front of each row, and the columns without any left out."""
+    row, column = np.nonzero(codes >= 0)
+    count = np.bincount(row, minlength=len(codes))
+    out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
+    out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
+    return out
+
+
+@eqx.filter_jit
+def _step(systems, guess: LimitCycle, start: Lanes, period, settings) -> Rounds:
+    def one(system, start, expected):
+        start, expected = _on_clock(system, guess, start, expected)
+        kind = ReturnMap(guess.base, guess.conserved, guess.turns)
+        *found, seen, code = newton_step(system, start, kind, expected, settings)
+        dims = jnp.array(Structure(system).dims)[seen.legs.chart]
+        return Rounds(*found, seen, code, dims, jnp.array(1))
+
+    return eqx.filter_vmap(one)(systems, start, period)
+
+
+@eqx.filter_jit
+def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
+    """Where systems are after they have flowed freely for a while, at the guess's phase or
+    section (NaN for those that do not get there), and their expected periods."""
+    base = guess.base
+    patient = Settings(rtol=1e-8, atol=1e-8, max_steps=512 * _SETTLE)
+
+    def one(system, start, expected):
+        start, expected = _on_clock(system, guess, start, expected)
+        u = jnp.zeros((len(system.inputs), 1))
+        moved = move(system, start, u, until(start.t + _SETTLE * expected), patient)
+        if base is not None:
+            at_event = isinstance(base, AtEvent)
+            event = Structure(system).transition_index(base.name) if at_event else -1
+            target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
+            if not at_event:
+                target = eqx.tree_at(
+                    lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
+                )
+            moved = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
+        q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
+        start = eqx.tree_at(lambda x: (x.chart, x.q), start, (moved.lanes.chart, q))
+        return start, expected
+
+    return eqx.filter_vmap(one)(systems, start, period)
+
+
+def _on_clock(system, guess: LimitCycle, start: Lanes, expected: Array):
+    """The start at the same phase of this system's clock, and its period."""
+    if guess.clocked:
+        expected = guess.turns * jnp.asarray(system.period(), float)
+        start = eqx.tree_at(lambda x: x.t, start, guess.start.t / guess.period * expected)
+    return start, expected
