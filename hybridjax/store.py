@@ -72,7 +72,7 @@ def store_experiments(
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
     campaign = prepare(cycle, sections, design, outputs, **options)
     parts = chunks(campaign.count, chunk)
-    together, workers = divide(parts[0].stop, batch, workers)
+    together, workers = divide(parts[0].stop, batch, workers, campaign.precision)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
@@ -227,6 +227,7 @@ def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
         "family": placed.sections.label,
         "parameters": _digest(jax.tree_util.tree_leaves((system, placed.sections))),
         "accuracy": campaign.accuracy,
+        "precision": campaign.precision,
         "design": inputs,
         "cycle": np.concatenate(
             [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, campaign.scales)]

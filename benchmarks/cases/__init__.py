@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 # In the order in which they run.
 NAMES = (
-    "experiments", "honesty", "sizes", "jacobians", "gradients", "grid", "steps", "cores",
-    "compile",
+    "experiments", "honesty", "precision", "sizes", "jacobians", "gradients", "grid", "steps",
+    "cores", "compile",
 )  # fmt: skip
 
 

@@ -27,7 +27,11 @@ def run(show, options) -> None:
 
 
 def _honest(task: Problem, accuracy: float, name: str, show) -> None:
-    data = task.run(accuracy)
+    show_honesty(task, task.run(accuracy), accuracy, name, show)
+
+
+def show_honesty(task: Problem, data, accuracy: float, name: str, show) -> None:
+    """The share of experiments that ran well, and the errors of these."""
     scale = prepare(task.cycle, task.placed, task.u, task.outputs, discard=0).scales[:, 1:3]
     scale = np.resize(scale, task.exact.shape[1:])
     assert scale.shape[0] % N == 0

@@ -59,11 +59,13 @@ class Problem:
     def scaled(self, factor: float) -> "Problem":
         return dataclasses.replace(self, u=factor * self.u)
 
-    def run(self, accuracy: float = 1e-9, workers: int = 1) -> hj.ExperimentData:
+    def run(
+        self, accuracy: float = 1e-9, workers: int = 1, precision: str = "double"
+    ) -> hj.ExperimentData:
         """All experiments, as a user runs them."""
         return hj.run_experiments(
             self.cycle, self.placed, self.u, self.outputs,
-            discard=0, accuracy=accuracy, workers=workers,
+            discard=0, accuracy=accuracy, workers=workers, precision=precision,
         )  # fmt: skip
 
     def error(self, data: hj.ExperimentData) -> float:

@@ -1,9 +1,13 @@
-"""Double precision: switched on by the user, required by the solvers."""
+"""Double precision: switched on by the user, required by the solvers. Single precision, where it
+will do."""
 
+import contextlib
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .errors import PrecisionError
 
@@ -36,3 +40,30 @@ def require_x64(*trees: Any) -> None:
                 f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`. Switch 64-bit "
                 "mode on first, then build it again."
             )
+
+
+def at_precision(double: float, single: float) -> float:
+    """A threshold that is a matter of rounding, for the precision that JAX computes in."""
+    return single if jnp.result_type(float) == jnp.float32 else double
+
+
+def single_precision() -> contextlib.AbstractContextManager:
+    """A context in which this thread computes in 32 bits, with what `single` returns."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(False)
+    from jax.experimental import disable_x64  # before JAX 0.8
+
+    return disable_x64()
+
+
+def single(tree: Any) -> Any:
+    """`tree` with its arrays rounded to 32 bits."""
+    narrow = {"f": np.float32, "i": np.int32}
+
+    def convert(x):
+        if not eqx.is_array(x):
+            return x
+        x = np.asarray(x)
+        return jnp.asarray(x.astype(narrow.get(x.dtype.kind, x.dtype)))
+
+    return jax.tree_util.tree_map(convert, tree)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
-from .._core.precision import require_x64
+from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
 from .._core.threads import in_threads, thread_count
 from ..flow.move import Settings
@@ -27,11 +27,14 @@ from ..systems.structure import Outputs, Structure
 from .data import ExperimentData
 from .design import Design
 from .respond import observe, respond
+from .single import plan_single
 
 
 # Experiments in one compiled call: on CPU, where more of them leave the cache and fewer share the
 # cost of what is done once for all; and elsewhere.
-_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+_BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
+# The accuracy where none is asked for.
+_ACCURACY = {"double": 1e-9, "single": 1e-4}
 # Splitting fewer than this among workers gains nothing.
 _FEW = 32
 # A multiple of the numbers that processors add at once: other batches are up to a third slower.
@@ -51,6 +54,9 @@ class Campaign:
     periods: int
     outputs: Outputs
     accuracy: float
+    precision: str
+    rounding: float
+    """The error that this precision leaves, beside that of the steps."""
     scales: Float[np.ndarray, "N n"]
     settings: Settings
     plan: Plan
@@ -72,7 +78,7 @@ class Campaign:
 
         def work(k):
             some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
-            part = _once_compiled(
+            arguments = (
                 self.placed,
                 self.plan,
                 jnp.asarray(start[:, some]),
@@ -80,11 +86,17 @@ class Campaign:
                 tuple(self.outputs.items),
                 self.settings,
             )
+            if self.precision == "double":
+                part = _once_compiled(*arguments)
+            else:
+                with single_precision():
+                    part = _once_compiled(*single(arguments))
             return [np.asarray(x)[: S - k] for x in part]
 
         parts = in_threads(work, range(0, S, size), workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
         y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
+        y, error = y.astype(float), error.astype(float) + self.rounding
         base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
         if not (np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)).all():
             for a in np.unique(self.placed.lanes.chart):
@@ -127,7 +139,7 @@ _compiling, _compiled = threading.Lock(), set()
 def _once_compiled(*arguments):
     """`_respond`, where threads that need the same program wait until one has compiled it."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    program = structure, tuple(getattr(x, "shape", x) for x in leaves)
+    program = structure, tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
     if program in _compiled:
         return _respond(*arguments)
     with _compiling:
@@ -145,8 +157,9 @@ def prepare(
     start: str = "cycle",
     discard: int | None = None,
     periods: int | None = None,
-    accuracy: float = 1e-9,
+    accuracy: float | None = None,
     scale: Mapping[str, float] | None = None,
+    precision: str = "double",
 ) -> Campaign:
     """Check what `run_experiments` was given, and do what is done once for all experiments."""
     placed = as_placed(cycle, sections)
@@ -168,6 +181,8 @@ def prepare(
             "experiments would leave it: stabilise the system, or use the exact linearisation "
             "(`linearize`), which needs no experiments."
         )
+    if precision not in _ACCURACY:
+        raise DefinitionError(f"precision is 'double' or 'single', not {precision!r}.")
     nu = len(cycle.system.inputs)
     source, count, cycles, periods = _source(design, placed.count, nu, start, discard, periods)
     model = None
@@ -177,13 +192,21 @@ def prepare(
                 "a periodic start needs inputs of a whole number of windows: use `discard=0`."
             )
         model = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
-    plan, settings, scales = plan_flow(placed, accuracy, scale)
+    accuracy = _ACCURACY[precision] if accuracy is None else float(accuracy)
+    if precision == "double":
+        planned, rounding = plan_flow(placed, accuracy, scale), 0.0
+    else:
+        planned, rounding = plan_single(placed, accuracy, scale)
+    plan, settings, scales = planned
     return Campaign(
-        placed, source, count, cycles, periods, z, float(accuracy), scales, settings, plan, model
-    )
+        placed, source, count, cycles, periods, z, accuracy, precision, rounding, scales, settings,
+        plan, model,
+    )  # fmt: skip
 
 
-def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:
+def divide(
+    S: int, batch: int | None, workers: int | None, precision: str = "double"
+) -> tuple[int, int]:
     """The size of batches for S experiments, and how many threads share them.
 
     **Raises:** `DefinitionError` for numbers below one.
@@ -194,7 +217,8 @@ def divide(S: int, batch: int | None, workers: int | None) -> tuple[int, int]:
     if batch is not None:
         size = min(batch, S)
     else:
-        most = _BATCH if jax.default_backend() == "cpu" else _BATCH_ON_ACCELERATOR
+        on_cpu = jax.default_backend() == "cpu"
+        most = _BATCH[precision] if on_cpu else _BATCH_ON_ACCELERATOR
         # As many batches as there are turns of all workers, and all batches of one size.
         turns = -(-S // (most * workers))
         size = max(-(-S // (turns * workers)), min(_FEW, S))

@@ -29,8 +29,9 @@ def run_experiments(
     periods: int | None = None,
     process_noise: float = 0.0,
     seed: int = 0,
-    accuracy: float = 1e-9,
+    accuracy: float | None = None,
     scale: Mapping[str, float] | None = None,
+    precision: str = "double",
     batch: int | None = None,
     workers: int | None = None,
     progress: bool = False,
@@ -57,8 +58,12 @@ def run_experiments(
     - `process_noise`: standard deviation of a random input, held from section to section, that
         acts beside the excitation and is not recorded. `seed`: of it.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
-        every section, relative to `scale`. `data.error` is each experiment's own estimate.
+        every section, relative to `scale`. By default 1e-9, and 1e-4 in single precision.
+        `data.error` is each experiment's own estimate.
     - `scale`: sizes of states by name (of time as `t`); by default the largest on the cycle.
+    - `precision`: "double" or "single". Single precision computes the experiments in 32 bits, the
+        cycle, the sections and the plan remain in 64. What rounding costs is measured on the
+        cycle and is part of `data.error`.
     - `batch`: experiments per compiled call, by default what is fastest. Another size compiles
         another program.
     - `workers`: threads that run batches at the same time; by default all cores on CPU, and one
@@ -67,14 +72,16 @@ def run_experiments(
 
     **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
 
-    **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for
-    an unstable cycle, from which any experiment would run away.
+    **Raises:** `DefinitionError` for arguments that do not fit together, or for an accuracy that
+    single precision cannot give; `ComputationError` for an unstable cycle, from which any
+    experiment would run away.
     """
     campaign = _prepare(
         cycle, sections, design, outputs, start=start, discard=discard, periods=periods,
         process_noise=process_noise, seed=seed, accuracy=accuracy, scale=scale,
+        precision=precision,
     )  # fmt: skip
-    size, workers = divide(campaign.count, batch, workers)
+    size, workers = divide(campaign.count, batch, workers, campaign.precision)
     return campaign.run(slice(0, campaign.count), size, workers, progress)
 
 
@@ -105,7 +112,7 @@ def stream_experiments(
     """
     campaign = _prepare(cycle, sections, design, outputs, **options)
     parts = chunks(campaign.count, chunk)
-    size, workers = divide(parts[0].stop, batch, workers)
+    size, workers = divide(parts[0].stop, batch, workers, campaign.precision)
     return (campaign.run(rows, size, workers) for rows in parts)
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.precision import at_precision
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import next_schedule
@@ -78,7 +79,7 @@ def take_aim(s, state: State, active, target, stride: Stride) -> tuple[Aim, Way]
         known = jnp.minimum(target.time, scheduled)
         schedule = jnp.where(scheduled <= target.time, which, -1)
     rest = jnp.maximum(known - lanes.t, 0.0)
-    pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / state.h, 2.0) - 1e-9)
+    pieces = jnp.ceil(jnp.where(jnp.isfinite(rest), rest / state.h, 2.0) - at_precision(1e-9, 1e-5))
     last = (pieces <= 1) & ~approach.on
     step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), state.h)
     which = jnp.where(approach.on, approach.which, -1)

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.precision import at_precision
 from ..systems.structure import Structure
 from .aim import Aim
+from .events import width
 from .hermite import NEAR, control_points, root_near_end
 from .lanes import Lanes, for_each_chart, only
 from .step import Step, rk_step
@@ -24,6 +26,8 @@ _BEND = 2e-3
 _SHORT = 0.25
 # and if the last correction is at most this fraction of the way from the step's start.
 _FINE = 1e-6
+# or at most this fraction of the time allowed, in double and in single precision.
+_HERE = 1e-14, 5e-6
 # The error of a derivative is seen by a step that starts aside, by this part of the state's size in
 # a direction that no system is made for.
 _ASIDE = 1e-4
@@ -138,7 +142,8 @@ def attempt(
         true, _ = values(s, a, target, t + 0.5 * moved, middle, uu, index, home.f)
         cubic = 0.5 * (ends[0] + ends[1]) + 0.125 * (ends[2] - ends[3])
         size = jnp.abs(ends[0]) + jnp.abs(ends[1]) + jnp.abs(true)
-        bent = (jnp.abs(true - cubic) > _BEND * size).any(axis=0)
+        rounding = width(t, span, jnp.maximum(jnp.abs(before[1]), jnp.abs(rate)))
+        bent = (jnp.abs(true - cubic) > _BEND * size + rounding).any(axis=0)
 
         points = control_points(*ends)
         low = jnp.minimum(jnp.minimum(points[0], points[1]), jnp.minimum(points[2], points[3]))
@@ -182,7 +187,8 @@ def _go_home(
     end = settle(s, a, target, t + tau, step.q, step.f1, u, index, which, first)
     share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
     rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
-    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + 1e-14 * span
+    rounding = at_precision(*_HERE) * span
+    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + rounding
     lands = near & fine & (share <= _SHORT) & (jnp.abs(rough) <= 1.0)
     return _Home(
         jnp.where(lands, end.q, step.q),

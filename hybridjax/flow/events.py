@@ -5,19 +5,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.precision import at_precision
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .lanes import Lanes, for_each_chart, needed, only
 from .watch import Watch
 
 
-# A watched function counts as zero if its rate would have made its value in this fraction of the
-# time span at hand.
-ZERO = 1e-12
+# Each in double and in single precision. A watched function counts as zero if its rate would have
+# made its value in this fraction of the time span at hand.
+ZERO = 1e-12, 1e-6
 # Rounding errors of a time or a state, relative to it.
-_ROUNDING = 4e-15
+_ROUNDING = 4e-15, 2e-6
 # Times of a schedule are equal if they differ by less than this fraction of its period.
-_TIE = 1e-11
+_TIE = 1e-11, 1e-5
 # Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
 # A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno too.
@@ -37,9 +38,10 @@ def start_lanes(
     return Lanes(t, chart, q, armed, jnp.zeros(L, jnp.int32), pace)
 
 
-def width(t: Float[Array, " L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
+def width(t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
     """Values of watched functions that count as zero: what their rates make of rounding errors."""
-    return (ZERO * span + _ROUNDING * jnp.abs(t)) * jnp.abs(rate)
+    zero, rounding = at_precision(*ZERO), at_precision(*_ROUNDING)
+    return (zero * span + rounding * jnp.abs(t)) * jnp.abs(rate)
 
 
 def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> Lanes:
@@ -96,7 +98,7 @@ def _noise(s: Structure, lanes: Lanes, u, mask: Bool[Array, " L"]) -> Float[Arra
         def one(s, t, q, u):
             guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in rows])  # noqa: E731
             by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
-            return _ROUNDING * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
+            return at_precision(*_ROUNDING) * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
 
         n = s.dims[a]
         noise = s.by_lane(one)(only(here, lanes.t), only(here, lanes.q[:n]), only(here, u))
@@ -153,13 +155,14 @@ def next_schedule(
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
     at `end` happens at `end`.
     """
+    tie = at_precision(*_TIE)
     best, which = jnp.full_like(t, jnp.inf), jnp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         schedule = transition.guard
         if isinstance(schedule, Scheduled):
-            k = jnp.floor((t - schedule.offset) / schedule.period + _TIE) + 1
+            k = jnp.floor((t - schedule.offset) / schedule.period + tie) + 1
             time = schedule.offset + k * schedule.period
-            time = jnp.where(jnp.abs(time - end) <= _TIE * schedule.period, end, time)
+            time = jnp.where(jnp.abs(time - end) <= tie * schedule.period, end, time)
             sooner = (chart == s.chart_index(transition.source)) & (time < best)
             best, which = jnp.where(sooner, time, best), jnp.where(sooner, g, which)
     return best, which

@@ -10,9 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.precision import at_precision
 
-# An extremum within this fraction of the guard's values at the step's ends is a touch (grazing) ...
-TOUCH = 1e-10
+
+# An extremum within this fraction of the guard's values at the step's ends (in double and in single
+# precision) is a touch (grazing) ...
+TOUCH = 1e-10, 1e-6
 # ... and within this fraction a near miss, which a shorter step must settle.
 NEAR = 1e-2
 # Newton steps to the zero: enough to tell apart guards that fall almost together.
@@ -75,11 +78,12 @@ def first_crossing(
         s = jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
+    small = at_precision(*TOUCH) * scale
     touch = near = jnp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
-        touch = touch | (dips & (jnp.abs(value) <= TOUCH * scale))
-        near = near | (dips & (value > TOUCH * scale) & (value < NEAR * scale))
+        touch = touch | (dips & (jnp.abs(value) <= small))
+        near = near | (dips & (value > small) & (value < NEAR * scale))
     return Crossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
 
 

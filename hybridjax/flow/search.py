@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.lanewise import shared
+from .._core.precision import at_precision
 from .._core.results import Result, update_result
 from ..systems.structure import Structure
 from .aim import Aim, Approach, State, Way, take_aim
@@ -28,8 +29,8 @@ from .target import Target
 from .watch import Watch, watch
 
 
-# Steps below this fraction of the time allowed are not taken.
-_TINY = 1e-13
+# Steps below this fraction of the time allowed (in double and in single precision) are not taken.
+_TINY = 1e-13, 1e-6
 # Attempts to land on a crossing before the step in which it was seen is halved.
 _TRIES = 8
 
@@ -180,7 +181,7 @@ def _eventfully(
 
     # 1. Which approaches succeed.
     tau = approach.tau + new.past
-    enough = 1e-6 * approach.reach + 1e-13 * span
+    enough = 1e-6 * approach.reach + at_precision(1e-13, 1e-6) * span
     inside = (tau >= -enough) & (tau <= approach.reach + enough)
     falling = _row(end.rate, jnp.maximum(aim.which, 0)) < 0
     lands = active & new.lands & falling & jnp.where(approach.on, inside, near)
@@ -250,7 +251,7 @@ def _eventfully(
     h = jnp.where(plain | too_long, adapted, state.h)
     h = jnp.where(fired >= 0, jnp.maximum(h, stride.h), h)
     h = jnp.where(refine, 0.5 * aim.step, jnp.where(lost, 0.5 * aim.reach, h))
-    stuck = (too_long | refine | lost) & (h < _TINY * span)
+    stuck = (too_long | refine | lost) & (h < at_precision(*_TINY) * span)
     graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
     result = update_result(state.result, graze, Result.GRAZING)
     result = update_result(result, stuck, Result.BLOW_UP)
@@ -307,7 +308,7 @@ def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):
 
 def _aims(seen: Watch, span):
     """Whether the target's level is clearly positive, so that its next fall counts."""
-    return seen.value[-1] > 1e-10 * span * jnp.abs(seen.rate[-1])
+    return seen.value[-1] > at_precision(1e-10, 1e-6) * span * jnp.abs(seen.rate[-1])
 
 
 def _merge(mask, new: Watch, old: Watch) -> Watch:

@@ -67,7 +67,8 @@ def _in_a_loop(field, t, q, h) -> Float[Array, "stages n L"]:
         return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
 
     begin = jnp.zeros((_STAGES, *q.shape), q.dtype)
-    return jax.lax.scan(stage, begin, (_A, _C, np.arange(_STAGES)))[0]
+    tableau = jnp.asarray(_A, q.dtype), jnp.asarray(_C, q.dtype), jnp.arange(_STAGES)
+    return jax.lax.scan(stage, begin, tableau)[0]
 
 
 def _written_out(field, t, q, h) -> list[Float[Array, "n L"]]:
