@@ -74,7 +74,8 @@ def experiments(values: dict, baseline: dict) -> str:
 
 def honesty(values: dict, baseline: dict) -> str:
     rows = []
-    names = [x.removesuffix(".bounded") for x in values if x.endswith(".bounded")]
+    own = [x for x in values if x.startswith("honesty.")]
+    names = [x.removesuffix(".bounded") for x in own if x.endswith(".bounded")]
     for name in names:
         _, model, family, rest = name.split(".", 3)
         amplitude, accuracy = rest.removeprefix("amplitude_").split(".accuracy_")
@@ -117,9 +118,28 @@ def derivatives(values: dict, baseline: dict) -> str:
     return markdown(("job", "", "seconds", "error", "compile"), rows)
 
 
+def precision(values: dict, baseline: dict) -> str:
+    """Single precision beside double, both asked for 1e-4."""
+    rows = []
+    for job in JOBS[:2]:
+        for count in (80, 1000, 10_000):
+            name = f"precision.{job}.experiments_{count}"
+            columns = (
+                "double_1e-04.cpu", "single_1e-04.cpu", "speedup", "double_1e-04.true_error",
+                "single_1e-04.true_error", "single_1e-04.bounded", "single_1e-04.median_ratio",
+            )  # fmt: skip
+            measured = [number(values.get(f"{name}.{x}")) for x in columns]
+            rows.append((job.replace(".", ", "), count, *measured))
+    head = (
+        "job", "experiments", "double, s", "single, s", "ratio", "error, double", "error, single",
+        "error <= estimate", "estimate / error",
+    )  # fmt: skip
+    return markdown(head, rows)
+
+
 TABLES: dict[str, Callable[[dict, dict], str]] = {
     "machines": machines, "targets": targets, "experiments": experiments, "honesty": honesty,
-    "sizes": sizes, "derivatives": derivatives,
+    "precision": precision, "sizes": sizes, "derivatives": derivatives,
 }  # fmt: skip
 
 
