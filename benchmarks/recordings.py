@@ -117,6 +117,7 @@ def dirt(seeds=5, strides=500, noise=1e-4):
             PLANE, {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
         ),
         "drift of 5e-3, removed": (PLANE, {"drift": 5e-3}, {"drift": 50}),
+        "period that grows by 5 %": (PLANE, {"stretch": 0.05}, {}),
         "cycles from apex to apex, clean": (hj.EventPhase("apex"), {}, {}),
         "1 % lost, gap, 5 events lost, 5 doubled": (
             hj.EventPhase("apex"), {"missing": 0.01, "gap": gap, "lost": 5, "doubled": 5}, {},
@@ -146,15 +147,23 @@ def dirt(seeds=5, strides=500, noise=1e-4):
 
 
 def walker(seeds=10, strides=100, trials=5, noise=1e-4):
-    print(f"\nWalkers without a clock: {trials} trials of {strides} strides, noise {noise:g}")
+    print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
+    wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
+    oscillator, angle = hj.models.VanDerPol(mu=0.1), hj.AnglePhase("x", "v")
+    middle = hj.EventPhase("middle")
+    # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
+    # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
-        "rimless wheel": (
-            hj.models.RimlessWheel(), "impact", ("th", "w"), "th", "rising", 0.0015, 1,
+        "rimless wheel": (wheel, "impact", ("th", "w"), middle, ("th", "rising"), 0.0015, 1, 1),
+        "compass gait": (
+            gait, "heelstrike", ("n", "s", "vn", "vs"), middle, ("s", "falling"), 0.05, 2, 2,
         ),
+        "van der Pol": (oscillator, None, ("x", "v"), angle, None, 0.02, 1, 1),
     }  # fmt: skip
-    for label, (system, event, outputs, angle, direction, size, order) in systems.items():
-        cycle = hj.find_limit_cycle(system, section=hj.AtEvent(event))
-        period = float(cycle.period)
+    for label, (system, event, outputs, phase, mark, size, order, overhang) in systems.items():
+        where = {} if event is None else {"section": hj.AtEvent(event)}
+        cycle = hj.find_limit_cycle(system, **where)
+        period, true = float(cycle.period), np.asarray(cycle.multipliers)[:order]
         rate = 200 / period
         force = [
             hj.random_force(strides * period, rate, 8 / period, rms=size, seed=k)
@@ -164,20 +173,20 @@ def walker(seeds=10, strides=100, trials=5, noise=1e-4):
         hits, widths, found = 0, [], []
         for seed in range(seeds):
             own = made.trials[seed * trials : (seed + 1) * trials]
-            one = spoil(
-                eqx.tree_at(lambda r: r.trials, made, own), outputs, noise=noise, seed=seed
-            ).mark("middle", angle, direction=direction, bandwidth=20 / period)
+            one = eqx.tree_at(lambda r: r.trials, made, own)
+            one = spoil(one, outputs, noise=noise, seed=seed)
+            if mark:
+                one = one.mark("middle", mark[0], direction=mark[1], bandwidth=20 / period)
             data = hj.section_data(
-                one, hj.EventPhase("middle"), inputs="u", outputs=outputs, sections=16,
-                time="duration",
-            )  # fmt: skip
-            fit = hj.fit_series(data.records, order, check=False)
-            hits += bool(fit.contains(cycle.multipliers).all())
-            found.append(fit.compare(cycle.multipliers).max_error)
+                one, phase, inputs="u", outputs=outputs, sections=16, time="duration"
+            )
+            fit = hj.fit_series(data.records, order, overhang=16 * overhang, check=False)
+            hits += bool(fit.contains(true).all())
+            found.append(fit.compare(true).max_error)
             widths.append([np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)])
         print(
-            f"{label}: {data!r}\n  rms error {rms(found):.1e}, 95 % regions reach "
-            f"{np.mean(widths, axis=0)}, all held in {hits}/{seeds}",
+            f"{label} (multipliers {true}): {data!r}\n  rms error {rms(found):.1e}, 95 % regions "
+            f"reach {np.mean(widths, axis=0)}, all held in {hits}/{seeds}",
             flush=True,
         )
 

@@ -3,7 +3,6 @@
 import base64
 import csv
 import html
-import io
 import json
 import os
 import shutil
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from . import __version__, plot
@@ -45,11 +43,14 @@ def write_report(found: Identification, folder: str | os.PathLike) -> Path:
     temporary = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}")
     try:
         (temporary / "figures").mkdir(parents=True)
+        from matplotlib import pyplot
+
         htf = _htf(found)
         images = {}
         for name, figure in _figures(found, htf).items():
-            look.save(figure, temporary / "figures" / name)
-            images[name] = _encoded(figure)
+            image, _ = look.save(figure, temporary / "figures" / name)
+            images[name] = base64.b64encode(image.read_bytes()).decode()
+            pyplot.close(figure)
         save(temporary / "htf.npz", htf)
         save(temporary / "fit.npz", found.fit)
         _write_sections(found, temporary)
@@ -138,15 +139,6 @@ def _figures(found: Identification, htf: HTF) -> dict[str, Figure]:
     return figures
 
 
-def _encoded(figure: Figure) -> str:
-    stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(stream, dpi=150, format="png")
-    from matplotlib import pyplot
-
-    pyplot.close(figure)
-    return base64.b64encode(stream.getvalue()).decode()
-
-
 def _write_sections(found: Identification, folder: Path) -> None:
     data = found.data
     names = data.inputs + data.outputs
@@ -170,8 +162,8 @@ def _write_sections(found: Identification, folder: Path) -> None:
 
 
 _CAPTIONS = {
-    "bode": "Magnitude and phase of H_0, with bands of 95 %.",
-    "harmonics": "Magnitudes of H_0, H_1 and H_-1, with bands of 95 %.",
+    "bode": "Magnitude and phase of H₀, with bands of 95 %.",
+    "harmonics": "Magnitudes of H₀, H₁ and H₋₁, with bands of 95 %.",
 }
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
@@ -258,19 +250,25 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         ),
         "<h2>The recording</h2>",
         _table(
-            ("signal", "unit"), zip(found.recording.signals, found.recording.units, strict=True)
+            ("signal", "rms deviation from the average cycle"),
+            [
+                (name, f"{x:.3g} {unit}")
+                for name, x, unit in zip(
+                    data.inputs + data.outputs, np.concatenate(data.rms()), data.units, strict=True
+                )
+            ],
         ),
-        f"<p>{_safe(repr(found.phase))}</p>",
+        f"<p>{_phase(found)}</p>",
         _figure(images["phase"], "Durations of the cycles."),
-        f"<p>{_safe(repr(data))}</p>",
         _figure(
             images["sections"],
             "Average cycle; deviations with twice their standard deviation; power of inputs, and "
             "outputs from cycle to cycle at the section where they vary most.",
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
-        f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags; regions "
-        "from the residuals, cycle by cycle.</p>",
+        f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags"
+        f"{', with a part of second order' if fit.distortion else ''}; regions from the residuals, "
+        "cycle by cycle.</p>",
     ]
     title = _safe(f"Multipliers of {trials}")
     return (
@@ -283,8 +281,29 @@ def _safe(text: str) -> str:
     return html.escape(text)
 
 
+def _phase(found: Identification) -> str:
+    phase = found.phase
+    parts = [
+        f"{phase.cycles} whole cycles. Period {phase.period:.4g} (median), with a standard "
+        f"deviation of {100 * phase.jitter:.2g} % from cycle to cycle and a drift of "
+        f"{100 * phase.drift:.2g} % per cycle."
+    ]
+    if phase.backwards:
+        parts.append(f"The phase ran backwards at {100 * phase.backwards:.2g} % of the samples.")
+    if phase.dropped:
+        parts.append(f"{phase.dropped} doubled events were left out.")
+    if phase.missed:
+        parts.append(f"{phase.missed} cycles were left out, since an event was missed.")
+    if found.data.missing:
+        parts.append(f"{100 * found.data.missing:.2g} % of the section data are missing.")
+    return " ".join(parts)
+
+
 def _complex(z: complex) -> str:
-    return f"{z.real:.4f}" + (f" {'+' if z.imag > 0 else '−'} {abs(z.imag):.4f}i" if z.imag else "")
+    shown = f"{z.real:.4f}" + (
+        f" {z.imag:+.4f}i".replace("+", "+ ").replace("-", "- ") if z.imag else ""
+    )
+    return shown.replace("-", "−")
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -1,11 +1,22 @@
 """The dirt of real recordings, to test with: noise, quantisation, drift, lost samples, gaps."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from .recording import Recording
+
+
+class _Slower(NamedTuple):
+    start: float
+    span: float
+    stretch: float
+
+    def __call__(self, time: np.ndarray) -> np.ndarray:
+        since = time - self.start
+        return time + self.stretch * since**2 / (2 * self.span)
 
 
 def spoil(
@@ -20,6 +31,7 @@ def spoil(
     irregular: bool = False,
     lost: int = 0,
     doubled: int = 0,
+    stretch: float = 0.0,
     seed: int = 0,
 ) -> Recording:
     """A recording as a poor laboratory would have made it.
@@ -32,6 +44,8 @@ def spoil(
     - `missing`: share of samples that are lost, NaN. `gap`: start and end of a stretch of NaN.
     - `irregular`: a random third of the samples is not there at all.
     - `lost`, `doubled`: how many events of each kind vanish, or are followed by a false one.
+    - `stretch`: the share by which the period grows from the beginning to the end of each trial,
+      as if everything went slower and slower.
     - `seed`: of all of these.
     """
     rng = np.random.default_rng(seed)
@@ -54,6 +68,7 @@ def spoil(
             chosen = rng.permutation(len(at))[: lost + doubled]
             false = at[chosen[lost:]] + 0.05 * np.median(np.diff(at))
             events[name] = np.sort(np.concatenate([np.delete(at, chosen[:lost]), false]))
-        parts = (time, values, events)
+        slower = _Slower(trial.time[0], np.ptp(trial.time), stretch)
+        parts = (slower(time), values, {name: slower(at) for name, at in events.items()})
         trials.append(eqx.tree_at(lambda t: (t.time, t.values, t.events), trial, parts))
     return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))

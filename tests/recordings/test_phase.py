@@ -82,6 +82,28 @@ def test_events_missed_and_doubled(wave, causal):
                                [0.3, 0.55, 0.3], atol=2e-6)  # fmt: skip
 
 
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.0, 0.05), st.booleans())
+def test_irregular_events(seed, jitter, causal):
+    """Jitter, missed and doubled events: the phase grows, is right at the events, or nearly so."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.3, 60) + jitter * rng.uniform(-1, 1, 60)
+    missed, doubled = 10 + rng.permutation(20)[0], 40 + rng.permutation(10)[0]
+    events = np.sort(np.append(np.delete(t, missed), t[doubled] + 0.1))
+    recording = hj.Recording(np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events})
+    phase = hj.estimate_phase(recording, hj.EventPhase("e"), causal=causal)
+    assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
+    assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
+    for w in phase.stretches[0]:
+        assert (np.diff(w.phase) > 0).all() and (np.diff(w.time) > 0).all()
+        own = t[(t >= w.time[0]) & (t <= w.time[-1])]
+        at = np.interp(own, w.time, w.phase)
+        # Causal: three cycles' durations are remembered, each off by twice the jitter at most.
+        assert (
+            np.abs(at - at[0] - np.arange(len(own))).max() <= (10 * jitter if causal else 0) + 1e-9
+        )
+
+
 def test_marked_events(wave):
     found = wave.mark("up", "v", direction="rising").trials[0].events["up"]
     np.testing.assert_allclose(found, np.arange(20) + 0.5, atol=1e-7)
