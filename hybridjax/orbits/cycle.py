@@ -222,6 +222,10 @@ def find_limit_cycle(
         _check_values(system, start, conserved)
     kind = ReturnMap(base, conserved, turns)
     solution = solve(system, start, kind, expected, settings, False, traced)
+    if not traced and int(solution[-1]) == Result.EXTRA_TURNS:
+        seen = solution[3]
+        expected = seen.period * turns / seen.meetings
+        solution = solve(system, solution[0], kind, expected, settings, False, False)
     if not traced and int(solution[-1]) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
         second = solve(system, start, kind, expected, settings, True, False, 64)

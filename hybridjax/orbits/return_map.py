@@ -63,6 +63,7 @@ class Turn(eqx.Module):
     period: Float[Array, ""]
     distance: Float[Array, ""]
     result: Int[Array, ""]
+    meetings: Int[Array, ""]
 
 
 @quick_jit
@@ -121,6 +122,7 @@ def _judged(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, sett
         same = seen.legs.chart == start.chart
         apart = jnp.where(same, jnp.max(jnp.abs(seen.legs.q - q[:, None]), axis=0), jnp.inf)
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
+        code = jnp.where(good & (seen.meetings > kind.turns), Result.EXTRA_TURNS, code)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
     return period, factors, code.astype(jnp.int32)
 
@@ -184,8 +186,25 @@ def _turn_with_jacobian(q, system, start, kind, expected, settings):
     jacobian = jacobian - hold
     legs = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), legs)
     distance = jnp.max(jnp.abs(residual)) + jnp.max(jnp.abs(off))
-    seen = Turn(legs, factors, codes[..., 0], end.t[0] - start.t[0], distance, result)
+    period, codes = end.t[0] - start.t[0], codes[..., 0]
+    meetings = _meetings(Structure(system), kind, legs, codes)
+    seen = Turn(legs, factors, codes, period, distance, result, meetings)
     return residual, seen, jacobian
+
+
+def _meetings(s: Structure, kind: ReturnMap, legs: Lanes, codes) -> Int[Array, ""]:
+    """How often a round met the section that it ended on, as far as its legs show it."""
+    if kind.base is None:
+        return jnp.asarray(kind.turns, jnp.int32)
+    if isinstance(kind.base, AtEvent):
+        own = codes == s.transition_index(kind.base.name)
+        return jnp.sum(own, dtype=jnp.int32)
+    K = legs.t.shape[0]
+    target = dataclasses.replace(until(legs.t), levels=ListLevels((kind.base,)))
+    u, everywhere = jnp.zeros((s.nu, K)), jnp.ones(K, bool)
+    level = watch(s, legs.t, legs.chart, legs.q, u, target, everywhere).value[-1]
+    falls = (level[1:-1] > 0) & (level[2:] <= 0) & (legs.events[1:-1] == legs.events[2:])
+    return 1 + jnp.sum(falls, dtype=jnp.int32)
 
 
 def _flow(system, lanes, target, settings, h, result):

@@ -124,8 +124,7 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
-    - `settings`: accuracy of the flow; by default 1e-9 per step, in at most 64 steps for each
-        sixteenth of a period.
+    - `settings`: accuracy of the flow; by default 1e-9 per step.
     - `batch`: systems per compiled call.
     - `workers`: threads that run calls at the same time; by default all cores on CPU.
     - `progress`: show a progress bar over the systems.
@@ -135,7 +134,7 @@ def find_limit_cycles(
 
     **Raises:** `DefinitionError` for systems that do not belong together.
     """
-    settings = Settings(rtol=1e-9, atol=1e-9, max_steps=64) if settings is None else settings
+    settings = Settings(rtol=1e-9, atol=1e-9) if settings is None else settings
     systems = _stacked(systems)
     require_x64(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)

@@ -119,9 +119,12 @@ class Tiles(NamedTuple):
 
     def _newton(self, rows, start: Lanes, period) -> Rounds:
         """Newton's method; systems that are done make room for others."""
-        out = self._in_tiles(_step, rows, start, period)
+        out, period = self._in_tiles(_step, rows, start, period), period.copy()
         for _ in range(_NEWTON - 1):
-            going = np.flatnonzero(np.isfinite(out.size) & (out.size > 1))
+            extra = out.result == Result.EXTRA_TURNS
+            once = out.seen.period[extra] / out.seen.meetings[extra]
+            period[extra] = self.guess.turns * once
+            going = np.flatnonzero(np.isfinite(out.size) & ((out.size > 1) | extra))
             if not len(going):
                 break
             part = self._in_tiles(_step, rows[going], _pick(out.start, going), period[going])

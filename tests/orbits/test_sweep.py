@@ -47,6 +47,29 @@ def test_a_list_of_systems_is_the_same(found, hopper_cycle):
     np.testing.assert_array_equal(again.start.q, found.start.q)
 
 
+@pytest.fixture(scope="module")
+def wheel():
+    return hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.08), section=hj.AtEvent("impact"))
+
+
+def test_without_a_clock_and_in_waves(wheel):
+    """The wheel's multiplier is cos(2 pi / 8)^2 = 1/2 at any slope. At steep ones a step is so
+    much shorter than the guess's that the flow from one impact passes the next."""
+    slopes = np.linspace(0.08, 0.16, 11)
+    systems = [hj.models.RimlessWheel(slope=x) for x in slopes]
+    found = hj.find_limit_cycles(systems, wheel, batch=4)
+    assert found.ok.all() and np.all(np.diff(found.period) < 0)
+    assert found.period[-1] < 0.7 * wheel.period
+    np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
+    assert {found[i].order for i in range(11)} == {(0,)}
+
+
+def test_a_guess_with_too_long_a_period(wheel):
+    cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
+    assert cycle.order == (0,) and cycle.period < 0.7 * wheel.period
+    np.testing.assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)
+
+
 def test_bad_arguments(hopper_cycle):
     one = hj.models.VerticalHopper()
     with pytest.raises(hj.DefinitionError, match="the same leading axis"):
