@@ -30,7 +30,7 @@ _GAUGE = 1e-11  # eigenvalues of the Hessian that are: they belong to coordinate
 _BLOCKS = 4  # of a cycle; the mean input in each takes part in products
 HORIZON = 8  # cycles of inputs from which the first model is made
 _HALVINGS = 12
-_SETTLED = 1e-4  # squared step, in units of its standard error, that no longer matters
+_SETTLED = 1e-2  # squared step, in units of its standard error, that is the last one
 _UNSTABLE = 1.2
 _ROUNDING = 1e-12  # part of an output that no noise is taken to be smaller than
 _LEFT = 1 / 3  # of the samples of a section: if products leave fewer, they are not tried
@@ -320,8 +320,6 @@ def _minimise(lifted: Lifted, model: Model, max_steps: int) -> tuple[Model, bool
         found = _evaluate(lifted, model)
         step = _inverse(found.hessian) @ found.gradient
         gain = float(step @ found.gradient)
-        if gain <= _SETTLED:
-            return model, True
         for k in range(_HALVINGS):
             part = step / 2**k
             A = model.A + part[: d * d].reshape(d, d)
@@ -330,8 +328,11 @@ def _minimise(lifted: Lifted, model: Model, max_steps: int) -> tuple[Model, bool
             if stable and _evaluate(lifted, trial, False).cost < found.cost:
                 break
         else:
-            return model, bool(gain <= 1e-6 * found.cost or np.abs(step).max() < 1e-8)
+            small = gain <= max(_SETTLED, 1e-6 * found.cost) or np.abs(step).max() < 1e-8
+            return model, bool(small)
         model = trial
+        if gain <= _SETTLED:
+            return model, True
     return model, False
 
 
