@@ -133,9 +133,10 @@ def fit_series(
 
     Output error, with white noise of unknown variance in each output: the sum of squares of the
     difference between measured and simulated outputs is minimised over all numerators, unknown
-    starts and c; all but c are solved for inside (variable projection, Golub and Pereyra 1973).
-    It starts from the periodic ARX problem, solved by total least squares. (Ljung, *System
-    Identification: Theory for the User*, treats both.)
+    starts and c. It starts from the periodic ARX problem, solved by total least squares (Ljung,
+    *System Identification: Theory for the User*, treats both), and ends in the form in which all
+    sections share one state. Each time all but the denominator is solved for inside (variable
+    projection, Golub and Pereyra 1973).
 
     **Arguments:**
 
@@ -144,11 +145,13 @@ def fit_series(
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
     - `overhang`: lags of the numerators beyond d N; None means N.
     - `start`: "free": whatever happened before a record, the state at its start is unknown.
-      That costs the information of its first d + 1 cycles. "rest": it starts on the limit
+      "rest": it starts on the limit
       cycle, with no input before.
     - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
       cycle, so that it holds also where noise of successive cycles is dependent (process noise),
       with the weights of Newey and West (1987). "white": from its size alone.
+    - `distortion`: whether to allow for a part of the response of second order; None: if that
+      explains more than chance would, and lowers the standard errors by 10 % or more.
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
