@@ -34,7 +34,7 @@ _SETTLED = 1e-2  # squared step, in units of its standard error, that is the las
 _UNSTABLE = 1.2
 _ROUNDING = 1e-12  # part of an output that no noise is taken to be smaller than
 _LEFT = 1 / 3  # of the samples of a section: if products leave fewer, they are not tried
-_SIGNIFICANT = 3.0  # deviations of chance: products must explain more, or they are left out
+_EXPLAINED = 2.0  # products must lower the variance of the misfit so much, or they are left out
 _SURER = 0.9  # products must lower standard errors to this part, or they are left out
 
 
@@ -112,15 +112,10 @@ def refine(
 
 
 def _pays(lifted: Lifted, second: Lifted, plain: Refined, full: Refined) -> bool:
-    """Do products explain more than they would of noise, and make the coefficients surer?"""
-    chance = []
-    for (good, few), (_, many) in zip(_pairs(lifted), _pairs(second), strict=True):
-        rows, more = good.sum(), many.shape[1] - few.shape[1]
-        chance.append(np.sqrt(2 * more / (rows * (rows - more))))
+    """Is most of the misfit explained by products, and are the coefficients surer?"""
     explained = -2 * np.log(second.noise / lifted.noise).mean()
     sizes = [np.linalg.slogdet(x.covariance)[1] / (2 * len(x.covariance)) for x in (full, plain)]
-    significant = explained > _SIGNIFICANT * np.mean(chance)
-    return bool(significant and sizes[0] < sizes[1] + np.log(_SURER))
+    return bool(explained > np.log(_EXPLAINED) and sizes[0] < sizes[1] + np.log(_SURER))
 
 
 def _pairs(lifted: Lifted):

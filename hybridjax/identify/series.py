@@ -145,13 +145,12 @@ def fit_series(
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
     - `overhang`: lags of the numerators beyond d N; None means N.
     - `start`: "free": whatever happened before a record, the state at its start is unknown.
-      "rest": it starts on the limit
-      cycle, with no input before.
+      "rest": it starts on the limit cycle, with no input before.
     - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
       cycle, so that it holds also where noise of successive cycles is dependent (process noise),
       with the weights of Newey and West (1987). "white": from its size alone.
     - `distortion`: whether to allow for a part of the response of second order; None: if that
-      explains more than chance would, and lowers the standard errors by 10 % or more.
+      explains more than half of the misfit, and lowers the standard errors by 10 % or more.
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
