@@ -175,9 +175,7 @@ def fit_series(
     problem = rescale(problem, _noise(found, order))  # the weights that the misfit suggests
     c, found, converged = _minimise(problem, c, max_steps)
     if check:
-        delayed = delayed_outputs(rescale(problem, _noise(found, order)), order)
-        rows = max(delayed.freedom, 1)
-        refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
+        refuse_order(problem, order, _noise(found, order))
     first = quick_fit(problem, c, found, layout)
     refined = refine(
         layout,
@@ -192,6 +190,14 @@ def fit_series(
     )
     c = refined.coefficients
     return _as_fit(problem, c, linearise(problem, c), layout, refined)
+
+
+def refuse_order(problem: Problem, order: int, noise: Float[np.ndarray, " ny"]) -> None:
+    """Raise `DefinitionError` where data with so much noise, in the problem's units, do not carry
+    `order` multipliers."""
+    delayed = delayed_outputs(rescale(problem, noise), order)
+    rows = max(delayed.freedom, 1)
+    refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
 
 
 def quick_fit(problem: Problem, c: np.ndarray, found: Linearisation, layout: Layout) -> SeriesFit:

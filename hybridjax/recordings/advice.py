@@ -13,7 +13,7 @@ from ..identify.estimate import roots_of
 from ..identify.prediction import predict
 from ..identify.records import Record, lay_out, pieces_of
 from ..identify.regression import Regression, initial, lagged, linearise, set_up
-from ..identify.series import SeriesFit, fit_series, quick_fit
+from ..identify.series import SeriesFit, fit_series, quick_fit, refuse_order
 from ..identify.validate import Validation, validate
 from .sections import SectionData
 from .spectra import input_band, input_spectrum
@@ -153,9 +153,9 @@ class Advice(eqx.Module):
 def advise(data: SectionData, fit: SeriesFit) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
-    Too few strides for the unknowns, inputs without power where the multipliers are, noise that
-    would bias plain regression, intervals that reach the unit circle, an iteration that did not
-    end.
+    Too few strides for the unknowns, more multipliers than the data carry, inputs without power
+    where the multipliers are, noise that would bias plain regression, intervals that reach the
+    unit circle, an iteration that did not end.
     """
     found = []
     N, R, _, nu = fit.numerators.shape
@@ -167,6 +167,14 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
         found.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
             "record more, take fewer sections, or excite fewer inputs."
+        )
+    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
+    try:
+        refuse_order(problem, d, fit.noise / problem.scale)
+    except DefinitionError:
+        found.append(
+            f"Order: the data do not carry {d} multipliers. The weakest may be noise alone (or "
+            "nearly zero in truth); neither its value nor its interval then means anything."
         )
     f, power = input_spectrum(data)
     resonance = np.abs(np.angle(fit.multipliers)) / (2 * np.pi)

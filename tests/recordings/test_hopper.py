@@ -107,6 +107,10 @@ def test_order_and_advice(hopper_recording, angle):
     assert any("plain regression (ARX) would give" in w for w in advice.warnings)
     assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
     assert (np.diff(advice.expected[:, 0]) <= 0).all()
+    too_many = hj.advise(data, hj.fit_series(data.records, order=3, check=False)).warnings
+    order = "Order: the data do not carry 3 multipliers"
+    assert any(w.startswith(order) for w in too_many)
+    assert not any(w.startswith("Order") for w in advice.warnings)
     slow = hj.Recording(
         noisy.trials[0].time,
         {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
