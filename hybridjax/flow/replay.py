@@ -6,6 +6,7 @@ crossings follow from two Newton steps on the true guard, which is the saltation
 """
 
 import dataclasses
+import functools as ft
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +22,8 @@ from .target import Target
 from .watch import chart_field, settle, watched
 
 
-# Rows of a tape that reverse mode computes again together, and how many such blocks make one.
-_BLOCK, _BLOCKS = 4, 16
+# Rows of a tape that are skipped, or computed again by reverse mode, together.
+_BLOCK = 16
 
 
 def replay(
@@ -53,26 +54,19 @@ def replay(
 
         return jax.lax.cond((code != IDLE).any(), move, lambda carry: carry, carry), None
 
-    # Most tapes are empty but for their beginning: blocks of rows without a move are skipped, and
-    # so are blocks of blocks. Reverse mode keeps no more of a block than where it starts.
-    block = jax.checkpoint(_skipping(row), prevent_cse=False)
+    @ft.partial(jax.checkpoint, prevent_cse=False)
+    def block(carry, rows):
+        follow = lambda carry: jax.lax.scan(row, carry, rows)[0]  # noqa: E731
+        return jax.lax.cond((rows[1] != IDLE).any(), follow, lambda carry: carry, carry), None
+
+    # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
+    # mode keeps no more of a block than where it starts.
     rows, L = h.shape
-    shape, fill = (-1, _BLOCKS, _BLOCK, L), ((0, -rows % (_BLOCK * _BLOCKS)), (0, 0))
-    h = jnp.pad(h, fill).reshape(shape)
-    code = jnp.pad(code, fill, constant_values=IDLE).reshape(shape)
-    begin = lanes.t, lanes.q, lanes.chart
-    (t, q, _), _ = jax.lax.scan(_skipping(block), begin, (h, code))
+    fill = ((0, -rows % _BLOCK), (0, 0))
+    h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
+    code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    (t, q, _), _ = jax.lax.scan(block, (lanes.t, lanes.q, lanes.chart), (h, code))
     return t, q
-
-
-def _skipping(step):
-    """The body of a scan over blocks of moves: `step` for each, unless nothing moves."""
-
-    def block(carry, moves):
-        follow = lambda carry: jax.lax.scan(step, carry, moves)[0]  # noqa: E731
-        return jax.lax.cond((moves[1] != IDLE).any(), follow, lambda carry: carry, carry), None
-
-    return block
 
 
 def _advance(s, t, q, chart, moves, u, target, h, which, unroll):
