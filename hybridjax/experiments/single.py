@@ -1,7 +1,6 @@
 """Experiments in single precision: how far rounding errors carry them, measured on the cycle."""
 
 import dataclasses
-import weakref
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float
 from .._core.compile import quick_jit
 from .._core.errors import DefinitionError
 from .._core.precision import single, single_precision
+from .._core.remember import Memory
 from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
@@ -31,8 +31,7 @@ _TURNS, _GROWTH = 1024, 1e-3
 _LARGEST, _CAUTION = 4.0, 2.0
 
 
-# Rounding errors by sections, accuracy and scales, as long as the sections live.
-_known: dict[tuple, tuple[weakref.ref, float]] = {}
+_known = Memory()
 
 
 def plan_single(
@@ -48,11 +47,8 @@ def plan_single(
     noise = _NOISE * float(jnp.finfo(jnp.float32).eps) / planned.settings.rtol
     slack = jnp.maximum(planned.plan.slack, noise)
     planned = planned._replace(plan=dataclasses.replace(planned.plan, slack=slack))
-    key = id(placed), float(accuracy), tuple(sorted((scale or {}).items()))
-    owner, rounding = _known.get(key, (None, 0.0))
-    if owner is None or owner() is not placed:
-        rounding = rounding_error(placed, *planned)
-        _known[key] = weakref.ref(placed, lambda _: _known.pop(key, None)), rounding
+    key = float(accuracy), tuple(sorted((scale or {}).items()))
+    rounding = _known.recall(placed, key, lambda: rounding_error(placed, *planned))
     if rounding > accuracy / 2:
         raise DefinitionError(
             f"single precision leaves errors of about {rounding:.1e} of the states' sizes in these "

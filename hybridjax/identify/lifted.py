@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .likelihood import dependent, sandwich
+from .likelihood import dependent, memory, sandwich
 from .records import Layout
 from .regression import lagged
 
@@ -67,15 +67,17 @@ class Misfit(NamedTuple):
     gradient: Float[np.ndarray, " P"] | None
 
 
-class Refined(NamedTuple):
+class Estimate(NamedTuple):
+    """Coefficients of chi."""
+
     coefficients: Float[np.ndarray, " d"]
     covariance: Float[np.ndarray, "d d"]
     freedom: float
+    """Degrees of freedom of the covariance."""
     converged: bool
-    distortion: bool
 
 
-def refine(
+def with_products(
     layout: Layout,
     responses: Float[np.ndarray, "N lags ny nu"],
     order: int,
@@ -84,12 +86,12 @@ def refine(
     *,
     rest: bool,
     errors: Literal["residuals", "white"],
-    distortion: bool | None,
+    always: bool,
     max_steps: int,
-) -> Refined:
-    """From the responses that a first fit found to coefficients of chi and their covariance.
+) -> Estimate | None:
+    """An estimate that allows for a part of second order, from the responses of a first fit.
 
-    `distortion`: whether there are products; None: if the coefficients are surer with them.
+    None where products leave too little freedom, or unless `always`, do not pay.
     """
     N = layout.y.shape[2]
     back = [max(0, -(-(overhang - n) // N)) for n in range(N)]
@@ -97,24 +99,24 @@ def refine(
     w, basis = _whitened(layout.u)
     model = _first_model(responses, order, back, noise, basis)
     lifted = _lift(layout, w, back, noise, rest)
-    lifted, model, ended = _fit(lifted, model, max_steps)
-    plain = Refined(*_covariance(lifted, model, errors), ended, False)
-    if distortion is False:
-        return plain
+    lifted, model, _ = _fit(lifted, model, max_steps)
     products = _products(layout, simulate(lifted, model))
     second = _lift(layout, w, back, lifted.noise, rest, products)
     left = [1 - (basis.shape[1] + second.w.shape[2]) / good.sum() for good, basis in _pairs(second)]
-    if min(left) < (0 if distortion else _LEFT):
-        return plain
+    if min(left) < (0 if always else _LEFT):
+        return None
+    plain = _covariance(lifted, model, errors)
     second, model, ended = _fit(second, model, max_steps)
-    full = Refined(*_covariance(second, model, errors), ended, True)
-    return full if distortion or _pays(lifted, second, plain, full) else plain
+    full = _covariance(second, model, errors)
+    if always or _pays(lifted, second, plain[1], full[1]):
+        return Estimate(*full, ended)
+    return None
 
 
-def _pays(lifted: Lifted, second: Lifted, plain: Refined, full: Refined) -> bool:
+def _pays(lifted: Lifted, second: Lifted, plain, full) -> bool:
     """Is most of the misfit explained by products, and are the coefficients surer?"""
     explained = -2 * np.log(second.noise / lifted.noise).mean()
-    sizes = [np.linalg.slogdet(x.covariance)[1] / (2 * len(x.covariance)) for x in (full, plain)]
+    sizes = [np.linalg.slogdet(x)[1] / (2 * len(x)) for x in (full, plain)]
     return bool(explained > np.log(_EXPLAINED) and sizes[0] < sizes[1] + np.log(_SURER))
 
 
@@ -363,9 +365,7 @@ def _covariance(lifted: Lifted, model: Model, errors: str):
     mine = slopes @ (to_c @ found.hessian @ root).T
     score = np.einsum("stad,sta->std", mine, error)
     parts = np.einsum("stad,stae->stde", mine, mine)
-    slowest = np.clip(np.abs(np.linalg.eigvals(model.A)).max(), 1e-3, 0.99)
-    lags = int(min(np.ceil(np.log(0.1) / np.log(slowest)), T // 4))
-    gradient, terms = dependent(score, lags)
+    gradient, terms = dependent(score, memory(np.linalg.eigvals(model.A), T))
     scaled, freedom = sandwich(np.eye(d), gradient, parts.reshape(-1, d, d))
     return c, half @ scaled @ half.T, freedom / terms
 

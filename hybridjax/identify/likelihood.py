@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Inexact
 
 from .projection import Group, delayed, evaluate
 
@@ -159,6 +159,12 @@ def sandwich(
         share = np.einsum("ij,ejk,ik->ei", half, shares, half)
         freedom = float(1 / (share**2).sum(axis=0).mean())
     return inverse @ gradient @ inverse, freedom
+
+
+def memory(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> int:
+    """Cycles after which a tenth is left of the slowest response; of a record at most a quarter."""
+    slowest = np.clip(np.abs(multipliers).max(), 1e-3, 0.99)
+    return int(min(np.ceil(np.log(0.1) / np.log(slowest)), cycles // 4))
 
 
 def dependent(

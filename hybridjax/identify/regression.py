@@ -130,6 +130,12 @@ class Regression(NamedTuple):
         used = np.linalg.matrix_rank(self.inverse, hermitian=True) + (self.left**2).sum()
         return int(self.good.sum()) - int(round(float(used)))
 
+    @property
+    def leverage(self) -> Float[np.ndarray, "S T"]:
+        """The share of its own error that the fit takes from each sample."""
+        own = np.einsum("ij,jk,ik->i", self.rest, self.inverse, self.rest)
+        return (self.left**2).sum(axis=2) + own.reshape(self.left.shape[:2])
+
     def solve(self, x: Float[np.ndarray, "S T C"]):
         """Coefficients of V, the response at all rows, and what is left at those sampled."""
         a, left = np.zeros((self.rest.shape[1], x.shape[2])), self.good * x
@@ -144,26 +150,31 @@ class Regression(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    residual: Float[np.ndarray, "S T N ny 1"]
-    jacobian: Float[np.ndarray, "d S T N ny 1"]
+    residual: Float[np.ndarray, "S T N ny C"]
+    jacobian: Float[np.ndarray, "d S T N ny C"]
     freedom: Int[np.ndarray, "N ny"]
+    leverage: Float[np.ndarray, "S T N ny"]
     numerators: Float[np.ndarray, "N columns ny"]
+    """Of the first column of outputs."""
     slope: Float[np.ndarray, "d N columns ny"]
     """Their derivative with respect to c."""
     roots: list[list[Float[np.ndarray, "columns r"]]]
     """root @ root.T is the covariance of the numerators of a section and output, given c."""
 
 
-def linearise(problem: Problem, c: Coefficients) -> Linearisation:
+def linearise(
+    problem: Problem, c: Coefficients, y: Float[np.ndarray, "S T N ny C"] | None = None
+) -> Linearisation:
     """What the numerators and free starts leave of the outputs, and its derivative in c.
 
-    The derivative omits what vanishes with the residual (Kaufman 1975).
+    The derivative omits what vanishes with the residual (Kaufman 1975). `y`: other outputs than
+    those measured, C of each.
     """
     S, T, N, ny = problem.y.shape
-    y = problem.y[..., None]
+    y = problem.y[..., None] if y is None else y
     d, columns = len(c), problem.lags * problem.u.shape[3]
     residual, jacobian = np.zeros(y.shape), np.zeros((d, *y.shape))
-    freedom, roots = np.zeros((N, ny), int), []
+    freedom, leverage, roots = np.zeros((N, ny), int), np.zeros((S, T, N, ny)), []
     b, slope = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
     v = along_cycles(c, problem.u)
     for n in range(N):
@@ -174,7 +185,7 @@ def linearise(problem: Problem, c: Coefficients) -> Linearisation:
             good = problem.good[:, :, n, i]
             if regression is None or not np.array_equal(good, regression.good[..., 0]):
                 regression = Regression.make(V, E, problem.slow, good)
-                left = regression.freedom
+                left, share = regression.freedom, regression.leverage
                 w, q = np.linalg.eigh(regression.inverse)
                 root = problem.maps[n] @ (q * np.sqrt(np.maximum(w, 0)))
             a, fitted, residual[:, :, n, i] = regression.solve(y[:, :, n, i])
@@ -182,10 +193,10 @@ def linearise(problem: Problem, c: Coefficients) -> Linearisation:
             for j in range(d):
                 more, _, jacobian[j, :, :, n, i] = regression.solve(along_cycles(c, fitted, j + 1))
                 slope[j, n, :, i] = problem.maps[n] @ more[:, 0]
-            freedom[n, i] = left
+            freedom[n, i], leverage[:, :, n, i] = left, share
             roots.append(root)
     roots = [roots[n * ny : (n + 1) * ny] for n in range(N)]
-    return Linearisation(residual, jacobian, freedom, b, slope, roots)
+    return Linearisation(residual, jacobian, freedom, leverage, b, slope, roots)
 
 
 def responses_to_starts(

@@ -14,8 +14,8 @@ from ..periodic.htf import HTF
 from ..periodic.ldtp import LDTP
 from ..periodic.transfer import check_harmonics
 from .estimate import MultiplierEstimate, roots_of
-from .lifted import HORIZON, Refined, refine
-from .likelihood import gauss_newton
+from .lifted import HORIZON, Estimate, with_products
+from .likelihood import dependent, gauss_newton, memory, sandwich
 from .order import refuse_invented
 from .projection import chi
 from .records import Layout, Recorded, lay_out
@@ -28,6 +28,9 @@ from .regression import (
     rescale,
     set_up,
 )
+
+
+_PROBES = 4  # outputs of pure noise, from which the noise in the Jacobian is estimated
 
 
 class SeriesFit(MultiplierEstimate):
@@ -176,20 +179,25 @@ def fit_series(
     c, found, converged = _minimise(problem, c, max_steps)
     if check:
         refuse_order(problem, order, _noise(found, order))
-    first = quick_fit(problem, c, found, layout)
-    refined = refine(
-        layout,
-        first.impulse_response((1 + HORIZON + order + -(-overhang // N)) * N),
-        order,
-        overhang,
-        _section_noise(found) * problem.scale,
-        rest=start == "rest",
-        errors=errors,
-        distortion=distortion,
-        max_steps=max_steps,
-    )
-    c = refined.coefficients
-    return _as_fit(problem, c, linearise(problem, c), layout, refined)
+    covariance, freedom = _covariance(problem, c, found, errors)
+    best = Estimate(c, covariance, freedom, converged)
+    second = None
+    if distortion is not False:
+        first = quick_fit(problem, c, found, layout)
+        second = with_products(
+            layout,
+            first.impulse_response((1 + HORIZON + order + -(-overhang // N)) * N),
+            order,
+            overhang,
+            _section_noise(found) * problem.scale,
+            rest=start == "rest",
+            errors=errors,
+            always=distortion is True,
+            max_steps=max_steps,
+        )
+    if second is not None:
+        best, found = second, linearise(problem, second.coefficients)
+    return _as_fit(problem, found, layout, best, second is not None)
 
 
 def refuse_order(problem: Problem, order: int, noise: Float[np.ndarray, " ny"]) -> None:
@@ -203,11 +211,12 @@ def refuse_order(problem: Problem, order: int, noise: Float[np.ndarray, " ny"]) 
 def quick_fit(problem: Problem, c: np.ndarray, found: Linearisation, layout: Layout) -> SeriesFit:
     """A fit with these coefficients, whatever they are worth, and an unknown covariance."""
     unknown = np.full((len(c), len(c)), np.inf)
-    return _as_fit(problem, c, found, layout, Refined(c, unknown, np.inf, False, False))
+    return _as_fit(problem, found, layout, Estimate(c, unknown, np.inf, False), False)
 
 
-def _as_fit(problem, c, found, layout, refined: Refined) -> SeriesFit:
+def _as_fit(problem, found, layout, best: Estimate, distortion: bool) -> SeriesFit:
     N, nu, ny = layout.y.shape[2], layout.u.shape[3], layout.y.shape[3]
+    c = best.coefficients
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
@@ -221,18 +230,18 @@ def _as_fit(problem, c, found, layout, refined: Refined) -> SeriesFit:
     return SeriesFit(
         multipliers=roots_of(c),
         coefficients=c,
-        covariance=refined.covariance,
+        covariance=best.covariance,
         numerators=by_input(found.numerators),
         slopes=by_input(found.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(found, len(c)) * problem.scale,
-        covariance_freedom=refined.freedom,
-        result=Result.OK if refined.converged else Result.NOT_CONVERGED,
+        covariance_freedom=best.freedom,
+        result=Result.OK if best.converged else Result.NOT_CONVERGED,
         sections=N,
         inputs=layout.inputs,
         outputs=layout.outputs,
         lead=layout.lead,
-        distortion=refined.distortion,
+        distortion=distortion,
     )
 
 
@@ -250,6 +259,32 @@ def _noise(found: Linearisation, order: int) -> Float[np.ndarray, " ny"]:
     square = (found.residual**2).sum(axis=(0, 1, 2, 4))
     left = found.freedom.sum(axis=0) - order / found.freedom.shape[1]
     return np.maximum(np.sqrt(square / left), 1e-15)
+
+
+def _covariance(problem: Problem, c, found: Linearisation, errors: str):
+    """Of c, and its degrees of freedom; by cycles, which may depend on their neighbours."""
+    d = len(c)
+    rng = np.random.default_rng(0)
+    probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.good[..., None]
+    noise = linearise(problem, c, probes).jacobian.reshape(d, -1)
+    noise = noise @ noise.T / _PROBES
+    parts = np.einsum("istnac,jstnac->stij", found.jacobian, found.jacobian)
+    square = parts.sum(axis=(0, 1))
+    if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
+        return sandwich(square - noise, square)
+    # What a sample would miss a fit to the others by: errors that are large where inputs are, as
+    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
+    error = found.residual / np.maximum(1 - found.leverage, 1e-3)[..., None]
+    score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
+    lags = memory(roots_of(c), problem.y.shape[1])
+    gradient, terms = dependent(score, lags)
+    # The scores add up to zero at the minimum, which takes this part of their covariance away.
+    half = np.linalg.inv(np.linalg.cholesky(square))
+    share = np.einsum("ij,stjk,lk->stil", half, parts, half).reshape(*parts.shape[:2], d * d)
+    taken = np.trace(dependent(share, lags)[0])
+    gradient = gradient / max(1 - taken / d, 0.5)
+    covariance, freedom = sandwich(square - noise, gradient, parts.reshape(-1, d, d))
+    return covariance, freedom / terms
 
 
 def _section_noise(found: Linearisation) -> Float[np.ndarray, "N ny"]:

@@ -5,7 +5,6 @@ way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
 import functools as ft
-import weakref
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.errors import DefinitionError
+from .._core.remember import Memory
 from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
@@ -217,8 +217,7 @@ class Planned(NamedTuple):
     scales: Float[np.ndarray, "N n"]
 
 
-# Plans by sections, accuracy and scales, as long as the sections live.
-_made: dict[tuple, tuple[weakref.ref, Planned]] = {}
+_made = Memory()
 
 
 def plan_flow(
@@ -230,12 +229,11 @@ def plan_flow(
     """
     if not 1e-13 <= accuracy <= 1e-2:
         raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
-    key = id(placed), float(accuracy), tuple(sorted((scale or {}).items()))
-    owner, planned = _made.get(key, (None, None))
-    if owner is None or owner() is not placed:
+
+    def make() -> Planned:
         scales = section_scales(placed, scale)
         settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
         plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
-        planned = Planned(plan, settings, scales)
-        _made[key] = weakref.ref(placed, lambda _: _made.pop(key, None)), planned
-    return planned
+        return Planned(plan, settings, scales)
+
+    return _made.recall(placed, (float(accuracy), tuple(sorted((scale or {}).items()))), make)

@@ -57,10 +57,16 @@ class Tiles(NamedTuple):
 
     @property
     def parameters(self) -> Float[np.ndarray, "S p"]:
-        """The numbers in which the systems differ, each in units of its spread."""
+        """The numbers in which the systems differ, each in units of its spread. (What is not finite
+        has no neighbours to learn from; it is taken for the mean.)"""
         arrays = jax.tree_util.tree_leaves(eqx.filter(self.systems, eqx.is_inexact_array))
         flat = np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
-        spread = flat.std(axis=0)
+        good = np.isfinite(flat)
+        count = np.maximum(good.sum(axis=0), 1)
+        flat = np.where(good, flat - np.where(good, flat, 0.0).sum(axis=0) / count, 0.0)
+        spread = np.sqrt((flat**2).sum(axis=0) / count)
+        if not spread.any():
+            return flat[:, :1]
         return flat[:, spread > 0] / spread[spread > 0]
 
     def solve(self, S: int, progress: bool) -> Rounds:

@@ -36,7 +36,7 @@ def test_copies_with_other_values_have_their_own():
 
 def test_it_is_forgotten_with_its_object():
     calls.clear()
-    values = Box.__dict__["double"]._values
+    values = Box.double.memory
     size = len(values)
     box = Box(jnp.asarray(1.0))
     assert box.double == 2 and len(values) == size + 1

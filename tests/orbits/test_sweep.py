@@ -64,6 +64,15 @@ def test_without_a_clock_and_in_waves(wheel):
     assert {found[i].order for i in range(11)} == {(0,)}
 
 
+def test_systems_that_are_alike_or_undefined(wheel):
+    """Neither takes the others down with it."""
+    slopes = [0.08] * 9 + [np.nan, 0.08]
+    found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
+    np.testing.assert_array_equal(found.failed, [9])
+    alike = hj.find_limit_cycles([found[0].system] * 6, wheel, batch=4)
+    assert alike.ok.all()
+
+
 def test_a_guess_with_too_long_a_period(wheel):
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
     assert cycle.order == (0,) and cycle.period < 0.7 * wheel.period
