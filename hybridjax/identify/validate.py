@@ -13,7 +13,7 @@ from scipy import stats
 from .._core.errors import DefinitionError
 from ..periodic.ldtp import LDTP
 from .prediction import predict
-from .records import Piece, Recorded, pieces_of
+from .records import Piece, Recorded, pieces_of, slow_waves
 from .series import SeriesFit
 
 
@@ -105,7 +105,7 @@ def validate(
     - `data`: `ExperimentData`, a `Record` or several, best those that the model was not made from;
       those that it was made from always fit too well.
     - `start`: "free" estimates the state at the start of each record from it; "rest" takes it as
-      zero.
+      zero. A drift that the records announce is estimated from them in either case.
     - `lags`: how many are looked at; default one period, less for few cycles.
     - `level`: of the tests.
 
@@ -164,23 +164,43 @@ def check_model(model: LDTP | SeriesFit, N: int, inputs, outputs) -> None:
 
 
 def simulate_piece(model: LDTP | SeriesFit, piece: Piece, free: bool) -> Float[np.ndarray, "n ny"]:
-    """The outputs of the model, from the state that fits the record best, or from rest."""
+    """The outputs of the model from the state that fits the record best, or from rest, with the
+    drift that does."""
     if isinstance(model, SeriesFit):
         return predict(model, piece, free)
     forced = np.asarray(model.simulate(piece.u, start=piece.start))
+    left = (piece.y - forced)[..., None]
     if not free:
-        return forced
+        return forced + _slow(left, piece, model.sections)[..., 0]
     d = int(model.dims[piece.start])
     still = jnp.zeros_like(jnp.asarray(piece.u))
     states = jnp.eye(model.A.shape[-1])[:d]
     alone = jax.vmap(lambda x0: model.simulate(still, x0, piece.start))(states)
     alone = np.moveaxis(np.asarray(alone), 0, -1)
+    both = np.concatenate([left, alone], axis=2)
+    both = both - _slow(both, piece, model.sections)
     seen = np.isfinite(piece.y)
     # Outputs in units of their size, so that none is neglected.
     size = np.sqrt(np.nanmean(piece.y**2, axis=0, where=seen)) if seen.any() else 1.0
     weight = np.broadcast_to(1 / np.where(size > 0, size, 1.0), piece.y.shape)[seen]
-    x0 = np.linalg.lstsq(alone[seen] * weight[:, None], (piece.y - forced)[seen] * weight)[0]
-    return forced + alone @ x0
+    x0 = np.linalg.lstsq(both[seen][:, 1:] * weight[:, None], both[seen][:, 0] * weight)[0]
+    out = forced + alone @ x0
+    return out + _slow((piece.y - out)[..., None], piece, model.sections)[..., 0]
+
+
+def _slow(
+    x: Float[np.ndarray, "n ny m"], piece: Piece, sections: int
+) -> Float[np.ndarray, "n ny m"]:
+    """The drift that explains most of x at the samples of a piece, section by section."""
+    out = np.zeros_like(x)
+    waves = slow_waves(piece, sections, piece.drift)
+    cycle, section = np.divmod(piece.start + np.arange(len(x)), sections)
+    for n, i in np.ndindex(sections, x.shape[1]):
+        rows = section == n
+        seen = rows & np.isfinite(piece.y[:, i])
+        if waves.shape[1] and seen.any():
+            out[rows, i] = waves[cycle[rows]] @ np.linalg.lstsq(waves[cycle[seen]], x[seen, i])[0]
+    return out
 
 
 def _sections(pieces: Sequence[Piece], N: int) -> np.ndarray:

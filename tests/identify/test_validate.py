@@ -71,6 +71,27 @@ def test_identified_beside_held_out_data(hopper):
     np.testing.assert_allclose(found.fit, 99.0, atol=0.4)
 
 
+@pytest.mark.parametrize("start", ["free", "rest"])
+def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
+    """Neither residuals nor p-values of the true model change, however large the drift is."""
+    plain = record(small, 4 * 150, 0, 0.3, start=1)
+    plain.y[5:9, 0] = np.nan
+    cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
+    wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
+    about = dict(sections=4, start=1, outputs=plain.outputs, drift=50)
+    still, moved = (
+        hj.validate(small, hj.Record(plain.u, plain.y + x, **about), start=start)
+        for x in (0.0, wave[:, None] * [1.0, -2.0])
+    )
+    np.testing.assert_allclose(moved.noise, still.noise, rtol=1e-3)
+    np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
+    assert moved.white and moved.independent
+    np.testing.assert_allclose(still.noise, 0.3, rtol=0.1)
+    silent = dict(about, drift=None)
+    unsaid = hj.Record(plain.u, plain.y + wave[:, None], **silent)
+    assert not hj.validate(small, unsaid, start=start).white
+
+
 def test_amplitudes(small):
     """A cubic nonlinearity: the misfit grows with the square of the amplitude."""
 
