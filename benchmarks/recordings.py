@@ -1,11 +1,12 @@
 """Recordings to multipliers: errors, dirt, coverage, a walker, time and memory.
 
-python benchmarks/recordings.py [errors] [dirt] [walker] [size] [coverage]      (all by default)
+python benchmarks/recordings.py [errors] [parts] [dirt] [walker] [size] [coverage]
 
-The systems are simulated and their multipliers known. Beside `fit_series` stands plain ARX: least
-squares on the same section data.
+does all of these by default. The systems are simulated and their multipliers known. Beside
+`fit_series` stands plain ARX: least squares on the same section data.
 """
 
+import itertools
 import resource
 import subprocess
 import sys
@@ -21,21 +22,25 @@ import hybridjax as hj
 from hybridjax.recordings.spoil import spoil
 
 
-PLANE = hj.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+ANGLE = hj.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+APEX = hj.EventPhase("apex")
+PHASES = {"apex": APEX, "angle": ANGLE}
 RATE, BANDWIDTH, RMS = 500, 8.0, 0.0205  # Hz, Hz, N: outputs deviate by 9.7e-4 m (rms)
 NOISES = (0.0, 1e-4, 1e-3)
 
 
-def hopper(strides, seeds):
+def hopper(strides, seeds, force=RMS):
     """Recordings of the paper's hopper, one for each seed, and its multipliers."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    force = [random_force(strides, seed) for seed in seeds]
-    both = hj.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=RATE, steps=1)
+    u = [hj.random_force(strides, RATE, BANDWIDTH, rms=force, seed=seed) for seed in seeds]
+    both = hj.simulate_recording(cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1)
     return [eqx.tree_at(lambda r: r.trials, both, (t,)) for t in both.trials], cycle.multipliers
 
 
-def random_force(strides, seed):
-    return hj.random_force(strides, RATE, BANDWIDTH, rms=RMS, seed=seed)
+def noisy(recording, noise, seed):
+    """With white noise, in which the apex of each stride is marked."""
+    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
+    return dirty.mark("apex", "vM", direction="falling", bandwidth=16)
 
 
 def start_of(recording, strides):
@@ -48,7 +53,7 @@ def start_of(recording, strides):
     return eqx.tree_at(lambda r: r.trials, recording, tuple(map(cut, recording.trials)))
 
 
-def at_sections(recording, phase=PLANE, sections=32, **options):
+def at_sections(recording, phase, sections=32, **options):
     options |= {"inputs": "u", "outputs": ("yM", "vM"), "sections": sections}
     return hj.section_data(recording, phase, **options)
 
@@ -57,50 +62,69 @@ def distance(multipliers, true):
     return np.abs(multipliers - true).max()
 
 
-def errors(seeds=5):
+def errors(seeds=10):
     print(f"\nHopper, {RATE} Hz, force of {BANDWIDTH:g} Hz and rms {RMS} N; {seeds} seeds")
     recordings, true = hopper(1000, range(seeds))
-    print("strides  noise    rms error  (median)   said     plain ARX, rms; on splines through all")
-    for strides in (1000, 300):
-        for noise in NOISES:
-            found, said, plain, rough = [], [], [], []
+    print("phase  strides  noise    rms error  (median)   said     plain ARX, rms; on splines")
+    for name, strides, noise in itertools.product(PHASES, (1000, 300), NOISES):
+        found, said, plain, rough = [], [], [], []
+        for seed, recording in enumerate(recordings):
+            dirty = noisy(start_of(recording, strides), noise, seed)
+            data = at_sections(dirty, PHASES[name])
+            fit = hj.fit_series(data.records, 2, check=False)
+            found.append(distance(fit.multipliers, true))
+            said.append(fit.standard_errors[0])
+            plain.append(distance(hj.plain_regression(data, 2), true))
+            through = at_sections(dirty, PHASES[name], bandwidth=np.inf)
+            rough.append(distance(hj.plain_regression(through, 2), true))
+        row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
+        row = "  ".join(f"{x:9.1e}" for x in row)
+        print(f"{name:5s}  {strides:7d}  {noise:6.0e}  {row}", flush=True)
+
+
+def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
+    """With a tenth of force and noise there is a hundredth of distortion: noise alone is left."""
+    print(f"\nForce and noise ({noise:g}) as they are, and {part:g} of both; {seeds} seeds")
+    for share in (1.0, part):
+        recordings, true = hopper(strides, range(seeds), share * RMS)
+        for name, phase in PHASES.items():
+            found, said = [], []
             for seed, recording in enumerate(recordings):
-                dirty = spoil(start_of(recording, strides), ("yM", "vM"), noise=noise, seed=seed)
-                data = at_sections(dirty)
-                fit = hj.fit_series(data.records, 2, check=False)
+                data = at_sections(noisy(recording, share * noise, seed), phase)
+                fit = hj.fit_series(data.records, 2, check=False, distortion=False)
                 found.append(distance(fit.multipliers, true))
                 said.append(fit.standard_errors[0])
-                plain.append(distance(hj.plain_regression(data, 2), true))
-                through = at_sections(dirty, bandwidth=np.inf)
-                rough.append(distance(hj.plain_regression(through, 2), true))
-            row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
-            print(f"{strides:7d}  {noise:6.0e}  " + "  ".join(f"{x:9.1e}" for x in row), flush=True)
+            print(
+                f"{name:5s} {share:3g}: rms error {rms(found):.1e}, said {rms(said):.1e}",
+                flush=True,
+            )
 
 
 def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16):
+def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16, phases=tuple(PHASES)):
     print(
         f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {sections} sections, "
         f"noise {noise:g}"
     )
-    hits, found, said = [], [], []
-    for first in range(0, seeds, chunk):
-        recordings, true = hopper(strides, range(1000 + first, 1000 + first + chunk))
-        for seed, recording in enumerate(recordings, first):
-            dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
-            fit = hj.fit_series(at_sections(dirty, sections=sections).records, 2, check=False)
-            hits.append(bool(fit.contains(true[:1])[0]))
-            found.append(distance(fit.multipliers, true))
-            said.append(fit.standard_errors[0])
-        p = stats.binomtest(sum(hits), len(hits), 0.95).pvalue
-        print(
-            f"{sum(hits)} of {len(hits)} ({100 * np.mean(hits):.1f} %), p = {p:.2g}; rms error "
-            f"{rms(found):.1e}, said {rms(said):.1e}",
-            flush=True,
-        )
+    for name in phases:
+        hits, found, said = [], [], []
+        for first in range(0, seeds, chunk):
+            recordings, true = hopper(strides, range(1000 + first, 1000 + first + chunk))
+            for seed, recording in enumerate(recordings, first):
+                data = at_sections(noisy(recording, noise, seed), PHASES[name], sections)
+                fit = hj.fit_series(data.records, 2, check=False)
+                hits.append(bool(fit.contains(true[:1])[0]))
+                found.append(distance(fit.multipliers, true))
+                said.append(fit.standard_errors[0])
+            p = stats.binomtest(sum(hits), len(hits), 0.95).pvalue
+            print(
+                f"{name}: {sum(hits)} of {len(hits)} ({100 * np.mean(hits):.1f} %), p = {p:.2g}; "
+                f"rms error {rms(found):.1e}, said {rms(said):.1e}",
+                flush=True,
+            )
 
 
 def dirt(seeds=5, strides=500, noise=1e-4):
@@ -108,28 +132,27 @@ def dirt(seeds=5, strides=500, noise=1e-4):
     recordings, true = hopper(strides, range(seeds))
     gap = (strides / 2, strides / 2 + 20)
     cases = {
-        "clean": (PLANE, {}, {}),
-        "1 % of samples lost, gap of 20 strides": (PLANE, {"missing": 0.01, "gap": gap}, {}),
+        "clean": (ANGLE, {}, {}),
+        "1 % of samples lost, gap of 20 strides": (ANGLE, {"missing": 0.01, "gap": gap}, {}),
         "the same, a third not there": (
-            PLANE, {"missing": 0.01, "gap": gap, "irregular": True}, {},
+            ANGLE, {"missing": 0.01, "gap": gap, "irregular": True}, {},
         ),
         "the same, rounded to 1e-4": (
-            PLANE, {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
+            ANGLE, {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
         ),
-        "drift of 5e-3, removed": (PLANE, {"drift": 5e-3}, {"drift": 50}),
-        "period that grows by 5 %": (PLANE, {"stretch": 0.05}, {}),
-        "cycles from apex to apex, clean": (hj.EventPhase("apex"), {}, {}),
+        "drift of 5e-3, removed": (ANGLE, {"drift": 5e-3}, {"drift": 50}),
+        "period that grows by 5 %": (ANGLE, {"stretch": 0.05}, {}),
+        "cycles from apex to apex, clean": (APEX, {}, {}),
         "1 % lost, gap, 5 events lost, 5 doubled": (
-            hj.EventPhase("apex"), {"missing": 0.01, "gap": gap, "lost": 5, "doubled": 5}, {},
+            APEX, {"missing": 0.01, "gap": gap, "lost": 5, "doubled": 5}, {},
         ),
     }  # fmt: skip
     for label, (phase, spoiled, options) in cases.items():
         found, said, hits = [], [], 0
         for seed, recording in enumerate(recordings):
-            if isinstance(phase, hj.EventPhase):
-                noisy = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
-                marked = noisy.mark("apex", "vM", direction="falling", bandwidth=16)
-                dirty = spoil(marked, ("yM", "vM"), seed=seed, **spoiled)
+            if phase is APEX:
+                dirty = noisy(recording, noise, seed)
+                dirty = spoil(dirty, ("yM", "vM"), seed=seed, **spoiled)
             else:
                 dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
             if "drift" in options:
@@ -215,7 +238,7 @@ def size(trials=10, minutes=10, rate=1000):
 
 if __name__ == "__main__":
     hj.enable_x64()
-    for name in sys.argv[1:] or ("errors", "dirt", "walker", "size", "coverage"):
+    for name in sys.argv[1:] or ("errors", "parts", "dirt", "walker", "size", "coverage"):
         start = time.process_time()
         globals()[name]()
         print(f"({time.process_time() - start:.0f} CPU s)")

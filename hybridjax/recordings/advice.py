@@ -1,5 +1,6 @@
 """What the data cannot carry, in plain words."""
 
+from itertools import combinations
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,6 +23,7 @@ from .spectra import input_band, input_spectrum
 _FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are few
 _WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
 _LOST = 0.2  # of all samples
+_ALIKE = 0.98  # median of the correlations of two outputs at the sections: they say the same
 _ENOUGH = 1000  # cycles to choose an order from, and to try it on
 _TIE = 0.02  # relative difference of misfits that are as good as equal
 
@@ -154,8 +156,8 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
     Too few strides for the unknowns, more multipliers than the data carry, inputs without power
-    where the multipliers are, noise that would bias plain regression, intervals that reach the
-    unit circle, an iteration that did not end.
+    where the multipliers are, outputs that say the same, noise that would bias plain regression,
+    intervals that reach the unit circle, an iteration that did not end.
     """
     found = []
     N, R, _, nu = fit.numerators.shape
@@ -200,6 +202,13 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
                 f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
                 f"where the power of {name} ends."
             )
+    for i, j in combinations(range(layout.y.shape[3]), 2):
+        if _correlation(layout.y[..., i], layout.y[..., j]) > _ALIKE:
+            found.append(
+                f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
+                "two sides of one number, as signals are whose angle is the phase. Cycles from "
+                "event to event (`mark`, `EventPhase`) may make the multipliers much surer."
+            )
     plain = plain_regression(data, d)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     if bias > 2 * fit.standard_errors.max():
@@ -222,6 +231,16 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     with np.errstate(divide="ignore"):
         expected = fit.standard_errors * np.sqrt(now / later)[:, None]
     return Advice(tuple(found), plain, bias, tuple(band), strides, expected)
+
+
+def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
+    """Its modulus, the median over the sections."""
+    seen = np.isfinite(x) & np.isfinite(y)
+    both = np.where(seen, [x, y], 0.0)
+    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(seen.sum(axis=(0, 1)), 1)
+    x, y = np.where(seen, both - mean, 0.0)
+    xy, xx, yy = ((a * b).sum(axis=(0, 1)) for a, b in ((x, y), (x, x), (y, y)))
+    return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
 
 
 def _list(values) -> str:

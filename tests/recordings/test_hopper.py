@@ -13,6 +13,20 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
     assert fit.compare(hopper_cycle.multipliers).max_error < 2e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
     assert "199.94 cycles" in repr(data)
+    said = hj.advise(data, fit).warnings
+    assert any(w.startswith("Outputs: where sections are crossed, yM and vM") for w in said)
+
+
+def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
+    """At the sections of an angle of the two outputs, these are one number."""
+    noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
+    marked = noisy.mark("apex", "vM", direction="falling", bandwidth=16)
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    data = [hj.section_data(marked, p, **options) for p in (angle, hj.EventPhase("apex"))]
+    fits = [hj.fit_series(x.records, order=2) for x in data]
+    assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
+    assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
+    assert not any(w.startswith("Outputs") for w in hj.advise(data[1], fits[1]).warnings)
 
 
 def test_dirt(hopper_recording, hopper_cycle, angle):
@@ -111,6 +125,7 @@ def test_order_and_advice(hopper_recording, angle):
     order = "Order: the data do not carry 3 multipliers"
     assert any(w.startswith(order) for w in too_many)
     assert not any(w.startswith("Order") for w in advice.warnings)
+    assert not any(w.startswith("Outputs") for w in advice.warnings)
     slow = hj.Recording(
         noisy.trials[0].time,
         {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
