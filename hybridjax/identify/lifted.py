@@ -1,4 +1,4 @@
-r"""The output-error problem cycle by cycle: all sections share one state.
+r"""A part of second order in recorded series: all sections share one state.
 
 With $w[p]$ the inputs of cycle p, a system with d non-zero multipliers obeys
 
@@ -12,7 +12,8 @@ Coordinates of x are free: steps are those of least norm.
 
 A little nonlinearity adds a part of second order, which obeys the same equations with products of
 the first-order state and the input in place of the input (perturbation expansion). Since that state
-is simulated, and free of noise, such products are inputs like others.
+is simulated, and free of noise, such products are inputs like others. They cost many unknowns: the
+estimate counts only where they pay, and the plain one (`regression`) is kept elsewhere.
 """
 
 from typing import Literal, NamedTuple

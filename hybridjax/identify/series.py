@@ -136,10 +136,10 @@ def fit_series(
 
     Output error, with white noise of unknown variance in each output: the sum of squares of the
     difference between measured and simulated outputs is minimised over all numerators, unknown
-    starts and c. It starts from the periodic ARX problem, solved by total least squares (Ljung,
-    *System Identification: Theory for the User*, treats both), and ends in the form in which all
-    sections share one state. Each time all but the denominator is solved for inside (variable
-    projection, Golub and Pereyra 1973).
+    starts and c; all but c is solved for inside (variable projection, Golub and Pereyra 1973). It
+    starts from the periodic ARX problem, solved by total least squares (Ljung, *System
+    Identification: Theory for the User*, treats both). Where `distortion` is allowed for, c comes
+    from the form in which all sections share one state.
 
     **Arguments:**
 
