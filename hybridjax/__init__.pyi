@@ -100,7 +100,8 @@ from .orbits.maps import (
     SectionMap as SectionMap,
     section_map as section_map,
 )
-from .orbits.place import PlacedSections as PlacedSections, place_sections as place_sections
+from .orbits.place import place_sections as place_sections
+from .orbits.placed import PlacedSections as PlacedSections
 from .orbits.sweep import (
     LimitCycles as LimitCycles,
     find_limit_cycles as find_limit_cycles,

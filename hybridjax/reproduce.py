@@ -29,7 +29,8 @@ from .identify.structured import StructuredFit, fit_multipliers
 from .models.hopper import VerticalHopper
 from .orbits.cycle import LimitCycle, find_limit_cycle
 from .orbits.linearize import linearize
-from .orbits.place import PlacedSections, place_sections
+from .orbits.place import place_sections
+from .orbits.placed import PlacedSections
 from .periodic.htf import HTF
 from .periodic.ldtp import LDTP
 from .report import OUTPUTS, summarize, table

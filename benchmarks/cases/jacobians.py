@@ -1,9 +1,11 @@
 """All 32 pairs A, B: in a user's compiled function, by `linearize`, and by heyoka.
 
-`program` is what a fit calls many times: the computation of A and B inside of an outer jit.
-`linearize` is one call from Python, which is compiled quickly and runs slower.
+`program` computes A and B of sections that are placed on a cycle, inside of an outer jit; `placing`
+finds the sections on the cycle first, as a fit does at every step. `linearize` is one call from
+Python, which is compiled quickly and runs slower.
 """
 
+import dataclasses
 import functools as ft
 
 import equinox as eqx
@@ -21,9 +23,13 @@ RTOL = (1e-10, 1e-12)
 
 
 @eqx.filter_jit
-def _program(placed, settings):
-    A, B, _ = _section_jacobians(placed, settings)
-    return A, B
+def _program(placed):
+    return _section_jacobians(placed)
+
+
+@eqx.filter_jit
+def _placing(cycle, family):
+    return _section_jacobians(hj.place_sections(cycle, family))
 
 
 def run(show, options) -> None:
@@ -35,12 +41,15 @@ def run(show, options) -> None:
         for rtol in RTOL:
             name = f"{task.label}.program.rtol_{rtol:.0e}"
             settings = hj.Settings(rtol=rtol, atol=rtol)
-            work = ft.partial(_program, task.placed, settings)
+            cycle = dataclasses.replace(task.cycle, settings=settings)
+            work = ft.partial(_program, hj.place_sections(cycle, task.placed.sections))
             (A, B), compiling, seconds = first_and_later(work, repeat)
             if rtol == RTOL[0]:
                 show(f"{name}.compile", compiling)
             show(f"{name}.cpu", seconds.cpu)
             show(f"{name}.error", _error((A, B), exact))
+            work = ft.partial(_placing, cycle, task.placed.sections)
+            show(f"{task.label}.placing.rtol_{rtol:.0e}.cpu", first_and_later(work, repeat)[2].cpu)
         name = f"{task.label}.linearize"
         work = ft.partial(hj.linearize, task.cycle, task.placed, task.outputs)
         ldtp, compiling, seconds = first_and_later(work, repeat)

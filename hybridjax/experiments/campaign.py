@@ -19,7 +19,8 @@ from .._core.threads import in_threads, thread_count
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import PlacedSections, as_placed
+from ..orbits.place import as_placed
+from ..orbits.placed import PlacedSections
 from ..orbits.plan import Plan, plan_flow
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .._core.results import Result, update_result
 from ..flow.lanes import Lanes, for_each_chart, needed, only
 from ..flow.move import Settings, move
-from ..orbits.place import PlacedSections
+from ..orbits.placed import PlacedSections
 from ..orbits.plan import Plan
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure

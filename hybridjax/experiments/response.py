@@ -12,7 +12,8 @@ from .._core.errors import DefinitionError
 from .._core.precision import require_x64
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
-from ..orbits.place import PlacedSections, as_placed
+from ..orbits.place import as_placed
+from ..orbits.placed import PlacedSections
 from ..orbits.plan import Plan, plan_flow
 from ..systems.output import Output
 from ..systems.structure import Structure

@@ -16,7 +16,7 @@ from .._core.remember import Memory
 from .._core.results import Result
 from ..flow.move import Settings, move
 from ..flow.stride import Stride
-from ..orbits.place import PlacedSections
+from ..orbits.placed import PlacedSections
 from ..orbits.plan import Plan, Planned, plan_flow
 from ..systems.structure import Structure
 

@@ -19,7 +19,8 @@ from ..flow.sections import AbstractSections, as_sections
 from ..identify.values import check_values, weights_of
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import PlacedSections, place_sections
+from ..orbits.place import place_sections
+from ..orbits.placed import PlacedSections
 from ..orbits.plan import Plan
 from ..periodic.htf import HTF
 from ..systems.structure import Structure

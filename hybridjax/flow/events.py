@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.precision import at_precision
@@ -33,9 +34,9 @@ def start_lanes(
 ) -> Lanes:
     """Lanes with fresh bookkeeping. No guard is armed yet: that is done where they set out."""
     L = t.shape[0]
-    pace = jnp.zeros((4, L)).at[1].set(jnp.inf)
-    armed = jnp.zeros((len(s.transitions), L), bool)
-    return Lanes(t, chart, q, armed, jnp.zeros(L, jnp.int32), pace)
+    pace = jnp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), float)
+    armed = jnp.asarray(np.zeros((len(s.transitions), L), bool))
+    return Lanes(t, chart, q, armed, jnp.asarray(np.zeros(L, np.int32)), pace)
 
 
 def width(t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):

@@ -99,6 +99,16 @@ def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     return s
 
 
+def interpolate(x, h, q0, q1, f0, f1):
+    """The cubic at fraction x of a step of length h, from the states at its ends and the fields
+    there. (Of NumPy's arrays as of JAX's.)"""
+    return (
+        q0 * (1 + 2 * x) * (1 - x) ** 2
+        + q1 * x**2 * (3 - 2 * x)
+        + h * x * (1 - x) * (f0 * (1 - x) - f1 * x)
+    )
+
+
 def control_points(v0, v1, d0, d1) -> tuple[jax.Array, ...]:
     """The cubic's Bernstein coefficients: it stays between the smallest and the largest of them."""
     return v0, v0 + d0 / 3, v1 - d1 / 3, v1

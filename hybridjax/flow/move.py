@@ -68,7 +68,7 @@ def move(
     """
     how = _How(False, glide, new_input, False)
     setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, how)
+    return _move(system, lanes, u, target, setout, result, settings, how)[0]
 
 
 def record(
@@ -82,14 +82,13 @@ def record(
     new_input: bool = True,
     tangents: bool = False,
 ) -> tuple[Moved, Tape]:
-    """As `move`, with a record of every step, and without derivatives.
+    """As `move`, with a record of every step, which has no derivatives.
 
     With `tangents`, steps are short enough for the derivatives, too, that a replay will have.
     """
-    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    arguments = system, lanes, u, target, setout, result
     how = _How(True, False, new_input, tangents)
-    return _search(*(_constant(x) for x in arguments), settings, how)
+    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
+    return _move(system, lanes, u, target, setout, result, settings, how)
 
 
 def follow(
@@ -110,10 +109,11 @@ def _defaults(system, lanes, u, target, settings, setout, result):
         setout = stride(setout)
     if result is None:
         result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
-    return _constant(setout), result
+    return constant(setout), result
 
 
-def _constant(tree):
+def constant(tree):
+    """The same numbers without derivatives."""
     return jax.tree_util.tree_map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree
     )
@@ -144,16 +144,17 @@ def _run(system, levels, settings, lanes, u, target, setout, result, how: _How):
 
 @eqx.filter_custom_jvp
 def _move(system, lanes, u, target, setout, result, settings, how: _How):
-    return _search(system, lanes, u, target, setout, result, settings, how)[0]
+    return _search(system, lanes, u, target, setout, result, settings, how)
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
-    go = system, lanes, u, target, settings, setout, result, how.new_input
-    moved, tape = record(*go, tangents=not how.glide)
+    taped = how._replace(tape=True, glide=False, tangents=how.tangents or not how.glide)
+    go = (constant(x) for x in (system, lanes, u, target, setout, result))
+    moved, tape = _search(*go, settings, taped)
 
-    def ends(lane, common):
+    def repeat(lane, common):
         (t, q, u, time), (system, levels) = lane, common
         start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         to = dataclasses.replace(target, time=time, levels=levels)
@@ -162,10 +163,8 @@ def _move_jvp(primals, tangents):
     t_system, t_lanes, t_u, t_target, *_ = tangents
     lane = (lanes.t, lanes.q, u, target.time), (t_lanes.t, t_lanes.q, t_u, t_target.time)
     common = (system, target.levels), (t_system, t_target.levels)
-    (t, q), (t_t, t_q) = lane_jvp(ends, lane, common)
-    out = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (t, q))
+    (t, q), (t_t, t_q) = lane_jvp(repeat, lane, common)
+    ends = lambda x: (x[0].lanes.t, x[0].lanes.q)  # noqa: E731
+    out = eqx.tree_at(ends, (moved, tape if how.tape else None), (t, q))
     nothing = jax.tree_util.tree_map(lambda _: None, out)
-    d_out = eqx.tree_at(
-        lambda x: (x.lanes.t, x.lanes.q), nothing, (t_t, t_q), is_leaf=lambda x: x is None
-    )
-    return out, d_out
+    return out, eqx.tree_at(ends, nothing, (t_t, t_q), is_leaf=lambda x: x is None)

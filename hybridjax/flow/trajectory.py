@@ -18,6 +18,7 @@ from .._core.results import Result
 from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
+from .hermite import interpolate
 from .move import Settings, record
 from .stride import initial_step
 from .tape import IDLE
@@ -83,12 +84,7 @@ class Trajectory(eqx.Module):
         x = np.linspace(0.0, 1.0, per_step + 1)[None, :]
         q0, q1 = self.after[:-1, None], self.before[1:, None]
         d0, d1 = self.slope_after[:-1, None], self.slope_before[1:, None]
-        y, hh = x[..., None], h[..., None]
-        q = (
-            q0 * (1 + 2 * y) * (1 - y) ** 2
-            + q1 * y**2 * (3 - 2 * y)
-            + hh * y * (1 - y) * (d0 * (1 - y) - d1 * y)
-        )
+        q = interpolate(x[..., None], h[..., None], q0, q1, d0, d1)
         t = self.t[:-1, None] + h * x
         chart = np.broadcast_to(self.chart[:-1, None], t.shape)
         keep = np.ones(t.shape, bool)

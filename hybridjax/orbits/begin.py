@@ -14,7 +14,8 @@ from .._core.results import Result
 from ..flow.events import start_lanes
 from ..flow.move import move
 from ..flow.sections import AtEvent, Crossing, ListLevels
-from ..flow.target import toward
+from ..flow.target import Target, toward, until
+from ..flow.watch import slopes, watch
 from ..systems.structure import Structure
 from ..systems.system import Guess
 from ..systems.transition import Scheduled
@@ -73,8 +74,9 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         )
     if section is not None:
         section.check(s)
-    q = jnp.zeros((s.d, 1)).at[: s.dims[a], 0].set(guess.state)
-    lanes = start_lanes(s, guess.time[None], jnp.array([a], jnp.int32), q)
+    q = np.zeros((s.d, 1))
+    q[: s.dims[a], 0] = guess.state
+    lanes = start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
     if settle:
         wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
@@ -85,15 +87,18 @@ def begin(system, guess, section, turns, settle, max_period, settings):
     if period is not None:
         return lanes, None, turns * jnp.asarray(period, float)
     a = int(lanes.chart[0])
-    t, q = lanes.t[0], lanes.q[: s.dims[a], 0]
-    f = s.field(a, t, q, jnp.zeros(s.nu))
-    if not jnp.any(f != 0):
+    q = np.asarray(lanes.q)[: s.dims[a], 0]
+    f, level, rate = jax.device_get(_at_start(system, lanes, section))
+    f = f[: s.dims[a]]
+    if not f.any():
         raise ComputationError(
             f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
             "moves: start elsewhere."
         )
+    on_section = rate < 0 and abs(level) <= -1e-9 * max_period * rate
     if section is None:
-        section = Crossing(_Plane(q, f / jnp.linalg.norm(f)), "rising", charts=(s.names[a],))
+        plane = _Plane(jnp.asarray(q), jnp.asarray(f / np.linalg.norm(f)))
+        section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
 
     def next_meeting(lanes, doing):
@@ -102,7 +107,7 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         _require(moved, f"{doing} ({section})", s)
         return moved.lanes
 
-    if not _is_on(section, s, a, t, q, f, max_period):
+    if not on_section:
         lanes = next_meeting(lanes, "looking for the section")
     back = lanes
     for _ in range(turns):
@@ -110,13 +115,14 @@ def begin(system, guess, section, turns, settle, max_period, settings):
     return lanes, section, back.t[0] - lanes.t[0]
 
 
-def _is_on(section, s: Structure, a: int, t, q, f, span) -> bool:
-    """Whether (t, q) in chart a lies on a section, crossing it the right way."""
-    if isinstance(section, AtEvent) or not section.in_chart(s, a):
-        return False
-    level = lambda t, q: section.level(s, a, t, q)  # noqa: E731
-    value, rate = jax.jvp(level, (t, q), (jnp.ones_like(t), f))
-    return bool((rate < 0) & (jnp.abs(value) <= -1e-9 * span * rate))
+@quick_jit
+def _at_start(system, lanes, section):
+    """The field (d,), and the value and rate of the section's level, if it has one."""
+    s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, u)[:, 0]
+    target = _to_section(section, until(lanes.t))
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, jnp.ones(1, bool))
+    return f, seen.value[-1, 0], seen.rate[-1, 0]
 
 
 def _require(moved, doing: str, s: Structure) -> None:
@@ -135,6 +141,11 @@ def _go(system, lanes, section, target, settings):
     """One lane to a time, or to one section, however many steps it takes."""
     s = Structure(system)
     settings = dataclasses.replace(settings, max_steps=1_000_000)
-    if isinstance(section, Crossing):
-        target = dataclasses.replace(target, levels=ListLevels((section,)))
-    return move(system, lanes, jnp.zeros((s.nu, 1)), target, settings)
+    return move(system, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
+
+
+def _to_section(section, target: Target) -> Target:
+    """The target with the section's level, if it has one."""
+    if not isinstance(section, Crossing):
+        return target
+    return dataclasses.replace(target, levels=ListLevels((section,)))

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64
 from .._core.remember import remembered
@@ -17,7 +18,9 @@ from .._core.tracing import is_traced
 from ..flow.lanes import Lanes
 from ..flow.move import Settings
 from ..flow.sections import AtEvent, Crossing
+from ..flow.target import until
 from ..flow.trajectory import Trajectory, simulate
+from ..flow.watch import slopes, watch
 from ..periodic.multipliers import product_eigenvalues
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
@@ -34,8 +37,8 @@ class LimitCycle(eqx.Module):
     - `start`: the state at which it is anchored, on the section `base` (a clock section at
         `start.t` if `base` is `None`).
     - `legs`: states at the beginnings of the pieces into which the turn is cut.
-    - `factors`, `dims`: Jacobians of the flow over the pieces, padded with zeros. The valid block
-        of `factors[n]` is [:dims[n+1], :dims[n]].
+    - `factors`: Jacobians of the flow over the pieces, padded with zeros. The valid block of
+        `factors[n]` is [:dims[n+1], :dims[n]].
     - `residual`: largest distance between `start` and where it is after one period.
     - `iterations`: Newton steps taken.
     - `result`: a `Result` code.
@@ -50,7 +53,6 @@ class LimitCycle(eqx.Module):
     start: Lanes
     legs: Lanes
     factors: Float[Array, "K d d"]
-    dims: Int[Array, " K"]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     result: Int[Array, ""]
@@ -65,6 +67,12 @@ class LimitCycle(eqx.Module):
         """Whether a clock drives the system."""
         return self.system.period() is not None
 
+    @property
+    def dims(self) -> Int[np.ndarray, " K"]:
+        """Numbers of states at the beginnings of the pieces."""
+        _require_values(self, "dims")
+        return np.array(Structure(self.system).dims)[np.asarray(self.legs.chart)]
+
     @remembered
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, the largest first (on the host).
@@ -74,8 +82,7 @@ class LimitCycle(eqx.Module):
         conserved quantity that the cycle was chosen by stands for a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
-        dims = np.asarray(self.dims)
-        factors = np.asarray(self.factors)
+        dims, factors = self.dims, np.asarray(self.factors)
         after = np.roll(dims, -1)
         blocks = [f[: after[n], : dims[n]] for n, f in enumerate(factors)]
         values = product_eigenvalues(blocks, rtol=1e-9)
@@ -233,14 +240,15 @@ def find_limit_cycle(
     start, period, factors, seen, steps, result = solution
     if not traced:
         order = tuple(int(g) for g in np.ravel(seen.codes) if g >= 0)
-    dims = jnp.array(Structure(system).dims)[seen.legs.chart]
     cycle = LimitCycle(
-        system, base, period, start, seen.legs, factors, dims, seen.distance, steps, result,
-        order, settings, conserved, turns,
+        system, base, period, start, seen.legs, factors, seen.distance, steps, result, order,
+        settings, conserved, turns,
     )  # fmt: skip
     if not traced and int(result) in (Result.OK, Result.SINGULAR):
-        _check_clock(cycle)
-        _check_conserved(cycle)
+        if clocked:
+            _check_clock(cycle)
+        if conserved:
+            _check_conserved(cycle)
     if not traced and throw and (code := Result(int(result))) != Result.OK:
         raise ComputationError(_explain(cycle, code))
     return cycle
@@ -276,27 +284,32 @@ def _check_conserved(cycle: LimitCycle) -> None:
 
 def _check_clock(cycle: LimitCycle) -> None:
     """Raise where the cycle of a clocked system is not what it seems to be."""
-    if not cycle.clocked:
-        return
     s, system = Structure(cycle.system), cycle.system
-    a = int(cycle.start.chart[0])
-    t, q, u = cycle.start.t[0], cycle.start.q[: s.dims[a], 0], jnp.zeros(s.nu)
-    f = s.field(a, t, q, u)
-    later = s.field(a, t + cycle.period, q, u)
+    a, t = int(cycle.start.chart[0]), float(cycle.start.t[0])
+    f, later, guards, rates = jax.device_get(_at_start(cycle))
+    f, later = f[: s.dims[a]], later[: s.dims[a]]
     if not np.allclose(f, later, rtol=1e-6, atol=1e-9):
         raise ComputationError(
             f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "
-            f"that {type(system).__name__}.period() states: at t = {float(t):.6g} it is {f}, one "
-            f"period later {later}."
+            f"that {type(system).__name__}.period() states: at t = {t:.6g} it is {f}, one period "
+            f"later {later}."
         )
-    for g in s.guards(a):
-        guard = lambda t, q, g=g: s.guard(g, t, q, u)  # noqa: E731
-        value, rate = jax.jvp(guard, (t, q), (jnp.ones_like(t), f))
-        if float(rate) < 0 and abs(float(value)) <= 1e-9 * float(cycle.period) * -float(rate):
-            raise ComputationError(
-                f"the search begins exactly at the event '{s.transitions[g].name}', which may or "
-                "may not belong to the turn: give a guess at another time."
-            )
+    due = (rates < 0) & (np.abs(guards) <= -1e-9 * float(cycle.period) * rates)
+    if due.any():
+        raise ComputationError(
+            f"the search begins exactly at the event '{s.transitions[int(np.argmax(due))].name}', "
+            "which may or may not belong to the turn: give a guess at another time."
+        )
+
+
+@quick_jit
+def _at_start(cycle: LimitCycle):
+    """The field at the start (d,) and one period later, the guards there (G,) and their rates."""
+    s, start = Structure(cycle.system), cycle.start
+    u, later = jnp.zeros((s.nu, 1)), start.t + cycle.period
+    f = [slopes(s, t, start.chart, start.q, u)[:, 0] for t in (start.t, later)]
+    seen = watch(s, start.t, start.chart, start.q, u, until(start.t), jnp.ones(1, bool))
+    return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
 
 
 def _explain(cycle: LimitCycle, code: Result) -> str:

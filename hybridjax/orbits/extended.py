@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from ..flow.lanes import Lanes
-from ..flow.move import Settings, follow, record
+from ..flow.move import Settings, constant, follow, record
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .return_map import ReturnMap, across, departure, held, turn
@@ -61,9 +61,8 @@ def go_round(
 
     def flow(system, lanes, target, settings, h, result):
         u = jnp.zeros((s.nu, 1))
-        moved, tape = record(
-            system, lanes, u, target, settings, h, result, new_input=False, tangents=True
-        )
+        go = constant((system, lanes, u, target))
+        moved, tape = record(*go, settings, h, result, new_input=False, tangents=True)
 
         def end(q, step):
             grown = 1 + rate * step

@@ -245,9 +245,8 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
     r = jax.tree_util.tree_map(stack, *(p.round for p in points))
-    dims = np.array(curve.structure.dims)[r.legs.chart]
     return LimitCycles(
-        systems, cycle.base, r.period, r.start, r.legs, r.factors, dims,
+        systems, cycle.base, r.period, r.start, r.legs, r.factors,
         np.max(np.abs(r.residual), axis=1), np.array([p.steps for p in points]),
         np.zeros(len(points), np.int32), front(r.codes.reshape(len(points), -1)),
         cycle.settings, cycle.conserved, cycle.turns,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from ..flow.batching import vmap_to_lanes
 from ..flow.lanes import Lanes
-from ..flow.move import Moved, Settings, follow, record
+from ..flow.move import Moved, Settings, constant, follow, record
 from ..flow.tape import Tape
 from ..flow.target import Target
 from ..systems.structure import Structure
@@ -36,10 +36,20 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
-    moved, tape = record(system, lanes, zero, target, settings, h, result, new_input, True)
-    columns, end = _push(system, lanes, target, tape, of_states)
+    go = constant((system, lanes, zero, target))
+    moved, tape = record(*go, settings, h, result, new_input, tangents=True)
+    jacobian, end = tape_jacobian(system, lanes, target, tape, of_states)
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
-    return columns.transpose(2, 1, 0), moved, tape
+    return jacobian, moved, tape
+
+
+def tape_jacobian(
+    system: HybridSystem, lanes: Lanes, target: Target, tape: Tape, of_states: bool = False
+) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
+    """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
+    (t, q) at the targets."""
+    columns, end = _push(system, lanes, target, tape, of_states)
+    return columns.transpose(2, 1, 0), end
 
 
 def _columns(system, lanes, target, tape, of_states):

@@ -1,6 +1,5 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.compile import quick_jit
-from .._core.errors import ComputationError, DefinitionError
+from .._core.errors import DefinitionError
 from .._core.lanewise import by_lane
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -17,8 +16,9 @@ from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Structure
 from .cycle import LimitCycle
-from .jacobian import flow_jacobian
-from .place import PATIENCE, PlacedSections, as_placed
+from .jacobian import tape_jacobian
+from .place import as_placed
+from .placed import PlacedSections
 
 
 def linearize(
@@ -61,14 +61,12 @@ def linearize(
                 f"there is no input '{name}'; inputs are {', '.join(cycle.system.inputs)}."
             )
     columns = np.array([cycle.system.inputs.index(n) for n in names], int)
-    A, B, result = _section_jacobians(placed, cycle.settings)
-    if not traced and np.any(result != Result.OK):
-        n = int(np.argmax(np.asarray(result) != Result.OK))
-        raise ComputationError(
-            f"the flow from section {n} to the next one failed: {Result(int(result[n])).message}."
-        )
+    A, B = _section_jacobians(placed)
     C, D = _output_jacobians(placed, tuple(z.items))
-    d = s.d + 1 if traced else int(np.max(placed.dims))
+    d = s.d + 1
+    if not traced:
+        A, B, C, D = jax.device_get((A, B, C, D))
+        d = int(np.max(np.asarray(placed.dims)))
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
         inputs=tuple(names), outputs=z.names,
@@ -81,19 +79,15 @@ def _as_tuple(names):
 
 
 @quick_jit
-def _section_jacobians(placed: PlacedSections, settings):
-    """A (N, c, c) and B (N, c, nu), padded, NaN where the flow failed; and its result codes."""
-    N, n = placed.count, 1 + placed.lanes.q.shape[0]
-    following = (jnp.arange(N) + 1) % N
-    turns = jnp.where(following == 0, 1, 0)
-    target = placed.target(following, placed.lanes.t, turns)
-    settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
-    h = 1.05 * placed.duration  # one step to each section, where that is accurate enough
-    jacobian, moved, _ = flow_jacobian(placed.cycle.system, placed.lanes, target, settings, h)
-    jacobian = jnp.where((moved.result == Result.OK)[:, None, None], jacobian, jnp.nan)
+def _section_jacobians(placed: PlacedSections):
+    """A (N, c, c) and B (N, c, nu), padded; NaN where the flow failed."""
+    n = 1 + placed.lanes.q.shape[0]
+    following, _, target = placed.onwards()
+    jacobian, _ = tape_jacobian(placed.cycle.system, placed.lanes, target, placed.tape)
+    jacobian = jnp.where((placed.result == Result.OK)[:, None, None], jacobian, jnp.nan)
     embed, select = placed.frames()
     after = select[following]
-    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:], moved.result
+    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
 
 @quick_jit

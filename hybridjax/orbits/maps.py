@@ -15,7 +15,8 @@ from .._core.tracing import is_traced
 from ..flow.move import move
 from ..systems.structure import Structure
 from .cycle import LimitCycle
-from .place import PlacedSections, as_placed
+from .place import as_placed
+from .placed import PlacedSections
 
 
 class Arrival(NamedTuple):

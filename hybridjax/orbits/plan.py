@@ -22,7 +22,8 @@ from ..flow.move import Settings, move
 from ..flow.stride import Stride
 from ..flow.watch import watch
 from ..systems.structure import Structure
-from .place import PATIENCE, PlacedSections
+from .place import PATIENCE
+from .placed import PlacedSections
 
 
 # Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
@@ -81,9 +82,8 @@ def make_plan(
     K = len(_PIECES) + len(_PARTS)
     patience = max(settings.max_steps, PATIENCE)
     section = jnp.arange(N)
-    following = (section + 1) % N
-    turns = (following == 0).astype(jnp.int32)
-    lead = _lead(placed, following, turns)
+    following, _, target = placed.onwards()
+    lead = _lead(placed, target)
     by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
     longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
 
@@ -93,7 +93,6 @@ def make_plan(
     divide = jnp.array([*_PIECES, *[_PIECES[-1]] * len(_PARTS), *[2] * (1 + n)])
     slack = jnp.array([*[jnp.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
     rtol = jnp.where(jnp.isfinite(slack) & (jnp.arange(len(slack)) < K), settings.rtol, _TIGHT)
-    target = placed.target(following, placed.lanes.t, turns)
     u = jnp.zeros((len(placed.cycle.system.inputs), N))
 
     def block(xs):
@@ -143,11 +142,10 @@ def _cheapest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
     return jnp.where(enough.any(axis=0), jnp.argmax(enough, axis=0), jnp.argmin(impact, axis=0))
 
 
-def _lead(placed: PlacedSections, following, turns):
+def _lead(placed: PlacedSections, target):
     """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
     s, lanes = Structure(placed.cycle.system), placed.lanes
     N = placed.count
-    target = placed.target(following, lanes.t, turns)
     everywhere = jnp.ones(N, bool)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)), target, everywhere)
     value, rate = seen.value[-1], seen.rate[-1]

@@ -26,8 +26,8 @@ class LimitCycles(eqx.Module):
 
     **Fields**, with the systems on the first axis:
 
-    - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`,
-        `dims`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`:
+        see `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
     `base`, `settings`, `conserved` and `turns` are those of every cycle.
@@ -39,7 +39,6 @@ class LimitCycles(eqx.Module):
     start: Lanes
     legs: Lanes
     factors: Float[np.ndarray, "S K d d"]
-    dims: Int[np.ndarray, "S K"]
     residual: Float[np.ndarray, " S"]
     iterations: Int[np.ndarray, " S"]
     result: Int[np.ndarray, " S"]
@@ -57,8 +56,8 @@ class LimitCycles(eqx.Module):
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
             eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.start),
-            pick(self.legs), pick(self.factors), pick(self.dims), pick(self.residual),
-            pick(self.iterations), pick(self.result),
+            pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
+            pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
             self.conserved, self.turns,
         )  # fmt: skip
@@ -149,7 +148,7 @@ def find_limit_cycles(
     found = tiles.solve(S, progress)
     seen = found.seen
     return LimitCycles(
-        systems, guess.base, found.period, found.start, seen.legs, found.factors, found.dims,
+        systems, guess.base, found.period, found.start, seen.legs, found.factors,
         seen.distance, found.steps, found.result, seen.codes, settings, guess.conserved,
         guess.turns,
     )  # fmt: skip

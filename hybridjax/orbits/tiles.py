@@ -40,7 +40,6 @@ class Rounds(NamedTuple):
     seen: Turn
     """With all codes of events of a turn in one row."""
     result: Int[np.ndarray, " S"]
-    dims: Int[np.ndarray, "S K"]
     steps: Int[np.ndarray, " S"]
 
 
@@ -202,8 +201,7 @@ def _step(systems, guess: LimitCycle, start: Lanes, period, settings) -> Rounds:
         start, expected = _on_clock(system, guess, start, expected)
         kind = ReturnMap(guess.base, guess.conserved, guess.turns)
         *found, seen, code = newton_step(system, start, kind, expected, settings)
-        dims = jnp.array(Structure(system).dims)[seen.legs.chart]
-        return Rounds(*found, seen, code, dims, jnp.array(1))
+        return Rounds(*found, seen, code, jnp.array(1))
 
     return eqx.filter_vmap(one)(systems, start, period)
 

@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 from .._core.errors import DefinitionError
 from ..flow.trajectory import Trajectory
 from ..orbits.cycle import LimitCycle
-from ..orbits.place import PlacedSections
+from ..orbits.placed import PlacedSections
 from ..systems.structure import Structure
 from .look import COLORS, axes_or_new, label_of
 
