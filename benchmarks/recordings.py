@@ -98,10 +98,20 @@ def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
                 f"{name:5s} {share:3g}: rms error {rms(found):.1e}, said {rms(said):.1e}",
                 flush=True,
             )
+    print(f"what all samples would tell if the hopper were linear: {bound(strides, noise):.1e}")
 
 
-def rms(values):
-    return np.sqrt(np.mean(np.square(values)))
+def bound(strides, noise, sections=32, seed=0):
+    """The standard error from all samples of the linearised hopper, as means over sections."""
+    rate = 16 * sections
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    placed = hj.place_sections(cycle, hj.ClockPhase(sections))
+    force = hj.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=seed)
+    u = force.reshape(-1, 16, 1).mean(axis=1)
+    y = np.array(hj.linearize(cycle, placed, ("yM", "vM")).simulate(u))
+    y += noise * np.sqrt(sections / RATE) * np.random.default_rng(seed).normal(size=y.shape)
+    record = hj.Record(u, y, sections=sections)
+    return hj.fit_series(record, 2, errors="white", distortion=False).standard_errors[0]
 
 
 def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16, phases=tuple(PHASES)):
