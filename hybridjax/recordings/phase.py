@@ -28,8 +28,8 @@ class AnglePhase(eqx.Module):
     """Phase as the angle of two signals, a position and its velocity, say, around a centre.
 
     The angle of `(position - o_p) / s_p + i (velocity - o_v) / s_v`, counted in the sense in which
-    it turns. Section 0 lies at `start`. At its sections the two signals are two sides of one number:
-    as outputs they tell less than at those of an `EventPhase`.
+    it turns. Section 0 lies at `start`. At its sections the two signals are two sides of one
+    number: as outputs they tell less than at those of an `EventPhase`.
 
     **Fields:**
 
