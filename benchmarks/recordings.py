@@ -114,6 +114,10 @@ def bound(strides, noise, sections=32, seed=0):
     return hj.fit_series(record, 2, errors="white", distortion=False).standard_errors[0]
 
 
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
 def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16, phases=tuple(PHASES)):
     print(
         f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {sections} sections, "
