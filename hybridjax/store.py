@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from ._core.errors import DefinitionError, FileFormatError
-from .experiments.campaign import Campaign, divide, prepare
+from .experiments.campaign import Campaign, chunks, prepare
 from .experiments.data import ExperimentData, summary
 from .experiments.design import Design
-from .experiments.run import CHUNK, chunks
+from .experiments.run import CHUNK
 from .io import load, save
 from .orbits.cycle import LimitCycle
 from .systems.output import Output
@@ -70,15 +70,15 @@ def store_experiments(
     rank, size = share
     if not 0 <= rank < size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
-    campaign = prepare(cycle, sections, design, outputs, **options)
+    about = dict(chunk=chunk, batch=batch, workers=workers)
+    campaign = prepare(cycle, sections, design, outputs, **about, **options)
     parts = chunks(campaign.count, chunk)
-    together, workers = divide(parts[0].stop, batch, workers, campaign.precision)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
     missing = [k for k in stored.missing() if k % size == rank]
     for k in tqdm(missing, "chunks", disable=not progress):
-        save(stored.path(k), campaign.run(parts[k], together, workers))
+        save(stored.path(k), campaign.run(parts[k]))
     return stored
 
 

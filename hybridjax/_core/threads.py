@@ -29,12 +29,24 @@ def thread_count(workers: int | None) -> int:
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
     """`work` of each item, in order, under the caller's configuration of JAX."""
+    with ThreadPoolExecutor(workers) as pool:
+        yield from pool.map(_configured(work), items)
+
+
+def meanwhile(work: Callable[[], Any]) -> None:
+    """Begin with `work` in a thread of its own, under the caller's configuration of JAX. What it
+    returns or raises is lost: it only makes ready what will be asked for again."""
+    pool = ThreadPoolExecutor(1)
+    pool.submit(_configured(work))
+    pool.shutdown(wait=False)
+
+
+def _configured(work):
     device = jax.config.jax_default_device  # which other threads would not know
 
-    def configured(item):
+    def configured(*arguments):
         require_x64()
         with jax.default_device(device):
-            return work(item)
+            return work(*arguments)
 
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(configured, items)
+    return configured

@@ -1,6 +1,7 @@
 """Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
 
 import dataclasses
+import functools as ft
 import threading
 from collections.abc import Mapping, Sequence
 
@@ -15,13 +16,13 @@ from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
-from .._core.threads import in_threads, thread_count
+from .._core.threads import in_threads, meanwhile, thread_count
 from ..flow.move import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.linearize import linearize
-from ..orbits.place import as_placed
+from ..orbits.place import PATIENCE, as_placed
 from ..orbits.placed import PlacedSections
-from ..orbits.plan import Plan, plan_flow
+from ..orbits.plan import Plan, check_accuracy, plan_flow
 from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
@@ -63,6 +64,10 @@ class Campaign:
     plan: Plan
     model: LDTP | None
     """Predicts the start of a periodic response; None to start on the cycle."""
+    size: int
+    """Experiments in one compiled call."""
+    workers: int
+    """Threads that run calls at the same time."""
 
     def inputs(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
         """The inputs of some experiments."""
@@ -70,9 +75,9 @@ class Campaign:
             return self.source.inputs(self.cycles, rows)
         return np.asarray(self.source[rows], float)
 
-    def run(self, rows: slice, size: int, workers: int, progress: bool = False) -> ExperimentData:
-        """Run some of the experiments, in batches of `size` on so many threads (see `divide`)."""
-        N = self.placed.count
+    def run(self, rows: slice, progress: bool = False) -> ExperimentData:
+        """Run some of the experiments."""
+        N, size = self.placed.count, self.size
         u = self.inputs(rows)
         S = len(u)
         start = self._start(u)
@@ -94,7 +99,7 @@ class Campaign:
                     part = _once_compiled(*single(arguments))
             return [np.asarray(x)[: S - k] for x in part]
 
-        parts = in_threads(work, range(0, S, size), workers)
+        parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
         y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
         y, error = y.astype(float), error.astype(float) + self.rounding
@@ -149,6 +154,15 @@ def _once_compiled(*arguments):
     return out
 
 
+def _compile(placed: PlacedSections, shape, outputs) -> None:
+    """Compile `_respond` before the plan is known, by experiments that fail where they begin."""
+    N, n = placed.count, 1 + placed.lanes.q.shape[0]
+    plan = Plan(*np.zeros((4, N)))
+    nowhere = np.full((n, shape[0]), np.nan)
+    plan, nowhere, u = jax.tree_util.tree_map(jnp.asarray, (plan, nowhere, np.zeros(shape)))
+    _once_compiled(placed, plan, nowhere, u, outputs, Settings(1.0, 1.0, PATIENCE))
+
+
 def prepare(
     cycle: LimitCycle,
     sections,
@@ -161,8 +175,14 @@ def prepare(
     accuracy: float | None = None,
     scale: Mapping[str, float] | None = None,
     precision: str = "double",
+    chunk: int | None = None,
+    batch: int | None = None,
+    workers: int | None = None,
 ) -> Campaign:
-    """Check what `run_experiments` was given, and do what is done once for all experiments."""
+    """Check what `run_experiments` was given, and do what is done once for all experiments.
+
+    `chunk`: how many of them are run together; by default all.
+    """
     placed = as_placed(cycle, sections)
     require_x64(cycle)
     z = Structure(cycle.system).resolve_outputs(outputs)
@@ -193,16 +213,31 @@ def prepare(
                 "a periodic start needs inputs of a whole number of windows: use `discard=0`."
             )
         model = linearize(cycle, placed, outputs=[Output("t", lambda t, q, u: t)])
+    together = count if chunk is None else chunks(count, chunk)[0].stop
+    size, workers = divide(together, batch, workers, precision)
     accuracy = _ACCURACY[precision] if accuracy is None else float(accuracy)
+    check_accuracy(accuracy)
     if precision == "double":
+        shape = size, cycles * placed.count, nu
+        meanwhile(ft.partial(_compile, placed, shape, tuple(z.items)))
         planned, rounding = plan_flow(placed, accuracy, scale), 0.0
     else:
         planned, rounding = plan_single(placed, accuracy, scale)
     plan, settings, scales = planned
     return Campaign(
         placed, source, count, cycles, periods, z, accuracy, precision, rounding, scales, settings,
-        plan, model,
+        plan, model, size, workers,
     )  # fmt: skip
+
+
+def chunks(count: int, chunk: int) -> list[slice]:
+    """Consecutive parts of `count` experiments, all but the last of the size `chunk`.
+
+    **Raises:** `DefinitionError` if `chunk` is not positive.
+    """
+    if chunk < 1:
+        raise DefinitionError(f"chunk is the number of experiments of one part, not {chunk}.")
+    return [slice(k, min(k + chunk, count)) for k in range(0, count, chunk)]
 
 
 def divide(

@@ -5,10 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
-from .campaign import divide, prepare
+from .campaign import chunks, prepare
 from .data import ExperimentData
 from .design import Design
 from .variation import vary
@@ -79,10 +78,9 @@ def run_experiments(
     campaign = _prepare(
         cycle, sections, design, outputs, start=start, discard=discard, periods=periods,
         process_noise=process_noise, seed=seed, accuracy=accuracy, scale=scale,
-        precision=precision,
+        precision=precision, batch=batch, workers=workers,
     )  # fmt: skip
-    size, workers = divide(campaign.count, batch, workers, campaign.precision)
-    return campaign.run(slice(0, campaign.count), size, workers, progress)
+    return campaign.run(slice(0, campaign.count), progress)
 
 
 def stream_experiments(
@@ -110,10 +108,9 @@ def stream_experiments(
 
     **Raises:** as `run_experiments`, at once.
     """
-    campaign = _prepare(cycle, sections, design, outputs, **options)
-    parts = chunks(campaign.count, chunk)
-    size, workers = divide(parts[0].stop, batch, workers, campaign.precision)
-    return (campaign.run(rows, size, workers) for rows in parts)
+    about = dict(chunk=chunk, batch=batch, workers=workers)
+    campaign = _prepare(cycle, sections, design, outputs, **about, **options)
+    return map(campaign.run, chunks(campaign.count, chunk))
 
 
 def _prepare(*arguments, start="cycle", process_noise=0.0, seed=0, **options):
@@ -121,13 +118,3 @@ def _prepare(*arguments, start="cycle", process_noise=0.0, seed=0, **options):
     steady = start == "steady"
     start = "periodic" if steady else start
     return vary(prepare(*arguments, start=start, **options), steady, process_noise, seed)
-
-
-def chunks(count: int, chunk: int) -> list[slice]:
-    """Consecutive parts of `count` experiments, all but the last of the size `chunk`.
-
-    **Raises:** `DefinitionError` if `chunk` is not positive.
-    """
-    if chunk < 1:
-        raise DefinitionError(f"chunk is the number of experiments of one part, not {chunk}.")
-    return [slice(k, min(k + chunk, count)) for k in range(0, count, chunk)]

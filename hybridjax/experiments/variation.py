@@ -34,20 +34,20 @@ class Variation(Campaign):
     process_noise: float
     seed: int
 
-    def run(self, rows: slice, size: int, workers: int, progress: bool = False) -> ExperimentData:
+    def run(self, rows: slice, progress: bool = False) -> ExperimentData:
         u = self.inputs(rows)
         begin = self._start(u)
         if self.steady:
-            begin = self._settle(u, begin, size, workers, rows.start)
+            begin = self._settle(u, begin, rows.start)
         kicks = draw_process_noise(u.shape, self.process_noise, self.seed, rows.start)
-        data = self._given(u + kicks, begin).run(slice(0, len(u)), size, workers, progress)
+        data = self._given(u + kicks, begin).run(slice(0, len(u)), progress)
         return dataclasses.replace(data, u=u) if self.process_noise else data
 
     def _given(self, u, begin, **changes) -> Given:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(Campaign)}
         return Given(**fields | dict(source=u, count=len(u)) | changes, begin=begin)
 
-    def _settle(self, u, begin, size: int, workers: int, first: int):
+    def _settle(self, u, begin, first: int):
         r"""Starts from which the responses repeat after P periods: zeros of $F(x) - x$.
 
         Newton's method with the Jacobian of the linearisation, $\Phi^P$, as precise as the response
@@ -66,7 +66,7 @@ class Variation(Campaign):
         scale = np.asarray(self.scales[0])[:, None]
         for _ in range(_MOST):
             run = self._given(once, begin, outputs=outputs)
-            data = run.run(slice(0, len(u)), size, workers)
+            data = run.run(slice(0, len(u)))
             defect = np.where(data.ok, cycle + data.y[:, N * P].T - begin, 0.0)
             if not embed[0].any():  # time is no state, and an autonomous system may gain or lose it
                 defect[0] = 0.0

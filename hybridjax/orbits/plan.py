@@ -218,6 +218,12 @@ class Planned(NamedTuple):
 _made = Memory()
 
 
+def check_accuracy(accuracy: float) -> None:
+    """**Raises:** `DefinitionError` for an accuracy that no plan has."""
+    if not 1e-13 <= accuracy <= 1e-2:
+        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
+
+
 def plan_flow(
     placed: PlacedSections, accuracy: float, scale: Mapping[str, float] | None = None
 ) -> Planned:
@@ -225,8 +231,7 @@ def plan_flow(
 
     **Raises:** `DefinitionError` for an accuracy out of range, or scales of unknown states.
     """
-    if not 1e-13 <= accuracy <= 1e-2:
-        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
+    check_accuracy(accuracy)
 
     def make() -> Planned:
         scales = section_scales(placed, scale)

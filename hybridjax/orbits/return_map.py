@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
@@ -84,28 +85,35 @@ def solve(
     """
     q, seen, steps = _root(system, start, kind, expected, settings, damped, max_steps)
     if follow:
-        _, seen, _ = _turn_with_jacobian(q, system, start, kind, expected, settings)
-    period, factors, code = _judged(q, seen, system, start, kind, expected, settings)
-    lanes = departure(Structure(system), q, start, kind.base, expected)
+        _, seen, _ = turn_with_jacobian(q, system, start, kind, expected, settings)
+    lanes, period, factors, code = judge(q, seen, system, start, kind, expected, settings)
     return lanes, period, factors, seen, steps, code
 
 
-def newton_step(system, start: Lanes, kind: ReturnMap, expected, settings):
-    """One step of Newton's method from a start: where it leads to, its largest part relative to
-    the tolerance of `solve`, and what was seen on the turn before it, as `solve` returns it."""
-    q = start.q[:, 0]
-    residual, seen, jacobian = _turn_with_jacobian(q, system, start, kind, expected, settings)
-    step = -lx.linear_solve(lx.MatrixLinearOperator(jacobian), residual, _SOLVER, throw=False).value
-    size = jnp.max(jnp.abs(step) / (_ATOL + _RTOL * jnp.abs(q)))
-    period, factors, code = _judged(q, seen, system, start, kind, expected, settings)
-    lanes = departure(Structure(system), q + step, start, kind.base, expected)
-    return lanes, size, period, factors, seen, code
+def newton_step(
+    q: Float[np.ndarray, "S d"],
+    residual: Float[np.ndarray, "S d"],
+    jacobian: Float[np.ndarray, "S d d"],
+) -> tuple[Float[np.ndarray, "S d"], Float[np.ndarray, " S"]]:
+    """Where Newton's steps from S states lead to, and the largest part of each relative to the
+    tolerance of `solve`; NaN where the turn failed. On the host."""
+    step = np.full(q.shape, np.nan)
+    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    inverse = np.linalg.pinv(jacobian[good], rcond=_SINGULAR)
+    step[good] = -(inverse @ residual[good, :, None])[..., 0]
+    return q + step, np.max(np.abs(step) / (_ATOL + _RTOL * np.abs(q)), axis=1)
 
 
-def _judged(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, settings):
-    """The period, the factors of the monodromy, and whether q lies on a cycle."""
+def closes(q, seen: Turn):
+    """Whether a turn from q came back to it. (Of NumPy's arrays as of JAX's.)"""
+    return seen.distance <= 1e-8 * (1 + abs(q).max(axis=-1))
+
+
+def judge(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, settings):
+    """The lane at q, the period, the factors of the monodromy, and whether q lies on a cycle."""
     s = Structure(system)
     n = s.d
+    lanes = departure(s, q, start, kind.base, expected)
     valid = jnp.arange(n) < jnp.array(s.dims)[start.chart[0]]
     period = expected if kind.base is None else seen.period
     factors = seen.factors
@@ -115,7 +123,7 @@ def _judged(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, sett
     _, hold = held(s, q, start, kind)
     singular = jnp.linalg.svd(monodromy - jnp.diag(valid * 1.0) - hold, compute_uv=False)
     smallest = jnp.min(jnp.where(jnp.arange(n) < valid.sum(), singular, jnp.inf))
-    good = jnp.isfinite(seen.distance) & (seen.distance <= 1e-8 * (1 + jnp.max(jnp.abs(q))))
+    good = closes(q, seen)
     code = jnp.where(seen.result == Result.OK, Result.NOT_CONVERGED, seen.result)
     code = jnp.where(good, jnp.where(smallest < _SINGULAR, Result.SINGULAR, Result.OK), code)
     if kind.base is not None:
@@ -124,7 +132,7 @@ def _judged(q, seen: Turn, system, start: Lanes, kind: ReturnMap, expected, sett
         still = jnp.max(apart) <= 1e3 * jnp.maximum(settings.atol, seen.distance)
         code = jnp.where(good & (seen.meetings > kind.turns), Result.EXTRA_TURNS, code)
         code = jnp.where(good & still, Result.EQUILIBRIUM, code)
-    return period, factors, code.astype(jnp.int32)
+    return lanes, period, factors, code.astype(jnp.int32)
 
 
 @eqx.filter_custom_jvp
@@ -157,7 +165,7 @@ def _root_jvp(primals, tangents):
         return turn(q, system, start, kind, expected, settings, _flow)[0]
 
     _, by_parameters = eqx.filter_jvp(residual, tuple(parameters), tuple(tangents[:4]))
-    jacobian = lx.MatrixLinearOperator(_turn_with_jacobian(q, *parameters, settings)[2])
+    jacobian = lx.MatrixLinearOperator(turn_with_jacobian(q, *parameters, settings)[2])
     t_q = -lx.linear_solve(jacobian, by_parameters, _SOLVER, throw=False).value
     nothing = jax.tree_util.tree_map(lambda _: None, (seen, steps))
     return (q, seen, steps), (t_q, *nothing)
@@ -169,11 +177,12 @@ def _residual(q, system, start, base, expected, settings):
     The Jacobian comes with the value, so that the turn need not be traced again for it.
     """
     fixed = jax.lax.stop_gradient(q)
-    residual, seen, jacobian = _turn_with_jacobian(fixed, system, start, base, expected, settings)
+    residual, seen, jacobian = turn_with_jacobian(fixed, system, start, base, expected, settings)
     return residual + jacobian @ (q - fixed), seen
 
 
-def _turn_with_jacobian(q, system, start, kind, expected, settings):
+def turn_with_jacobian(q, system, start, kind, expected, settings):
+    """P(q) - q, what was seen on the way, and the Jacobian."""
     residual, end, result, (legs, jacobians, codes) = turn(
         q, system, start, kind, expected, settings, _flow_with_jacobian
     )

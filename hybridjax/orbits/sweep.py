@@ -149,7 +149,7 @@ def find_limit_cycles(
     seen = found.seen
     return LimitCycles(
         systems, guess.base, found.period, found.start, seen.legs, found.factors,
-        seen.distance, found.steps, found.result, seen.codes, settings, guess.conserved,
+        seen.distance, found.steps, found.result, found.codes, settings, guess.conserved,
         guess.turns,
     )  # fmt: skip
 

@@ -18,11 +18,12 @@ from ..flow.sections import AtEvent, ListLevels
 from ..flow.target import toward, until
 from ..systems.structure import Structure
 from .cycle import LimitCycle
-from .return_map import ReturnMap, Turn, newton_step
+from .return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_jacobian
 
 
-# Newton steps before a system is given up, or tried again.
-_NEWTON = 8
+# Newton steps before a system is given up, or tried again; and before it is left until those that
+# need more steps than most go on together.
+_NEWTON, _USUAL = 8, 4
 # Periods for which a system flows freely before Newton tries again.
 _SETTLE = 40
 # Up to this many parameters, guesses from neighbours are quadratic.
@@ -34,11 +35,14 @@ class Rounds(NamedTuple):
 
     start: Lanes
     size: Float[np.ndarray, " S"]
-    """Of that step, relative to the tolerance."""
+    """Of that step, relative to the tolerance; infinite where the turn was too long, NaN where it
+    failed."""
     period: Float[np.ndarray, " S"]
     factors: Float[np.ndarray, "S K d d"]
     seen: Turn
-    """With all codes of events of a turn in one row."""
+    """Without the codes of events,"""
+    codes: Int[np.ndarray, "S E"]
+    """which stand here, filled up with -1."""
     result: Int[np.ndarray, " S"]
     steps: Int[np.ndarray, " S"]
 
@@ -75,14 +79,18 @@ class Tiles(NamedTuple):
         order = np.random.default_rng(0).permutation(S)
         bar = tqdm(total=S, disable=not progress, desc="cycles")
         rows = order[: self.size]
-        out = self._again(rows, self._newton(rows, *self._given(len(rows))))
+        out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
         bar.update(len(rows))
         while (done := len(out.result)) < S:
             rows = order[done : 2 * done]
             guesses = self._by_neighbours(parameters[order[:done]], out, parameters[rows])
-            out = _join(out, self._newton(rows, *guesses))
+            out = _join(out, self._newton(rows, *guesses, _USUAL))
             bar.update(len(rows))
         bar.close()
+        late = np.flatnonzero(out.size > 1)
+        if len(late):
+            start, period = _pick((out.start, out.period), late)
+            out = _replace(out, late, self._newton(order[late], start, period, _NEWTON))
         return _pick(self._again(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
@@ -96,12 +104,12 @@ class Tiles(NamedTuple):
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
-        begin = self._in_tiles(_settled, rows[failed], *self._given(len(failed)))
+        begin = self._in_tiles(_settled, self._threads, rows[failed], *self._given(len(failed)))
         there = np.isfinite(begin[0].q).all(axis=(1, 2))
         if not there.any():
             return out
         failed, begin = failed[there], _pick(begin, there)
-        return _replace(out, failed, self._newton(rows[failed], *begin))
+        return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
 
     def _by_neighbours(self, known, out: Rounds, wanted) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         """The cycle of the nearest system, moved as those around it in the same chart suggest."""
@@ -122,32 +130,49 @@ class Tiles(NamedTuple):
         guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
         return eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :-1, None]), guess[:, -1]
 
-    def _newton(self, rows, start: Lanes, period) -> Rounds:
+    def _newton(self, rows, start: Lanes, period, steps: int) -> Rounds:
         """Newton's method; systems that are done make room for others."""
-        out, period = self._in_tiles(_step, rows, start, period), period.copy()
-        for _ in range(_NEWTON - 1):
-            extra = out.result == Result.EXTRA_TURNS
-            once = out.seen.period[extra] / out.seen.meetings[extra]
-            period[extra] = self.guess.turns * once
-            going = np.flatnonzero(np.isfinite(out.size) & ((out.size > 1) | extra))
+        out = self._step(rows, start, period)
+        for _ in range(steps - 1):
+            going = np.flatnonzero(out.size > 1)
             if not len(going):
                 break
-            part = self._in_tiles(_step, rows[going], _pick(out.start, going), period[going])
+            part = self._step(rows[going], *_pick((out.start, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        return out
+        judged = self._in_tiles(_verdict, 1, rows, out.start, out.period, out.seen)
+        start, period, factors, result = judged
+        return out._replace(start=start, period=period, factors=factors, result=result)
 
-    def _in_tiles(self, work, rows, start: Lanes, period):
+    def _step(self, rows, start: Lanes, period) -> Rounds:
+        """One step of Newton's method."""
+        start, period, residual, jacobian, seen, codes = self._in_tiles(
+            _turn, self._threads, rows, start, period
+        )
+        q, size = newton_step(start.q[..., 0], residual, jacobian)
+        # A turn that closes but met its section too often was given too long a period.
+        extra = closes(start.q[..., 0], seen) & (seen.meetings > self.guess.turns)
+        period[extra] = self.guess.turns * seen.period[extra] / seen.meetings[extra]
+        size[extra] = np.inf
+        start, once = eqx.tree_at(lambda x: x.q, start, q[..., None]), np.ones(len(rows), int)
+        return Rounds(start, size, period, seen.factors, seen, codes, -once, once)
+
+    @property
+    def _threads(self) -> int:
+        """One where programs factorise matrices (`held`): in several threads of XLA's pool, these
+        would wait for each other forever."""
+        return 1 if self.guess.conserved else self.workers
+
+    def _in_tiles(self, work, workers: int, rows, *arguments):
         """`work` for some systems, in calls of one size, so that there is one program for all."""
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
 
         def tile(k):
             some = np.arange(k, k + self.size) % len(rows)
             systems = eqx.combine(_pick(arrays, rows[some]), rest)
-            part = work(systems, self.guess, *_pick((start, period), some), self.settings)
-            part = _pick(part, slice(len(rows) - k))
-            return _fronted(part) if work is _step else part
+            part = work(systems, self.guess, *_pick(arguments, some), self.settings)
+            return _pick(part, slice(len(rows) - k))
 
-        return _join(*in_threads(tile, range(0, len(rows), self.size), self.workers))
+        return _join(*in_threads(tile, range(0, len(rows), self.size), workers))
 
 
 def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:
@@ -162,10 +187,14 @@ def _pick(tree, rows):
 
 
 def _join(*parts):
-    if isinstance(parts[0], Rounds):
-        width = max(part.seen.codes.shape[1] for part in parts)
-        parts = [_with_codes(part, _widened(part.seen.codes, width)) for part in parts]
-    return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
+    return jax.tree_util.tree_map(lambda *x: np.concatenate(_of_one_width(x)), *parts)
+
+
+def _of_one_width(parts):
+    """Arrays with as many columns as the widest, filled up with -1 (codes of events)."""
+    width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
+    fill = lambda x: ((0, 0), (0, width - x.shape[1]))  # noqa: E731
+    return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
@@ -174,36 +203,47 @@ def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
     return _pick(_join(out, new), place)
 
 
-def _with_codes(rounds: Rounds, codes: Int[np.ndarray, "S E"]) -> Rounds:
-    return rounds._replace(seen=eqx.tree_at(lambda x: x.codes, rounds.seen, codes))
-
-
-def _widened(codes: Int[np.ndarray, "S E"], width: int) -> Int[np.ndarray, "S W"]:
-    return np.pad(codes, ((0, 0), (0, width - codes.shape[1])), constant_values=-1)
-
-
-def _fronted(rounds: Rounds) -> Rounds:
-    return _with_codes(rounds, front(rounds.seen.codes.reshape(len(rounds.result), -1)))
-
-
 def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     """Codes of events moved to the front of each row, and the columns without any left out."""
-    row, column = np.nonzero(codes >= 0)
+    row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
     count = np.bincount(row, minlength=len(codes))
     out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
     out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
     return out
 
 
+def _kind(guess: LimitCycle) -> ReturnMap:
+    return ReturnMap(guess.base, guess.conserved, guess.turns)
+
+
+def _turn(*arguments):
+    """One turn of every system from its start, at the same phase of its own clock."""
+    *found, codes = _turn_with_codes(*arguments)
+    return *found, front(np.asarray(codes))
+
+
 @eqx.filter_jit
-def _step(systems, guess: LimitCycle, start: Lanes, period, settings) -> Rounds:
+def _turn_with_codes(systems, guess: LimitCycle, start: Lanes, period, settings):
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
-        kind = ReturnMap(guess.base, guess.conserved, guess.turns)
-        *found, seen, code = newton_step(system, start, kind, expected, settings)
-        return Rounds(*found, seen, code, jnp.array(1))
+        kind = _kind(guess)
+        residual, seen, jacobian = turn_with_jacobian(
+            start.q[:, 0], system, start, kind, expected, settings
+        )
+        bare = eqx.tree_at(lambda x: x.codes, seen, None)
+        return start, expected, residual, jacobian, bare, seen.codes.ravel()
 
     return eqx.filter_vmap(one)(systems, start, period)
+
+
+@eqx.filter_jit
+def _verdict(systems, guess: LimitCycle, start: Lanes, period, seen: Turn, settings):
+    """The starts ready to be left, periods, factors, and result codes."""
+
+    def one(system, start, expected, seen):
+        return judge(start.q[:, 0], seen, system, start, _kind(guess), expected, settings)
+
+    return eqx.filter_vmap(one)(systems, start, period, seen)
 
 
 @eqx.filter_jit

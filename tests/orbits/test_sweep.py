@@ -1,9 +1,14 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.orbits import tiles
+
+
+ONES = np.ones(2)
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +76,15 @@ def test_systems_that_are_alike_or_undefined(wheel):
     np.testing.assert_array_equal(found.failed, [9])
     alike = hj.find_limit_cycles([found[0].system] * 6, wheel, batch=4)
     assert alike.ok.all()
+
+
+def test_programs_in_threads_factorise_nothing(wheel):
+    """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
+    systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
+    start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.start, wheel.period))
+    start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
+    lowered = tiles._turn_with_codes.lower(systems, wheel, start, period, wheel.settings)
+    assert "lapack" not in lowered.as_text()
 
 
 def test_a_guess_with_too_long_a_period(wheel):
