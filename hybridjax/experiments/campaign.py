@@ -144,8 +144,7 @@ _compiling, _compiled = threading.Lock(), set()
 
 def _once_compiled(*arguments):
     """`_respond`, where threads that need the same program wait until one has compiled it."""
-    leaves, structure = jax.tree_util.tree_flatten(arguments)
-    program = structure, tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+    program = _program(arguments)
     if program in _compiled:
         return _respond(*arguments)
     with _compiling:
@@ -154,13 +153,21 @@ def _once_compiled(*arguments):
     return out
 
 
+def _program(arguments):
+    """What tells compiled programs apart."""
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    return structure, tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+
+
 def _compile(placed: PlacedSections, shape, outputs) -> None:
     """Compile `_respond` before the plan is known, by experiments that fail where they begin."""
     N, n = placed.count, 1 + placed.lanes.q.shape[0]
     plan = Plan(*np.zeros((4, N)))
     nowhere = np.full((n, shape[0]), np.nan)
     plan, nowhere, u = jax.tree_util.tree_map(jnp.asarray, (plan, nowhere, np.zeros(shape)))
-    _once_compiled(placed, plan, nowhere, u, outputs, Settings(1.0, 1.0, PATIENCE))
+    arguments = placed, plan, nowhere, u, outputs, Settings(1.0, 1.0, PATIENCE)
+    if _program(arguments) not in _compiled:
+        _once_compiled(*arguments)
 
 
 def prepare(
