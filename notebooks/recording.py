@@ -97,7 +97,8 @@ figure = hj.plot.section_data(data)
 #
 # The order that predicts strides best that it was not fitted to; and a model of the first three
 # quarters, simulated on the last. What is left is correlated in time since the splines smooth over
-# neighbouring sections.
+# neighbouring sections, and with the input since numerators are estimates (98 at each section, from
+# 360 strides) and the hopper is not quite linear.
 
 # %%
 print("order:", hj.choose_order(data))
