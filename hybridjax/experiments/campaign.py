@@ -83,7 +83,9 @@ class Campaign:
         start = self._start(u)
 
         def work(k):
-            some = np.arange(k, k + size) % S  # the last batch is filled up with repetitions
+            some = slice(k, k + size)
+            if k + size > S:  # the last batch is filled up with repetitions
+                some = np.arange(k, k + size) % S
             arguments = (
                 self.placed,
                 self.plan,
@@ -102,9 +104,10 @@ class Campaign:
         parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
         y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
-        y, error = y.astype(float), error.astype(float) + self.rounding
+        y, error = y.astype(float, copy=False), error.astype(float) + self.rounding
         base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
-        if not (np.isfinite(y).all(axis=(1, 2)) | (result != Result.OK)).all():
+        finite = np.isfinite(y)
+        if not (finite.all() or (finite.all(axis=(1, 2)) | (result != Result.OK)).all()):
             for a in np.unique(self.placed.lanes.chart):
                 self.outputs.require(int(a))
             raise DefinitionError(

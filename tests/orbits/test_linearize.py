@@ -120,3 +120,10 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
 def test_a_jump_that_goes_back_over_a_section_is_reported(lossy_cycle):
     with pytest.raises(hj.ComputationError, match=r"section 19 .* is crossed 2 times"):
         hj.linearize(lossy_cycle, KINEMATIC, OUTPUTS)
+
+
+def test_a_cycle_that_is_rest():
+    """Where the state stands still, only its derivatives say how short steps must be."""
+    cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
+    found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers()
+    np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
