@@ -183,7 +183,7 @@ def dirt(seeds=5, strides=500, noise=1e-4):
         )
 
 
-def walker(seeds=10, strides=100, trials=5, noise=1e-4):
+def walker(seeds=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
     oscillator, angle = hj.models.VanDerPol(mu=0.1), hj.AnglePhase("x", "v")
