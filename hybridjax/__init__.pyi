@@ -128,6 +128,7 @@ from .recordings.impulse import (
 )
 from .recordings.phase import (
     AnglePhase as AnglePhase,
+    CrossingPhase as CrossingPhase,
     EventPhase as EventPhase,
     estimate_phase as estimate_phase,
 )

@@ -66,6 +66,8 @@ def _add_identify(commands) -> None:
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_names, metavar="X,V",
         help="two signals whose angle about the centre is the phase")  # fmt: skip
+    phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:LEVEL]",
+        help="a cycle begins where signal X crosses a level, rising or falling")  # fmt: skip
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
     add("--center", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
     add("--scale", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
@@ -75,7 +77,7 @@ def _add_identify(commands) -> None:
     add("--bandwidth", type=float, metavar="HZ", help="of the splines through the outputs; by "
         "default N per period")  # fmt: skip
     add("--time", default="time", metavar="NAME", help="column with the times")
-    add("--crossings", choices=("clock", "duration"), help="an extra output from the times at "
+    add("--time-of-crossing", choices=("clock", "duration"), help="an extra output from the times at "
         "which sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=float, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
@@ -94,7 +96,7 @@ def _identify(options) -> None:
     from ._core.precision import enable_x64
     from .recording_report import check_folder, write_report
     from .recordings.identification import identify_recording
-    from .recordings.phase import AnglePhase, EventPhase
+    from .recordings.phase import AnglePhase, CrossingPhase, EventPhase
     from .recordings.read import read_recording
 
     enable_x64()
@@ -105,14 +107,16 @@ def _identify(options) -> None:
             raise DefinitionError(f"--{name} needs two entries with a comma in between.")
     recording = read_recording(*options.files, time=options.time)
     print(recording)
-    if options.event is None:
+    if options.phase is not None:
         phase = AnglePhase(*options.phase, center=options.center, scale=options.scale)
+    elif options.crossing is not None:
+        phase = CrossingPhase(*options.crossing)
     else:
         phase = EventPhase(options.event)
     found = identify_recording(
         recording, phase, inputs=options.input, outputs=options.outputs,
         sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-        time=options.crossings, drift=options.drift,
+        time=options.time_of_crossing, drift=options.drift,
     )  # fmt: skip
     print(found)
     print(write_report(found, options.out))
@@ -160,6 +164,19 @@ def _numbers(text: str) -> tuple[float, ...]:
         return tuple(float(x) for x in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers") from None
+
+
+def _crossing(text: str) -> tuple[str, str, float]:
+    signal, *more = text.split(":")
+    direction, level = (*more, *("rising", "0")[len(more) :])[:2]
+    try:
+        if len(more) > 2 or direction not in ("rising", "falling"):
+            raise ValueError
+        return signal, direction, float(level)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a signal, a direction and a level, as in x:falling:0.2"
+        ) from None
 
 
 def _assignment(text: str) -> tuple[str, float]:

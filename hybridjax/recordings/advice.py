@@ -207,7 +207,8 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
             found.append(
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "
-                "event to event (`mark`, `EventPhase`) may make the multipliers much surer."
+                "crossing to crossing (`CrossingPhase`, `--crossing`) may make multipliers "
+                "much surer."
             )
     plain = plain_regression(data, d)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)

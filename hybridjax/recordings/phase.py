@@ -1,7 +1,7 @@
 """Where in its cycle a recorded system is: phase from an angle, from events, or a function."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -16,6 +16,7 @@ from .tracker import track
 
 _BREAK = 0.25  # of a cycle: the turns in a longer gap cannot be counted
 _HARMONICS = 32  # bandwidth of the angle's signals, in cycles per cycle
+_OF_CROSSINGS = 16  # and of a signal whose crossings are taken
 _SLOWEST = 0.1  # cycles that a causal phase goes on until the next event, at least
 _TAILS = 0.01  # of the samples at either end, which say nothing of the range
 
@@ -29,7 +30,7 @@ class AnglePhase(eqx.Module):
 
     The angle of `(position - o_p) / s_p + i (velocity - o_v) / s_v`, counted in the sense in which
     it turns. Section 0 lies at `start`. At its sections the two signals are two sides of one
-    number: as outputs they tell less than at those of an `EventPhase`.
+    number: as outputs they tell less than at those of a `CrossingPhase`.
 
     **Fields:**
 
@@ -61,6 +62,30 @@ class EventPhase(eqx.Module):
     """
 
     event: str = eqx.field(static=True)
+
+
+class CrossingPhase(eqx.Module):
+    """Phase that grows by one from each crossing of a level to the next, linearly in between.
+
+    What an `EventPhase` makes of the events that `Recording.mark` finds. The signal should cross
+    the level once in each cycle in this direction, and fast: at mid-stance, at the apex.
+
+    **Fields:**
+
+    - `signal`: its name. `direction`: "rising" or "falling". `level`: in the signal's unit.
+    - `bandwidth`: of the spline through the signal, in Hz; by default 16 harmonics of the cycle.
+    """
+
+    signal: str = eqx.field(static=True)
+    direction: Literal["rising", "falling"] = eqx.field(static=True, default="rising")
+    level: Number = 0.0
+    bandwidth: Number | None = None
+
+    def __check_init__(self):
+        if self.direction not in ("rising", "falling"):
+            raise DefinitionError(
+                f"a CrossingPhase has direction {self.direction!r}; say 'rising' or 'falling'."
+            )
 
 
 class Winding(eqx.Module):
@@ -144,7 +169,9 @@ class Phase(eqx.Module):
         )
 
 
-Definition = AnglePhase | EventPhase | Callable[[np.ndarray, Mapping[str, np.ndarray]], Any]
+Definition = (
+    AnglePhase | CrossingPhase | EventPhase | Callable[[np.ndarray, Mapping[str, np.ndarray]], Any]
+)
 
 
 def estimate_phase(recording: Recording, definition: Definition, *, causal: bool = False) -> Phase:
@@ -152,9 +179,9 @@ def estimate_phase(recording: Recording, definition: Definition, *, causal: bool
 
     **Arguments:**
 
-    - `definition`: an `AnglePhase`, an `EventPhase`, or a function of the times (n,) and the
-      signals by name, that returns an angle (n,) in rad, with or without its whole turns, NaN where
-      it is not known.
+    - `definition`: an `AnglePhase`, a `CrossingPhase`, an `EventPhase`, or a function of the times
+      (n,) and the signals by name, that returns an angle (n,) in rad, with or without its whole
+      turns, NaN where it is not known.
     - `causal`: from the past only, as hardware in real time would find it: an angle by a
       `PhaseTracker`; from events by the duration of the last cycle, which remembers three cycles
       (fit it with `overhang=2 * sections`).
@@ -165,6 +192,8 @@ def estimate_phase(recording: Recording, definition: Definition, *, causal: bool
     **Raises:** `DefinitionError` for signals or events that are not there, a phase that does not
     wind, or a recording of less than two cycles.
     """
+    if isinstance(definition, CrossingPhase):
+        return _from_events(*_marked(recording, definition), causal)
     if isinstance(definition, EventPhase):
         return _from_events(recording, definition, causal)
     if isinstance(definition, AnglePhase):
@@ -262,6 +291,17 @@ def _monotone(time, phase) -> Winding | None:
     if rising.sum() < 2:
         return None
     return Winding(time[rising], phase[rising], linear=False)
+
+
+def _marked(recording: Recording, definition: CrossingPhase) -> tuple[Recording, EventPhase]:
+    signal, about = definition.signal, {}
+    about["level"], about["direction"] = definition.level, definition.direction
+    event = f"{signal} {definition.direction}"
+    bandwidth = definition.bandwidth
+    if bandwidth is None:  # noise makes the crossings of the samples themselves more
+        rough = _from_events(recording.mark(event, signal, **about), EventPhase(event), False)
+        bandwidth = _OF_CROSSINGS / rough.period
+    return recording.mark(event, signal, **about, bandwidth=bandwidth), EventPhase(event)
 
 
 def _from_events(recording: Recording, definition: EventPhase, causal: bool) -> Phase:

@@ -20,9 +20,9 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
     """At the sections of an angle of the two outputs, these are one number."""
     noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
-    marked = noisy.mark("apex", "vM", direction="falling", bandwidth=16)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
-    data = [hj.section_data(marked, p, **options) for p in (angle, hj.EventPhase("apex"))]
+    apex = hj.CrossingPhase("vM", "falling")
+    data = [hj.section_data(noisy, phase, **options) for phase in (angle, apex)]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()

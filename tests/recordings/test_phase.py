@@ -119,6 +119,7 @@ def test_what_is_no_phase(wave):
         (hj.AnglePhase("x", "c"), "needs a c that varies"),
         (hj.AnglePhase("x", "q"), "no signal 'q'"),
         (hj.EventPhase("strike"), "no event 'strike'; its events are: none"),
+        (hj.CrossingPhase("x", "falling", 3.0), "x never crosses 3, falling"),
         (lambda t, s: t[1:], "returned the shape"),
         (lambda t, s: 0 * t, "the phase does not wind"),
     ]:

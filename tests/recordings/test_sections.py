@@ -147,6 +147,22 @@ def test_the_command(files, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_the_command_from_crossing_to_crossing(files, tmp_path):
+    options = ["--input", "force", "--outputs", "x,v", "--sections", "16", "--order", "1"]
+    trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
+    main(["identify", *trials, *options, "--crossing", "v:falling", "--out", str(tmp_path / "out")])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert abs(summary["multipliers"][0][0] - MULTIPLIER) < 2e-2
+
+
+@pytest.mark.parametrize("text", ["x:up", "x:rising:high", "x:rising:0:1"])
+def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsys):
+    options = ["--input", "force", "--outputs", "x,v", "--crossing", text, "--out", str(tmp_path)]
+    with pytest.raises(SystemExit):
+        main(["identify", str(files / "trial0.csv"), *options])
+    assert "is not a signal, a direction and a level" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
