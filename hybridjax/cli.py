@@ -77,8 +77,8 @@ def _add_identify(commands) -> None:
     add("--bandwidth", type=float, metavar="HZ", help="of the splines through the outputs; by "
         "default N per period")  # fmt: skip
     add("--time", default="time", metavar="NAME", help="column with the times")
-    add("--time-of-crossing", choices=("clock", "duration"), help="an extra output from the times at "
-        "which sections are crossed: for systems with a clock, or without")  # fmt: skip
+    add("--time-of-crossing", choices=("clock", "duration"), help="an extra output, from when "
+        "sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=float, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
     identify.set_defaults(run=_identify)
