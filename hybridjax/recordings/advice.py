@@ -24,7 +24,7 @@ _FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are 
 _WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
 _LOST = 0.2  # of all samples
 _ALIKE = 0.98  # median of the correlations of two outputs at the sections: they say the same
-_ENOUGH = 1000  # cycles to choose an order from, and to try it on
+ENOUGH = 1000  # cycles to choose an order from, and to try it on
 _TIE = 0.02  # relative difference of misfits that are as good as equal
 
 
@@ -105,7 +105,7 @@ def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
 
 def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
     early, late = [], []
-    enough = min(1.0, _ENOUGH / data.cycles)
+    enough = min(1.0, ENOUGH / data.cycles)
     for r in data.records:
         end = round(len(r.u) * enough)
         cut = round(end * (1 - share))

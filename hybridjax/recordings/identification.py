@@ -6,10 +6,10 @@ from typing import Any
 import equinox as eqx
 
 from ..identify.series import SeriesFit, fit_series
-from .advice import Advice, HeldOut, advise, choose_order, hold_out
+from .advice import ENOUGH, Advice, HeldOut, advise, choose_order, hold_out
 from .drift import without_drift
 from .impulse import ImpulseResponses, impulse_responses
-from .phase import AnglePhase, Definition, Phase, estimate_phase
+from .phase import AnglePhase, CrossingPhase, Definition, Phase, estimate_phase
 from .recording import Recording
 from .sections import SectionData, section_data
 
@@ -64,19 +64,24 @@ def identify_recording(
         moved = {outputs} if isinstance(outputs, str) else set(outputs)
         if isinstance(definition, AnglePhase):
             moved |= {definition.position, definition.velocity}
+        if isinstance(definition, CrossingPhase):
+            moved |= {definition.signal}
         recording = without_drift(recording, phase, sorted(moved), drift)
         if not isinstance(definition, Phase):
             phase = estimate_phase(recording, definition)
     about = {"inputs": inputs, "outputs": outputs, "sections": sections, "drift": drift}
     data = section_data(recording, phase, **about, **options)
     order = choose_order(data) if order is None else order
-    fit = fit_series(data.records, order, check=False)
+    held = hold_out(data, order)
+    # A long recording need not be asked again whether it has a part of second order that pays.
+    known = data.cycles > ENOUGH and not held.fit.distortion
+    fit = fit_series(data.records, order, check=False, distortion=False if known else None)
     return Identification(
         recording,
         phase,
         data,
         fit,
-        hold_out(data, order),
+        held,
         impulse_responses(fit, data),
         advise(data, fit),
     )
