@@ -107,6 +107,7 @@ def derivatives(values: dict, baseline: dict) -> str:
         found = {
             "program at 1e-10": f"{name}.program.rtol_1e-10",
             "program at 1e-12": f"{name}.program.rtol_1e-12",
+            "sections and program at 1e-12": f"{name}.placing.rtol_1e-12",
             "`linearize`": f"{name}.linearize",
             "heyoka at 1e-6": f"{name}.{job}.heyoka.jacobians.tol_1e-06",
             "heyoka at 1e-9": f"{name}.{job}.heyoka.jacobians.tol_1e-09",
