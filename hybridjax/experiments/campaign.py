@@ -1,7 +1,6 @@
 """Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
 
 import dataclasses
-import functools as ft
 import threading
 from collections.abc import Mapping, Sequence
 
@@ -162,15 +161,25 @@ def _program(arguments):
     return structure, tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
 
 
-def _compile(placed: PlacedSections, shape, outputs) -> None:
-    """Compile `_respond` before the plan is known, by experiments that fail where they begin."""
+def _compile_ahead(placed: PlacedSections, shape, outputs) -> None:
+    """Begin to compile `_respond` in another thread, before the values of the plan are known.
+
+    It is traced in this one: what threads trace at the same time differs from run to run, and is
+    not found again in a cache on disk.
+    """
     N, n = placed.count, 1 + placed.lanes.q.shape[0]
-    plan = Plan(*np.zeros((4, N)))
-    nowhere = np.full((n, shape[0]), np.nan)
-    plan, nowhere, u = jax.tree_util.tree_map(jnp.asarray, (plan, nowhere, np.zeros(shape)))
-    arguments = placed, plan, nowhere, u, outputs, Settings(1.0, 1.0, PATIENCE)
-    if _program(arguments) not in _compiled:
-        _once_compiled(*arguments)
+    plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
+    start, u = jnp.asarray(np.zeros((n, shape[0]))), jnp.asarray(np.zeros(shape))
+    arguments = placed, plan, start, u, outputs, Settings(1.0, 1.0, PATIENCE)
+    if _program(arguments) in _compiled:
+        return
+    lowered = _respond.lower(*arguments)
+
+    def finish():
+        with _compiling:
+            lowered.compile()
+
+    meanwhile(finish)
 
 
 def prepare(
@@ -228,8 +237,7 @@ def prepare(
     accuracy = _ACCURACY[precision] if accuracy is None else float(accuracy)
     check_accuracy(accuracy)
     if precision == "double":
-        shape = size, cycles * placed.count, nu
-        meanwhile(ft.partial(_compile, placed, shape, tuple(z.items)))
+        _compile_ahead(placed, (size, cycles * placed.count, nu), tuple(z.items))
         planned, rounding = plan_flow(placed, accuracy, scale), 0.0
     else:
         planned, rounding = plan_single(placed, accuracy, scale)

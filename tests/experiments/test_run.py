@@ -16,6 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
+from hybridjax.experiments import campaign, respond
 
 from ..conftest import OUTPUTS
 from ..orbits import hopper_scipy
@@ -168,6 +169,26 @@ def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isoc
     stiffer = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(10.001, float))
     hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS, **BATCH)
     assert not compiled
+
+
+def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
+    hopper_cycle, placed_isochrons, monkeypatch
+):
+    traced = []
+
+    def counted(*arguments):
+        traced.append(1)
+        return respond.respond(*arguments)
+
+    monkeypatch.setattr(campaign, "_respond", eqx.filter_jit(counted))
+    monkeypatch.setattr(campaign, "_compiled", set())
+    u = np.zeros((2, 32, 1))
+    for accuracy in (1e-7, 1e-8):  # a plan of its own for each
+        data = hj.run_experiments(
+            hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0, accuracy=accuracy
+        )
+        assert data.ok.all()
+    assert len(traced) == 1
 
 
 @hypothesis.settings(max_examples=15, deadline=None)
