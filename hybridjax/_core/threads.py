@@ -1,8 +1,9 @@
-"""Compiled calls on several cores."""
+"""Compiled calls, and large ones of NumPy, on several cores."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Any
 
 import jax
@@ -20,11 +21,7 @@ def thread_count(workers: int | None) -> int:
         if workers < 1:
             raise DefinitionError(f"workers is the number of threads, not {workers}.")
         return workers
-    if jax.default_backend() != "cpu":
-        return 1
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return _cores() if jax.default_backend() == "cpu" else 1
 
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
@@ -33,12 +30,32 @@ def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -
         yield from pool.map(_configured(work), items)
 
 
+def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+    """`work` of each item, in order: large operations of NumPy and SciPy, during which other
+    threads can run. Each sees the caller's `np.errstate`.
+
+    Threads of BLAS would be in the way of these, so that the cores are left to them unless
+    OPENBLAS_NUM_THREADS is 1.
+    """
+    alone = os.environ.get("OPENBLAS_NUM_THREADS") == "1"
+    with ThreadPoolExecutor(_cores() if alone else 1) as pool:
+        running = [pool.submit(copy_context().run, work, item) for item in items]
+        return [one.result() for one in running]
+
+
 def meanwhile(work: Callable[[], Any]) -> None:
     """Begin with `work` in a thread of its own, under the caller's configuration of JAX. What it
     returns or raises is lost: it only makes ready what will be asked for again."""
     pool = ThreadPoolExecutor(1)
     pool.submit(_configured(work))
     pool.shutdown(wait=False)
+
+
+def _cores() -> int:
+    """That this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _configured(work):
