@@ -11,14 +11,15 @@ record. For given c every section is a linear regression of its own, in b and g.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Bool, Float, Int
 from scipy.signal import lfilter
 
+from .._core.threads import on_all_cores
 from .records import Layout
 
 
 _RANK = 1e-10  # singular values below this part of the largest are dropped
+_GRAM = 1e-12  # and eigenvalues of Gram matrices
 Coefficients = Float[np.ndarray, " d"]
 
 
@@ -50,13 +51,14 @@ def set_up(layout: Layout, order: int, overhang: int, rest: bool) -> Problem:
     free = 0 if rest else order + -(-overhang // N)
     good, first = np.isfinite(layout.y), np.argmax(layout.inside, axis=1)
     cycle = np.arange(layout.y.shape[1])
-    maps = []
-    for n in range(N):
+
+    def independent(n: int):
         tells = good[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
         rows = lagged(layout.u, n, lags, layout.lead)[tells]
-        _, s, vh = np.linalg.svd(rows, full_matrices=False)
+        _, s, vh = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=False)
         kept = s > _RANK * s.max(initial=0)
-        maps.append(vh[kept].T / s[kept])
+        return vh[kept].T / s[kept]
+
     scale = np.sqrt(np.nanmean(layout.y**2, axis=(0, 1, 2)))
     return Problem(
         layout.u,
@@ -66,7 +68,7 @@ def set_up(layout: Layout, order: int, overhang: int, rest: bool) -> Problem:
         lags,
         layout.lead,
         free,
-        maps,
+        on_all_cores(independent, range(N)),
         layout.slow,
         scale,
     )
@@ -108,8 +110,8 @@ class Regression(NamedTuple):
     to_free: Float[np.ndarray, "S K K"]
     rest: Float[np.ndarray, "rows r"]
     """Sampled rows of V without what these explain."""
-    inverse: Float[np.ndarray, "r r"]
-    """Of the Gram matrix of `rest`."""
+    root: Float[np.ndarray, "r k"]
+    """root @ root.T is the inverse of the Gram matrix of `rest`."""
 
     @classmethod
     def make(cls, V, E, slow, good):
@@ -122,31 +124,36 @@ class Regression(NamedTuple):
         to_free = to_free[:, : E.shape[2]]
         rest = good * V
         rest = (rest - left @ (left.swapaxes(1, 2) @ rest)).reshape(-1, V.shape[2])
-        inverse = scipy.linalg.pinvh(rest.T @ rest, rtol=1e-12)
-        return cls(V, E, good, left, to_free, rest, inverse)
+        w, q = np.linalg.eigh(rest.T @ rest)
+        kept = w > _GRAM * w.max(initial=0)
+        return cls(V, E, good, left, to_free, rest, q[:, kept] / np.sqrt(w[kept]))
 
     @property
     def freedom(self) -> int:
-        used = np.linalg.matrix_rank(self.inverse, hermitian=True) + (self.left**2).sum()
+        used = self.root.shape[1] + (self.left**2).sum()
         return int(self.good.sum()) - int(round(float(used)))
 
     @property
     def leverage(self) -> Float[np.ndarray, "S T"]:
         """The share of its own error that the fit takes from each sample."""
-        own = np.einsum("ij,jk,ik->i", self.rest, self.inverse, self.rest)
+        own = ((self.rest @ self.root) ** 2).sum(axis=1)
         return (self.left**2).sum(axis=2) + own.reshape(self.left.shape[:2])
 
     def solve(self, x: Float[np.ndarray, "S T C"]):
-        """Coefficients of V, the response at all rows, and what is left at those sampled."""
+        """Coefficients of V, and what is left at the rows sampled."""
         a, left = np.zeros((self.rest.shape[1], x.shape[2])), self.good * x
         for _ in range(2):  # the second time for accuracy
             left = left - self.left @ (self.left.swapaxes(1, 2) @ left)
-            more = self.inverse @ (self.rest.T @ left.reshape(-1, x.shape[2]))
+            more = self.root @ (self.root.T @ (self.rest.T @ left.reshape(-1, x.shape[2])))
             left = left - (self.rest @ more).reshape(left.shape)
             a += more
+        return a, left
+
+    def response(self, a: Float[np.ndarray, "r C"], x: Float[np.ndarray, "S T C"]):
+        """What inputs with these coefficients, and the starts that fit x best, make of all rows."""
         inputs = self.V @ a
         free = self.to_free @ (self.left.swapaxes(1, 2) @ (self.good * (x - inputs)))
-        return a, inputs + self.E @ free, left
+        return inputs + self.E @ free
 
 
 class Linearisation(NamedTuple):
@@ -161,6 +168,15 @@ class Linearisation(NamedTuple):
     roots: list[list[Float[np.ndarray, "columns r"]]]
     """root @ root.T is the covariance of the numerators of a section and output, given c."""
 
+    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "Linearisation":
+        """That of the problem with each output in units of its noise (`rescale`)."""
+        return self._replace(
+            residual=self.residual / noise[:, None],
+            jacobian=self.jacobian / noise[:, None],
+            numerators=self.numerators / noise,
+            slope=self.slope / noise,
+        )
+
 
 def linearise(
     problem: Problem, c: Coefficients, y: Float[np.ndarray, "S T N ny C"] | None = None
@@ -173,30 +189,52 @@ def linearise(
     S, T, N, ny = problem.y.shape
     y = problem.y[..., None] if y is None else y
     d, columns = len(c), problem.lags * problem.u.shape[3]
-    residual, jacobian = np.zeros(y.shape), np.zeros((d, *y.shape))
-    freedom, leverage, roots = np.zeros((N, ny), int), np.zeros((S, T, N, ny)), []
-    b, slope = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
+    found = Linearisation(
+        np.zeros(y.shape),
+        np.zeros((d, *y.shape)),
+        np.zeros((N, ny), int),
+        np.zeros((S, T, N, ny)),
+        np.zeros((N, columns, ny)),
+        np.zeros((d, N, columns, ny)),
+        [[np.zeros((0, 0))] * ny for _ in range(N)],
+    )
     v = along_cycles(c, problem.u)
-    for n in range(N):
+
+    def section(n: int) -> None:
         V = lagged(v, n, problem.lags, problem.lead) @ problem.maps[n]
         E = responses_to_starts(c, problem.first[:, n], T, min(problem.free, T))
-        regression = None
-        for i in range(ny):
-            good = problem.good[:, :, n, i]
-            if regression is None or not np.array_equal(good, regression.good[..., 0]):
-                regression = Regression.make(V, E, problem.slow, good)
-                left, share = regression.freedom, regression.leverage
-                w, q = np.linalg.eigh(regression.inverse)
-                root = problem.maps[n] @ (q * np.sqrt(np.maximum(w, 0)))
-            a, fitted, residual[:, :, n, i] = regression.solve(y[:, :, n, i])
-            b[n, :, i] = problem.maps[n] @ a[:, 0]
-            for j in range(d):
-                more, _, jacobian[j, :, :, n, i] = regression.solve(along_cycles(c, fitted, j + 1))
-                slope[j, n, :, i] = problem.maps[n] @ more[:, 0]
-            freedom[n, i], leverage[:, :, n, i] = left, share
-            roots.append(root)
-    roots = [roots[n * ny : (n + 1) * ny] for n in range(N)]
-    return Linearisation(residual, jacobian, freedom, leverage, b, slope, roots)
+        for good, outputs in _sampled_alike(problem.good[:, :, n]):
+            regression = Regression.make(V, E, problem.slow, good)
+            x = y[:, :, n, outputs].reshape(S, T, -1)
+            a, left = regression.solve(x)
+            fitted = regression.response(a, x)
+            fitted = np.concatenate([along_cycles(c, fitted, j + 1) for j in range(d)], axis=2)
+            more, slopes = regression.solve(fitted)
+            shape = (len(outputs), y.shape[4])
+            found.residual[:, :, n, outputs] = left.reshape(S, T, *shape)
+            slopes = np.moveaxis(slopes.reshape(S, T, d, *shape), 2, 0)
+            found.jacobian[:, :, :, n, outputs] = slopes
+            found.freedom[n, outputs] = regression.freedom
+            found.leverage[:, :, n, outputs] = regression.leverage[..., None]
+            to_lags = problem.maps[n]
+            found.numerators[n][:, outputs] = to_lags @ a.reshape(-1, *shape)[..., 0]
+            more = np.moveaxis(more.reshape(-1, d, *shape)[..., 0], 1, 0)
+            found.slope[:, n][..., outputs] = to_lags @ more
+            for i in outputs:
+                found.roots[n][i] = to_lags @ regression.root
+
+    on_all_cores(section, range(N))
+    return found
+
+
+def _sampled_alike(good: Bool[np.ndarray, "S T ny"]):
+    """The rows in which outputs are sampled, and the outputs that are sampled in these."""
+    left = list(range(good.shape[2]))
+    while left:
+        rows = good[..., left[0]]
+        same = [i for i in left if np.array_equal(good[..., i], rows)]
+        yield rows, same
+        left = [i for i in left if i not in same]
 
 
 def responses_to_starts(
@@ -211,33 +249,44 @@ def responses_to_starts(
 class Delayed(NamedTuple):
     """What inputs leave of the outputs 0, 1, ..., d cycles earlier."""
 
-    gram: Float[np.ndarray, "d1 d1"]
+    gram: Float[np.ndarray, "ny d1 d1"]
     freedom: int
-    """The number of independent rows; noise of variance 1 makes the Gram matrix that large."""
+    """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
+    matrices that large."""
+
+    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "Delayed":
+        """The same with each output in units of its noise, which was `noise` units before."""
+        return self._replace(gram=self.gram / (noise**2)[:, None, None])
 
 
 def delayed_outputs(problem: Problem, order: int) -> Delayed:
     """Only from rows whose lagged inputs and outputs are all known."""
     _, T, N, ny = problem.y.shape
-    gram, freedom = np.zeros((order + 1, order + 1)), 0
+    delays = range(order + 1)
     cycle = np.arange(T)[:, None]
-    for n in range(N):
+
+    def section(n: int):
+        gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
         V = lagged(problem.u, n, problem.lags, problem.lead) @ problem.maps[n]
-        known = (cycle >= problem.first[:, n] + problem.free).T
-        for i in range(ny):
-            good, y = problem.good[:, :, n, i], problem.y[:, :, n, i]
-            past = np.stack([_later(y, j) for j in range(order + 1)], axis=2)
-            rows = known & np.all([_later(good, j, not problem.free) for j in range(order + 1)], 0)
+        known = (cycle >= problem.first[:, n] + problem.free).T[..., None]
+        good, y = problem.good[:, :, n], problem.y[:, :, n]
+        good = known & np.all([_later(good, j, not problem.free) for j in delays], axis=0)
+        for rows, outputs in _sampled_alike(good):
             regression = Regression.make(V, problem.slow[:, :, :0], problem.slow, rows)
-            Z = regression.solve(past)[2].reshape(-1, order + 1)
-            gram += Z.T @ Z
-            freedom += max(regression.freedom, 0)
-    return Delayed(gram, freedom)
+            past = np.concatenate([_later(y[..., outputs], j) for j in delays], axis=2)
+            Z = regression.solve(past)[1].reshape(-1, order + 1, len(outputs))
+            gram[outputs] = np.einsum("rji,rki->ijk", Z, Z)
+            freedom += max(regression.freedom, 0) * len(outputs)
+        return gram, freedom
+
+    grams, freedoms = zip(*on_all_cores(section, range(N)), strict=True)
+    return Delayed(sum(grams), sum(freedoms))
 
 
-def initial(problem: Problem, order: int) -> Coefficients:
+def initial(delayed: Delayed) -> Coefficients:
     """chi y = B u by total least squares, which white noise does not bias."""
-    null = np.linalg.eigh(delayed_outputs(problem, order).gram)[1][:, 0]
+    order = delayed.gram.shape[1] - 1
+    null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
     if abs(null[0]) < 1e-8 * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])

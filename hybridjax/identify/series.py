@@ -20,6 +20,7 @@ from .order import refuse_invented
 from .projection import chi
 from .records import Layout, Recorded, lay_out
 from .regression import (
+    Delayed,
     Linearisation,
     Problem,
     delayed_outputs,
@@ -173,12 +174,14 @@ def fit_series(
         )
     _check(layout)
     problem = set_up(layout, order, overhang, start == "rest")
-    c, found, converged = _minimise(problem, initial(problem, order), max_steps)
+    delayed = delayed_outputs(problem, order)
+    c, found, converged = _minimise(problem, initial(delayed), max_steps)
     _check_freedom(found, order, problem)
-    problem = rescale(problem, _noise(found, order))  # the weights that the misfit suggests
-    c, found, converged = _minimise(problem, c, max_steps)
+    noise = _noise(found, order)
+    problem = rescale(problem, noise)  # the weights that the misfit suggests
+    c, found, converged = _minimise(problem, c, max_steps, found.rescale(noise))
     if check:
-        refuse_order(problem, order, _noise(found, order))
+        refuse_order(delayed.rescale(noise * _noise(found, order)))
     covariance, freedom = _covariance(problem, c, found, errors)
     best = Estimate(c, covariance, freedom, converged)
     second = None
@@ -200,12 +203,12 @@ def fit_series(
     return _as_fit(problem, found, layout, best, second is not None)
 
 
-def refuse_order(problem: Problem, order: int, noise: Float[np.ndarray, " ny"]) -> None:
-    """Raise `DefinitionError` where data with so much noise, in the problem's units, do not carry
-    `order` multipliers."""
-    delayed = delayed_outputs(rescale(problem, noise), order)
+def refuse_order(delayed: Delayed) -> None:
+    """Raise `DefinitionError` where outputs, in units of their noise, do not carry so many
+    multipliers."""
     rows = max(delayed.freedom, 1)
-    refuse_invented(np.linalg.eigvalsh(delayed.gram) / rows, np.sqrt(2 / rows))
+    gram = delayed.gram.sum(axis=0)
+    refuse_invented(np.linalg.eigvalsh(gram) / rows, np.sqrt(2 / rows))
 
 
 def quick_fit(problem: Problem, c: np.ndarray, found: Linearisation, layout: Layout) -> SeriesFit:
@@ -245,13 +248,20 @@ def _as_fit(problem, found, layout, best: Estimate, distortion: bool) -> SeriesF
     )
 
 
-def _minimise(problem: Problem, start: np.ndarray, max_steps: int):
+def _minimise(problem: Problem, start: np.ndarray, max_steps: int, found=None):
+    """`found`: the linearisation at the start, where that is known."""
+    last = [start, found]
+
+    def at(c):
+        if c is not last[0] or last[1] is None:
+            last[:] = c, linearise(problem, c)
+        return last[1]
+
     def normal(c):
-        found = linearise(problem, c)
-        return found.residual.ravel(), found.jacobian.reshape(len(c), -1).T
+        return at(c).residual.ravel(), at(c).jacobian.reshape(len(c), -1).T
 
     c, converged = gauss_newton(normal, start, max_steps)
-    return c, linearise(problem, c), converged
+    return c, at(c), converged
 
 
 def _noise(found: Linearisation, order: int) -> Float[np.ndarray, " ny"]:

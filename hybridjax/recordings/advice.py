@@ -13,7 +13,7 @@ from ..identify.compare import compare_multipliers
 from ..identify.estimate import roots_of
 from ..identify.prediction import predict
 from ..identify.records import Record, lay_out, pieces_of
-from ..identify.regression import Regression, initial, lagged, linearise, set_up
+from ..identify.regression import Delayed, delayed_outputs, initial, linearise, set_up
 from ..identify.series import SeriesFit, fit_series, quick_fit, refuse_order
 from ..identify.validate import Validation, validate
 from .sections import SectionData
@@ -37,18 +37,11 @@ def plain_regression(
     """
     layout = lay_out(data.records if isinstance(data, SectionData) else data)
     problem = set_up(layout, order, layout.y.shape[2], False)
-    _, T, N, ny = problem.y.shape
-    gram = np.zeros((order + 1, order + 1))
-    for n in range(N):
-        V = lagged(problem.u, n, problem.lags, problem.lead) @ problem.maps[n]
-        late = np.arange(T) >= problem.first[:, n, None] + problem.free
-        for i in range(ny):
-            delays = range(order + 1)
-            rows = late & np.all([np.roll(problem.good[:, :, n, i], j, 1) for j in delays], axis=0)
-            past = np.stack([np.roll(problem.y[:, :, n, i], j, 1) for j in delays], axis=2)
-            regression = Regression.make(V, problem.slow[:, :, :0], problem.slow, rows)
-            Z = regression.solve(past)[2].reshape(-1, order + 1)
-            gram += Z.T @ Z
+    return _plain(delayed_outputs(problem, order))
+
+
+def _plain(delayed: Delayed) -> Complex[np.ndarray, " d"]:
+    gram = delayed.gram.sum(axis=0)
     return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
 
 
@@ -67,7 +60,7 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     misfits = []
     for d in range(1, most + 1):
         problem = set_up(layout, d, layout.y.shape[2], False)
-        c = initial(problem, d)
+        c = initial(delayed_outputs(problem, d))
         found = linearise(problem, c)
         if (found.freedom <= 2 * d).any():
             break
@@ -171,8 +164,9 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
             "record more, take fewer sections, or excite fewer inputs."
         )
     problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
+    delayed = delayed_outputs(problem, d)
     try:
-        refuse_order(problem, d, fit.noise / problem.scale)
+        refuse_order(delayed.rescale(fit.noise / problem.scale))
     except DefinitionError:
         found.append(
             f"Order: the data do not carry {d} multipliers. The weakest may be noise alone (or "
@@ -210,7 +204,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
                 "crossing to crossing (`CrossingPhase`, `--crossing`) may make multipliers "
                 "much surer."
             )
-    plain = plain_regression(data, d)
+    plain = _plain(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     if bias > 2 * fit.standard_errors.max():
         found.append(
