@@ -154,6 +154,9 @@ class Recording(eqx.Module):
                         f"{key} is in '{unit}' in trial '{a}', but in '{other.units[k]}' in trial "
                         f"'{b}': convert one of them."
                     )
+            if order == sorted(order):
+                trials += other.trials
+                continue
             trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
         return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
 

@@ -1,9 +1,13 @@
 """Recordings, their files, and what is refused."""
 
+import io
+
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 import hybridjax as hj
+from hybridjax.recordings.read import _all_numbers
 
 
 T = np.arange(5.0)
@@ -77,6 +81,41 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
 
 
+@given(
+    st.lists(st.floats(allow_infinity=False), min_size=1),
+    st.sampled_from(["%.17g", "%.17e", "% .17g", "%25.17g", "%.17G"]),
+)
+def test_tables_of_numbers(values, form):
+    table = np.stack([values, values[::-1], values], axis=1)
+    text = io.BytesIO()
+    np.savetxt(text, table, form, delimiter=";")
+    np.testing.assert_array_equal(_all_numbers(text.getvalue().rstrip(), b";", 3), table)
+    assert _all_numbers(text.getvalue().rstrip(), b";", 2) is None
+
+
+_PART = st.sampled_from(
+    ["1.5", "-2e-3", "nan", "e", "E+", ".", "-", " ", "NaN", "N", "A", "%", "_"]
+)
+_FIELD = st.lists(_PART, max_size=3).map("".join)
+
+
+@given(st.lists(st.lists(_FIELD, min_size=1, max_size=3), min_size=1, max_size=3))
+def test_what_is_no_number_is_not_read_as_one(rows):
+    found = _all_numbers("\n".join(map(",".join, rows)).encode(), b",", len(rows[0]))
+    if found is not None:
+        np.testing.assert_array_equal(found, [[float(x) for x in row] for row in rows])
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("missing", ["nan", "NA", ""])
+def test_ends_of_lines(tmp_path, end, missing):
+    lines = ["\ufefftime,a", f"0,{missing}", "1,+2.5e-3", "2, 3", "", ""]
+    (tmp_path / "x.csv").write_text(end.join(lines), encoding="utf-8", newline="")
+    found = hj.read_recording(tmp_path / "x.csv").trials[0]
+    np.testing.assert_array_equal(found.time, [0, 1, 2])
+    np.testing.assert_array_equal(found.values[:, 0], [np.nan, 2.5e-3, 3])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -85,7 +124,9 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
         ("0,1\n1,2\n", "begins with numbers"),
         ("\n1,2\n", "no line with the names"),
         ("time,a\n0,1\n1,x\n", "line 3: column 'a' holds 'x', which is not a number"),
+        ("time,a\n0,1\n1,2-3\n", "line 3: column 'a' holds '2-3', which is not a number"),
         ("time,a\n0,1\n1\n", "line 3: 1 fields, but the header names 2"),
+        ("time,a\n0,1\n1,2,3\n4\n", "line 3: 3 fields, but the header names 2"),
         ("time,a,a\n0,1,1\n1,2,2\n", "two columns 'a'"),
         ("t,a\n0,1\n1,2\n", "no column 'time'; its columns are t, a"),
     ],
