@@ -3,6 +3,7 @@
 import base64
 import csv
 import html
+import io
 import json
 import os
 import shutil
@@ -146,13 +147,16 @@ def _write_sections(found: Identification, folder: Path) -> None:
     with open(folder / "sections.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["trial", "record", "cycle", "section", "time", *header])
+        numbers = ",".join(["%d", "%d", "%.9g", *["%.9g"] * len(names)])
         for k, (record, times) in enumerate(zip(data.records, data.times, strict=True)):
-            n = record.start + np.arange(len(record.u))
+            place = np.divmod(record.start + np.arange(len(record.u)), data.sections)
+            start = io.StringIO()
             trial = found.recording.trials[data.trials[k]].name
-            values = np.concatenate([record.u, record.y], axis=1)
-            for i, row in enumerate(values):
-                place = (trial, k, n[i] // data.sections, n[i] % data.sections, f"{times[i]:.9g}")
-                table.writerow([*place, *(f"{x:.9g}" for x in row)])
+            csv.writer(start, lineterminator=",").writerow([trial, k])
+            line = start.getvalue().replace("%", "%%") + numbers
+            np.savetxt(
+                file, np.column_stack([*place, times, record.u, record.y]), line, newline="\r\n"
+            )
     with open(folder / "cycle.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["section", "phase", *header])
