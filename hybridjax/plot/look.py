@@ -121,10 +121,15 @@ def save(figure: Figure | Axes, path: str | os.PathLike, dpi: int = 150) -> tupl
     if path.suffix in (".png", ".pdf"):
         path = path.with_suffix("")
     paths = tuple(path.with_name(path.name + suffix) for suffix in (".png", ".pdf"))
+    layout = figure.get_layout_engine()
     try:
         with matplotlib.rc_context(_FONTS_IN_FILES):
             for one in paths:
                 figure.savefig(one, dpi=dpi)
+                figure.set_layout_engine("none")  # the second file as the first
     except OSError as error:
         raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
+    finally:
+        if layout is not None:
+            figure.set_layout_engine(layout)
     return paths

@@ -3,6 +3,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import hybridjax as hj
 
@@ -197,6 +198,7 @@ def test_saved_as_png_and_pdf(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"multipliers.png", "multipliers.pdf"}
     again = hj.plot.save(ax.get_figure(), str(tmp_path / "v1.0"))
     assert [p.name for p in again] == ["v1.0.png", "v1.0.pdf"]
+    assert isinstance(ax.get_figure().get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
         hj.plot.save(ax, tmp_path / "absent" / "x")
 
