@@ -108,8 +108,8 @@ class SeriesFit(MultiplierEstimate):
         delays = lag ** np.arange(1, len(self.coefficients) + 1)[:, None]
         slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
         by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()).real
-        spread = np.einsum("fr,nirjk->nfijk", powers, self.roots)
-        by_b = (np.abs(spread) ** 2).sum(axis=(0, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
+        spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
+        by_b = (np.abs(spread) ** 2).sum(axis=(1, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
         variance = by_c + by_b * self.noise[:, None] ** 2
         return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
 
