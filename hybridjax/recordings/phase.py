@@ -9,7 +9,6 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from .._core.errors import DefinitionError
-from .._core.threads import on_all_cores
 from .recording import Recording, Trial
 from .smoothing import FEWEST, spline
 from .tracker import track
@@ -254,12 +253,10 @@ def _angles(recording: Recording, definition: AnglePhase, smooth: bool):
     if not smooth:
         return rough
     bandwidth = definition.bandwidth or _HARMONICS * rate
-
-    def smoothed(trial):
-        time, z = trial
-        return time, angle(np.stack([spline(time, x, bandwidth).values for x in z.T], axis=1))
-
-    return on_all_cores(smoothed, found)
+    return [
+        (time, angle(np.stack([spline(time, x, bandwidth).values for x in z.T], axis=1)))
+        for time, z in found
+    ]
 
 
 def _from_function(recording: Recording, trial: Trial, function):

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.errors import DefinitionError
-from .._core.threads import on_all_cores
 from ..experiments.data import ExperimentData
 from ..identify.records import Record
 from .phase import Definition, Phase, Winding, estimate_phase
@@ -157,9 +156,8 @@ def section_data(
             f"{len(recording.trials)}."
         )
     bandwidth = sections / phase.period if bandwidth is None else bandwidth
-
-    def sampled_trial(number: int):
-        trial = recording.trials[number]
+    found, trials = [], []
+    for number, trial in enumerate(recording.trials):
         sampler = _Sampler(recording, trial, inputs, outputs, bandwidth, sampled)
         longest = max_gap
         if longest is None:
@@ -169,11 +167,8 @@ def section_data(
         parts = [p for p in parts if p is not None]
         if time is not None:
             parts = _with_times(parts, sections, phase.period, time)
-        return _deviations(parts, sections)
-
-    by_trial = on_all_cores(sampled_trial, range(len(recording.trials)))
-    found = [part for parts in by_trial for part in parts]
-    trials = [number for number, parts in enumerate(by_trial) for _ in parts]
+        found += _deviations(parts, sections)
+        trials += [number] * len(parts)
     if not found:
         raise DefinitionError("the recording holds no whole cycle to sample.")
     names = outputs if time is None else (*outputs, "time" if time == "clock" else "duration")
