@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.identify.records import lay_out
+from hybridjax.identify.regression import delayed_outputs, linearise, rescale, set_up
 
 from ..periodic.conftest import blocks_at_random
 from .test_uncertainty import covered
@@ -65,6 +67,39 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers()).real[1:], atol=1e-7)
     lags = fit.numerators.shape[1]
     np.testing.assert_allclose(fit.impulse_response(lags), model.impulse_response(lags), atol=1e-7)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_outputs_do_not_meddle(small, alike):
+    """For given coefficients each output has its own regression, in whatever unit it is."""
+    whole = record(small, 4 * 60, noise=0.1)
+    y = whole.y.copy()
+    y[np.random.default_rng(1).random(len(y)) < 0.1, : None if alike else 1] = np.nan
+    c, unit = np.array([-0.5, 0.2]), np.array([2.0, 0.1])
+
+    def of(outputs):
+        problem = set_up(lay_out(hj.Record(whole.u, y[:, outputs], sections=4)), 2, 4, False)
+        return problem, linearise(problem, c), delayed_outputs(problem, 2)
+
+    problem, both, delayed = of([0, 1])
+    other = rescale(problem, unit)
+    for i in range(2):
+        _, alone, one = of([i])
+        np.testing.assert_allclose(both.residual[..., [i], :], alone.residual, atol=1e-12)
+        np.testing.assert_allclose(both.jacobian[..., [i], :], alone.jacobian, atol=1e-12)
+        np.testing.assert_allclose(both.leverage[..., [i]], alone.leverage, atol=1e-12)
+        np.testing.assert_allclose(both.numerators[..., [i]], alone.numerators, atol=1e-12)
+        np.testing.assert_allclose(both.slope[..., [i]], alone.slope, atol=1e-11)
+        np.testing.assert_array_equal(both.freedom[:, [i]], alone.freedom)
+        np.testing.assert_allclose(delayed.gram[[i]], one.gram, rtol=1e-9)
+        for n in range(4):
+            x, z = both.roots[n][i], alone.roots[n][0]
+            np.testing.assert_allclose(x @ x.T, z @ z.T, atol=1e-12)
+    for a, b in zip(linearise(other, c)[:-1], both.rescale(unit)[:-1], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+    np.testing.assert_allclose(
+        delayed_outputs(other, 2).gram, delayed.rescale(unit).gram, rtol=1e-9
+    )
 
 
 def test_regions_cover(small):
