@@ -197,6 +197,9 @@ def walker(seeds=30, strides=100, trials=5, noise=1e-4):
             gait, "heelstrike", ("n", "s", "vn", "vs"), middle, ("s", "falling"), 0.05, 2, 2,
         ),
         "van der Pol": (oscillator, None, ("x", "v"), angle, None, 0.02, 1, 1),
+        "van der Pol, a quarter of the force": (
+            oscillator, None, ("x", "v"), angle, None, 0.005, 1, 1,
+        ),
     }  # fmt: skip
     for label, (system, event, outputs, phase, mark, size, order, overhang) in systems.items():
         where = {} if event is None else {"section": hj.AtEvent(event)}
