@@ -1,16 +1,14 @@
 """Recordings from files: CSV, NPZ and Parquet."""
 
 import csv
-import io
 import os
 import re
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from scipy.io import mmread
 
 from .._core.errors import DefinitionError, FileFormatError
 from .recording import Recording
@@ -18,17 +16,6 @@ from .recording import Recording
 
 _MISSING = {"", "nan", "na", "n/a", "null"}
 _EVENT = "event "
-# The bytes of numbers by kind, and the kinds that may come next; 0 is the edge of a field.
-_AFTER = {
-    b"0123456789": (0, 1, 2, 4),
-    b".": (0, 1, 4),
-    b"+-": (1, 2),
-    b"eE": (1, 3),
-    b" ": (1, 2, 3, 5, 6),
-    b"nN": (0, 7),
-    b"aA": (6,),
-}
-_PAIRS = bytes(8 * k + x for k, after in enumerate([_AFTER[b" "], *_AFTER.values()]) for x in after)
 
 
 def read_recording(
@@ -106,19 +93,23 @@ def _split(header: str) -> tuple[str, str]:
 
 def _csv(path: Path) -> dict[str, np.ndarray]:
     try:
-        text = path.read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-        first, _, body = text.partition(b"\n")
-        first = first.decode("utf-8-sig")
-        separator = max(",;\t", key=first.count)
-        header = next(csv.reader([first], delimiter=separator), [])
-        if not any(map(str.strip, header)):
-            raise FileFormatError(f"'{path}' has no line with the names of its columns.")
-        if all(_number(x) is not None for x in header):
-            raise FileFormatError(
-                f"'{path}' begins with numbers: its first line must name the columns."
-            )
-        values = _all_numbers(body.rstrip(b"\n"), separator.encode(), len(header))
-        if values is None:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            first = file.readline()
+            separator = max(",;\t", key=first.count)
+            header = next(csv.reader([first], delimiter=separator), [])
+            if not any(map(str.strip, header)):
+                raise FileFormatError(f"'{path}' has no line with the names of its columns.")
+            if all(_number(x) is not None for x in header):
+                raise FileFormatError(
+                    f"'{path}' begins with numbers: its first line must name the columns."
+                )
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of no data, which is told below
+                    values = np.loadtxt(file, delimiter=separator, ndmin=2, comments=None)
+            except ValueError:
+                values = None
+        if values is None or values.shape[1] != len(header):
             values = _by_line(path, separator, header)
     except UnicodeDecodeError as error:
         raise FileFormatError(f"'{path}' is not a text file.") from error
@@ -130,31 +121,8 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(header, values.T, strict=True))
 
 
-def _all_numbers(body: bytes, separator: bytes, columns: int) -> Float[np.ndarray, "n k"] | None:
-    """The table, if it is nothing but numbers and `nan`.
-
-    Matrix Market files are read several times as fast as others, by a parser that takes whatever
-    begins like a number for one: we look first whether each field is one, all of it.
-    """
-    field = rb" *(?:-?\.?(?:[eE][-+]?)?|[nN][aA][nN])"  # without its digits
-    line = re.compile(separator.join([field] * columns))
-    if not all(map(line.fullmatch, set(body.translate(None, b"0123456789").split(b"\n")))):
-        return None
-    kinds = [separator + b"\n", *_AFTER]
-    to_kind = bytes.maketrans(b"".join(kinds), bytes(k for k, x in enumerate(kinds) for _ in x))
-    text = np.frombuffer((b"\n" + body + b"\n").translate(to_kind), np.uint8)
-    if (len(kinds) * text[:-1] + text[1:]).tobytes().translate(None, _PAIRS):
-        return None
-    size = b"%d %d\n" % (columns, body.count(b"\n") + 1)
-    lines = b"%%MatrixMarket matrix array real general\n" + size + body.replace(separator, b"\n")
-    try:
-        return mmread(io.BytesIO(lines)).T
-    except ValueError:
-        return None
-
-
 def _by_line(path: Path, separator: str, header: list[str]) -> np.ndarray:
-    """For files with other fields than numbers, or with an error that needs a line number."""
+    """For files with missing fields, or with an error that needs a line number."""
     rows = []
     with open(path, encoding="utf-8-sig", newline="") as file:
         for number, fields in enumerate(csv.reader(file, delimiter=separator), 1):
