@@ -64,7 +64,7 @@ def respond(
         i, j = k % N, (k + 1) % N
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
-        target = placed.target(jnp.full(S, j), lanes.t, jnp.full(S, turns))
+        target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.order)
         moved = move(system, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
         # An event may change places with a section, but none may be left out or come in addition.

@@ -14,7 +14,7 @@ from .hermite import NEAR, control_points, root_near_end
 from .lanes import Lanes, for_each_chart, only
 from .step import Step, rk_step
 from .target import Target
-from .watch import Watch, chart_field, nothing, settle, take, values, watched, write
+from .watch import Watch, chart_field, nothing, pick, settle, take, values, watched, write
 
 
 # A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
@@ -174,13 +174,9 @@ def _go_home(
 ) -> _Home:
     """From the end of a step onto the zero of `which`, on either side of it."""
     value, rate = values(s, a, target, t + tau, step.q, u, index, step.f1)
-    chosen = jnp.array(rows)[:, None] == which
-    ends = [
-        jnp.sum(jnp.where(chosen, x, 0.0), axis=0)
-        for x in (before[0], value, tau * before[1], tau * rate, rate)
-    ]
-    by_cubic = tau * (root_near_end(*ends[:4]) - 1)
-    by_newton = -ends[1] / jnp.where(ends[4] == 0, 1.0, ends[4])
+    v0, r0, v1, r1 = (pick(x, rows, which) for x in (*before, value, rate))
+    by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
+    by_newton = -v1 / jnp.where(r1 == 0, 1.0, r1)
     first = jnp.where(tau > 1e-3 * reach, by_cubic, by_newton)
     near = (which >= 0) & (jnp.abs(first) <= reach)
     first = jnp.where(near, first, 0.0)

@@ -44,11 +44,13 @@ def for_each_chart(
 
 
 def only(mask: Bool[Array, " L"], x: Array) -> Array:
-    """`x`, with the lanes outside `mask` replaced by one lane of it.
+    """`x`, with the lanes outside `mask` replaced by one lane of it; itself if it is one for all.
 
     A chart's functions are thus never evaluated at another chart's states, where they might be
     undefined; NaN there would poison reverse-mode derivatives even if it is masked afterwards.
     """
+    if x.shape[-1] < mask.shape[0]:
+        return x
     return jnp.where(mask, x, x[..., jnp.argmax(mask)][..., None])
 
 

@@ -26,7 +26,7 @@ from .lanes import Lanes
 from .stride import Stride
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape, blank_tape, write_row
 from .target import Target
-from .watch import Watch, watch
+from .watch import Watch, pick, watch
 
 
 # Steps below this fraction of the time allowed (in double and in single precision) are not taken.
@@ -183,7 +183,7 @@ def _eventfully(
     tau = approach.tau + new.past
     enough = 1e-6 * approach.reach + at_precision(1e-13, 1e-6) * span
     inside = (tau >= -enough) & (tau <= approach.reach + enough)
-    falling = _row(end.rate, jnp.maximum(aim.which, 0)) < 0
+    falling = _of(end.rate, aim.which) < 0
     lands = active & new.lands & falling & jnp.where(approach.on, inside, near)
     closer = active & approach.on & ~lands & (approach.tries < _TRIES)
     lost = active & approach.on & ~lands & ~closer
@@ -219,7 +219,7 @@ def _eventfully(
     level = lands & (aim.which == G)
     on_time = plain & way.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    speed = jnp.abs(_row(end.rate, jnp.maximum(aim.which, 0)))
+    speed = jnp.abs(_of(end.rate, aim.which))
     slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
     pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.order, lanes.events, fired)
@@ -237,7 +237,7 @@ def _eventfully(
     after, seen, aimed = _reset(s, after, seen, ready[-1], fired, u, target, together, span)
 
     # 4. The next step, and reasons to stop.
-    fastest = jnp.maximum(jnp.abs(_row(state.seen.rate, which)), jnp.abs(_row(end.rate, which)))
+    fastest = jnp.maximum(jnp.abs(_of(state.seen.rate, which)), jnp.abs(_of(end.rate, which)))
     approach = Approach(
         crosses | closer,
         jnp.where(crosses, which, approach.which),
@@ -299,7 +299,7 @@ def _reset(s, lanes: Lanes, seen, aimed, fired, u, target, together, span):
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, u, fired)
         new = eqx.tree_at(lambda x: (x.q, x.chart), lanes, (q, chart))
         after = watch(s, new.t, chart, q, u, target, fires)
-        residue = jnp.abs(_row(seen.value, jnp.maximum(fired, 0)))
+        residue = jnp.abs(_of(seen.value, fired))
         new = rearm(s, new, after, fired, together, span, u, residue)
         return new, _merge(fires, after, seen), jnp.where(fires, _aims(after, span), aimed)
 
@@ -315,8 +315,9 @@ def _merge(mask, new: Watch, old: Watch) -> Watch:
     return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
 
 
-def _row(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
-    return jnp.take_along_axis(x, which[None], axis=0)[0]
+def _of(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
+    """Each lane's entry in the row `which`; 0 for -1."""
+    return pick(x, range(len(x)), which)
 
 
 def _expected(order, events, fired):

@@ -156,17 +156,16 @@ class ClockPhase(AbstractSections):
 
 class _PhaseLevels(AbstractLevels):
     phase: "KinematicPhase"
-    angle: Float[Array, " N"]
-    sense: Float[Array, ""]
+    across: Float[Array, "2 N"]
+    """What multiplies (r_p, r_v) in the level: it falls in the sense in which the cycle turns."""
 
     def present(self, s, a):
         return s.resolve_outputs((self.phase.position, self.phase.velocity)).defined(a)
 
     def level(self, s, a, i, t, q):
         position, velocity = self.phase.plane(s, a, t, q)
-        angle = self.angle[i]
-        across = velocity * jnp.cos(angle) - position * jnp.sin(angle)
-        return jnp.where(i < 0, 1.0, -self.sense * across)
+        across = self.across[:, i]
+        return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)
 
 
 class KinematicPhase(AbstractSections):
@@ -215,7 +214,9 @@ class KinematicPhase(AbstractSections):
         sense = jax.lax.stop_gradient(jnp.sign(rate))
         first = angle if isinstance(self.start, Crossing) else self.start
         steps = 2 * jnp.pi * jnp.arange(self.count) / self.count
-        levels = _PhaseLevels(self, first + sense * steps, sense)
+        angle = first + sense * steps
+        across = sense * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+        levels = _PhaseLevels(self, across)
         never = jnp.full(self.count, jnp.inf)
         return Bound(never, _no_events(self.count), levels, jnp.asarray(period))
 

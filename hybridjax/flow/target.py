@@ -28,13 +28,14 @@ class AbstractLevels(eqx.Module):
 
 
 class Target(eqx.Module):
-    """The ends of a piece of flow, one per lane."""
+    """The ends of a piece of flow, one per lane. Section and event may be the same for all, as
+    arrays of one."""
 
     time: Float[Array, " L"]
     """End at this time; infinity if the end is not at a known time."""
-    index: Int[Array, " L"]
+    index: Int[Array, " #L"]
     """End at the section of this index, if `levels` is given."""
-    event: Int[Array, " L"]
+    event: Int[Array, " #L"]
     """End right after the transition of this index; -1 for none."""
     limit: Float[Array, " L"]
     """Give up at this time."""

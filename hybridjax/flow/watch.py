@@ -1,5 +1,6 @@
 """The functions whose zeros end a move: guards, and the level function of the target section."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -107,6 +108,17 @@ def write(out: Watch, rows: list[int], here: Bool[Array, " L"], new: Watch) -> W
     )
 
 
+def pick(x: Float[Array, "R L"], rows: Sequence[int], which: Int[Array, " L"]):
+    """Each lane's entry in the row of its function `which`; 0 where that is not among `rows`.
+
+    (A chain of selections: unlike a sum or a gather, XLA computes it together with its users.)
+    """
+    out = jnp.zeros_like(x[0])
+    for k, row in enumerate(rows):
+        out = jnp.where(which == row, x[k], out)
+    return out
+
+
 class Settled(NamedTuple):
     """Lanes moved onto the zero of the function that they cross."""
 
@@ -130,12 +142,11 @@ def settle(s: Structure, a: int, target: Target, t, q, f, u, index, which, first
     exactly, to second order: this is the saltation formula.
     """
     field = chart_field(s, a, u)
-    chosen = jnp.array(watched(s, a, target))[:, None] == which
+    rows = watched(s, a, target)
 
     def newton(t, q, f):
         value, rate = values(s, a, target, t, q, u, index, f)
-        value = jnp.sum(jnp.where(chosen, value, 0.0), axis=0)
-        rate = jnp.sum(jnp.where(chosen, rate, 0.0), axis=0)
+        value, rate = pick(value, rows, which), pick(rate, rows, which)
         return -value / jnp.where(rate == 0, 1.0, rate)
 
     first = newton(t, q, f) if first is None else first

@@ -69,14 +69,17 @@ class PlacedSections(eqx.Module):
             names.append(tuple(all_names[k] for k in keep if k or timed))
         return tuple(names)
 
-    def target(self, i: Int[Array, " L"], t: Float[Array, " L"], turns: Int[Array, " L"]) -> Target:
+    def target(
+        self, i: Int[Array, " #L"], t: Float[Array, " L"], turns: Int[Array, " #L"]
+    ) -> Target:
         """The target of lanes that flow to section i, `turns` periods after the first turn.
 
         A lane gives up half a period after the cycle itself would have arrived.
         """
         arrival = self.lanes.t[i] + turns * self.cycle.period
+        time = self.bound.time[i] + turns * self.cycle.period
         return Target(
-            self.bound.time[i] + turns * self.cycle.period,
+            jnp.broadcast_to(time, t.shape),
             i,
             self.bound.event[i],
             jnp.maximum(arrival, t) + 0.5 * self.cycle.period,
