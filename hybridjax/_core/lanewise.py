@@ -36,6 +36,13 @@ def shared(tree: Any) -> Any:
     return tree.tree if isinstance(tree, PerLane) else tree
 
 
+def _own(tree: Any) -> tuple[bool, ...]:
+    """Which of the tree's arrays have one entry for each lane."""
+    if isinstance(tree, PerLane):
+        return tree.own
+    return tuple(False for _ in jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_array)))
+
+
 def by_lane(function: Callable, *trees: Any) -> Callable:
     """Vectorise `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
@@ -44,6 +51,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     """
     arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
+    alone = [not own for x in trees for own in _own(x)]
 
     def one(arrays, *arguments):
         return function(*eqx.combine(arrays, rest), *arguments)
@@ -54,7 +62,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
         arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
         in_axes = (axes, *[None if c else -1 for c in common])
         many = lanes >= _MANY
-        work = vectorised(one) if many else one
+        work = vectorised(one, alone + common) if many else one
         return jax.vmap(work, in_axes=in_axes, out_axes=-1)(arrays, *arguments)
 
     return call
