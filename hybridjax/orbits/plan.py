@@ -4,7 +4,6 @@ A plan serves prediction, step lengths and error estimates, not control flow: la
 way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
-import functools as ft
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -67,32 +66,76 @@ class Plan(eqx.Module):
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
 
 
-@quick_jit
 def make_plan(
-    placed: PlacedSections,
-    settings: Settings,
-    accuracy: Float[Array, ""],
-    scale: Float[Array, "N n"],
+    placed: PlacedSections, settings: Settings, accuracy: float, scale: Float[np.ndarray, "N n"]
 ) -> Plan:
     """Find the cheapest way between sections that keeps the accuracy asked for.
 
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
     """
+    N = placed.count
+    ways = jax.device_get(_try_ways(placed, settings, jnp.asarray(scale)))
+    K = len(ways.estimate)
+    exact = ways.ends[:, K]
+    J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1))
+    J = J / scale[:, None, :]
+    J[~np.asarray(placed.time_is_state), :, 0] = 0.0
+    error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
+    if not placed.cycle.clocked:
+        error[..., 0] = 0.0
+    impact = np.maximum(_impact(J, error, scale), _ROUNDING)
+    impact = np.where(np.isnan(impact), np.inf, impact)
+    estimate = np.maximum(ways.estimate, 1e-6)
+
+    # The largest share of the accuracy for each section that keeps their sum.
+    section = np.arange(N)
+    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
+        best = _cheapest(impact, share)
+        total = impact[best, section].sum()
+        if total <= accuracy:
+            break
+    spare = np.clip(accuracy / total, 1e-6, _SLACK)
+    impact, estimate = impact[best, section], estimate[best, section]
+    # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
+    together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
+    weight = impact / estimate * np.maximum(together, 1 / _CANCEL)
+    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
+    share = np.minimum(accuracy * estimate / impact, 1.0) / N
+    slack = np.where(best < len(_PIECES), np.maximum(spare * estimate, share), ways.slack[best])
+    return Plan(*map(jnp.asarray, (ways.first[best, section], ways.lead, slack, weight)))
+
+
+class _Ways(NamedTuple):
+    """What was tried from every section to the next."""
+
+    ends: Float[Array, "n B N"]
+    """(t, q) after each of K ways to go, after the reference, and after it from starts that are
+    nudged in each coordinate; NaN for those that do not arrive."""
+    estimate: Float[Array, "K N"]
+    """Error estimates of the ways to go, relative to the tolerance."""
+    first: Float[Array, "K N"]
+    """Their first steps."""
+    slack: Float[Array, " K"]
+    lead: Float[Array, " N"]
+
+
+@quick_jit
+def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N n"]) -> _Ways:
     N, n = scale.shape
     K = len(_PIECES) + len(_PARTS)
     patience = max(settings.max_steps, PATIENCE)
-    section = jnp.arange(N)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
     by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
     longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
 
     # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
-    nudge = _NUDGE * scale.T[None] * jnp.eye(n)[:, :, None]
-    nudge = jnp.concatenate([jnp.zeros((K + 1, n, N)), nudge])
-    divide = jnp.array([*_PIECES, *[_PIECES[-1]] * len(_PARTS), *[2] * (1 + n)])
-    slack = jnp.array([*[jnp.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
-    rtol = jnp.where(jnp.isfinite(slack) & (jnp.arange(len(slack)) < K), settings.rtol, _TIGHT)
+    nudge = _NUDGE * scale.T[None] * np.eye(n)[:, :, None]
+    nudge = jnp.concatenate([np.zeros((K + 1, n, N)), nudge])
+    divide = np.array([*_PIECES, *[_PIECES[-1]] * len(_PARTS), *[2] * (1 + n)])
+    slack = np.array([*[np.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
+    by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
+    rtol = jnp.where(by_estimate, settings.rtol, _TIGHT)
     u = jnp.zeros((len(placed.cycle.system.inputs), N))
 
     def block(xs):
@@ -105,41 +148,16 @@ def make_plan(
         ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
         return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
 
-    ends, error = jax.lax.map(block, (nudge, divide, slack, rtol))
-    ends = jnp.moveaxis(ends, 0, 1)
+    ends, error = jax.lax.map(block, (nudge, jnp.asarray(divide), jnp.asarray(slack), rtol))
     estimate = error[:K] * (rtol[:K, None] / settings.rtol)
-    exact = ends[:, K]
-    J = jnp.transpose((ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1)) / scale[:, None, :]
-    J = J.at[:, :, 0].set(jnp.where(placed.time_is_state[:, None], J[:, :, 0], 0.0))
-    error = jnp.transpose(ends[:, :K] - exact[:, None], (1, 2, 0))
-    if not placed.cycle.clocked:
-        error = error.at[..., 0].set(0.0)
-    impact = jnp.maximum(_impact(J, error, scale), _ROUNDING)
-    impact = jnp.where(jnp.isnan(impact), jnp.inf, impact)
-    estimate = jnp.maximum(estimate, 1e-6)
-
-    # The largest share of the accuracy for each section that keeps their sum.
-    shares = accuracy * 0.5 ** jnp.arange(0, 4 + N.bit_length())
-    best = jax.vmap(ft.partial(_cheapest, impact))(shares)
-    total = jnp.sum(impact[best, section], axis=1)
-    k = jnp.where((total <= accuracy).any(), jnp.argmax(total <= accuracy), len(shares) - 1)
-    best, spare = best[k], jnp.clip(accuracy / total[k], 1e-6, _SLACK)
-    impact, estimate = impact[best, section], estimate[best, section]
-    # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
-    together = _CAUTION * _accumulated(J, error[best, section], scale) / jnp.sum(impact)
-    weight = impact / estimate * jnp.maximum(together, 1 / _CANCEL)
-    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
-    share = jnp.minimum(accuracy * estimate / impact, 1.0) / N
-    by_steps = jnp.maximum(spare * estimate, share)
-    return Plan(
-        longest / divide[best], lead, jnp.where(best < len(_PIECES), by_steps, slack[best]), weight
-    )
+    first = longest / divide[:K, None]
+    return _Ways(jnp.moveaxis(ends, 0, 1), estimate, first, jnp.asarray(slack[:K]), lead)
 
 
-def _cheapest(impact: Float[Array, "K N"], share) -> Int[Array, " N"]:
+def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
     """The first candidate of each section whose impact is at most `share`, or the best one."""
     enough = impact <= share
-    return jnp.where(enough.any(axis=0), jnp.argmax(enough, axis=0), jnp.argmin(impact, axis=0))
+    return np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
 
 
 def _lead(placed: PlacedSections, target):
@@ -154,36 +172,28 @@ def _lead(placed: PlacedSections, target):
     return jnp.where((lead > 0.3) & (lead < 3.0), lead, 1.0)
 
 
-def _impact(J, error, scale) -> Float[Array, "K N"]:
+def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
     """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
-    N = scale.shape[0]
-
-    def follow(carry, m):
-        error, worst = carry
-        at = (jnp.arange(N) + 1 + m) % N
-        worst = jnp.maximum(worst, jnp.max(jnp.abs(error) / scale[at], axis=-1))
-        return (jnp.einsum("kij,ckj->cki", J[at], error), worst), None
-
-    def turn(error, _):
-        none = jnp.zeros(error.shape[:2])
-        (error, worst), _ = jax.lax.scan(follow, (error, none), jnp.arange(N))
-        return error, worst
-
-    _, worst = jax.lax.scan(turn, error, None, length=_TURNS)
-    ratio = jnp.clip(worst[-1] / jnp.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
-    return jnp.sum(worst, axis=0) + worst[-1] * ratio / (1 - ratio)
+    N = len(scale)
+    section, worst = np.arange(N), np.zeros((_TURNS, *error.shape[:2]))
+    for m in range(_TURNS * N):
+        at = (section + 1 + m) % N
+        now = worst[m // N]
+        np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
+        error = np.einsum("kij,ckj->cki", J[at], error)
+    last, before = worst[-1], worst[-2]
+    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    return worst.sum(axis=0) + last * ratio / (1 - ratio)
 
 
-def _accumulated(J, error, scale) -> Float[Array, ""]:
+def _accumulated(J, error, scale) -> float:
     """The largest error, relative to the scales, when every section makes its `error` (N, n)."""
-    N = scale.shape[0]
-
-    def follow(carry, m):
-        total = J[m % N] @ carry + error[m % N]
-        return total, jnp.max(jnp.abs(total) / scale[(m + 1) % N])
-
-    _, sizes = jax.lax.scan(follow, jnp.zeros(scale.shape[1]), jnp.arange(_TURNS * N))
-    return jnp.max(sizes)
+    N = len(scale)
+    total, largest = np.zeros(scale.shape[1]), 0.0
+    for m in range(_TURNS * N):
+        total = J[m % N] @ total + error[m % N]
+        largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
+    return largest
 
 
 def section_scales(placed: PlacedSections, scale: Mapping[str, float] | None) -> np.ndarray:
@@ -236,7 +246,7 @@ def plan_flow(
     def make() -> Planned:
         scales = section_scales(placed, scale)
         settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
-        plan = make_plan(placed, settings, jnp.asarray(accuracy), jnp.asarray(scales))
+        plan = make_plan(placed, settings, accuracy, scales)
         return Planned(plan, settings, scales)
 
     return _made.recall(placed, (float(accuracy), tuple(sorted((scale or {}).items()))), make)

@@ -34,7 +34,7 @@ def experiment(request, lossy_cycle):
         ),
     }[request.param]
     placed = hj.place_sections(lossy_cycle, family)
-    plan = make_plan(placed, SETTINGS, jnp.asarray(1e-11), jnp.ones((N, 5)))
+    plan = make_plan(placed, SETTINGS, 1e-11, np.ones((N, 5)))
     start = jnp.concatenate([placed.lanes.t[None], placed.lanes.q])[:, :1]
 
     def run(x, u):
