@@ -93,8 +93,8 @@ def responding(placed, plan, start, u, outputs, settings):
 
 
 def program(*arguments) -> jax.Array:
-    """`responding` as `run_experiments` has compiled it."""
-    return _respond(*arguments).y
+    """`responding` as `run_experiments` has compiled it for many experiments."""
+    return _respond[False](*arguments).y
 
 
 def record(data: hj.ExperimentData) -> np.ndarray:

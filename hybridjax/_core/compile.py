@@ -6,6 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
+from .collection import uncollected
 from .tracing import is_traced
 
 
@@ -22,15 +23,15 @@ def quick_jit(function: Callable) -> Callable:
     `filter_jit`: there the outer program decides.
     """
     plain = eqx.filter_jit(function)
+    on_cpu = lambda: jax.default_backend() == "cpu"  # noqa: E731
 
     @ft.cache
     def quick():
         return eqx.filter_jit(function, compiler_options=_options())
 
-    @ft.wraps(function)
-    def call(*arguments):
+    def run(*arguments):
         # JAX refuses the options below the top level only after it has traced the function.
-        if jax.default_backend() != "cpu" or is_traced(arguments):
+        if not on_cpu() or is_traced(arguments):
             return plain(*arguments)
         try:
             return quick()(*arguments)
@@ -39,6 +40,12 @@ def quick_jit(function: Callable) -> Callable:
                 raise
             return plain(*arguments)
 
+    @ft.wraps(function)
+    def call(*arguments):
+        with uncollected:
+            return run(*arguments)
+
+    call.lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)
     return call
 
 

@@ -18,7 +18,11 @@ from ..flow.move import Settings
 from ..systems.structure import check_system
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
-from .tiles import Tiles
+from .tiles import FULL, QUICK, Tiles
+
+
+# Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
+_SMALL = 2000
 
 
 class LimitCycles(eqx.Module):
@@ -144,7 +148,8 @@ def find_limit_cycles(
             f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
             "find_limit_cycle first."
         )
-    tiles = Tiles(systems, guess, settings, min(batch, S), thread_count(workers))
+    programs = QUICK if S <= _SMALL else FULL
+    tiles = Tiles(systems, guess, settings, min(batch, S), thread_count(workers), programs)
     found = tiles.solve(S, progress)
     seen = found.seen
     return LimitCycles(

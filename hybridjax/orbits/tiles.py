@@ -1,5 +1,6 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,8 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from .._core.collection import uncollected
+from .._core.compile import quick_jit
 from .._core.results import Result
 from .._core.threads import in_threads
 from ..flow.lanes import Lanes
@@ -23,7 +26,7 @@ from .return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_j
 
 # Newton steps before a system is given up, or tried again; and before it is left until those that
 # need more steps than most go on together.
-_NEWTON, _USUAL = 8, 4
+_NEWTON, _USUAL = 6, 3
 # Periods for which a system flows freely before Newton tries again.
 _SETTLE = 40
 # Up to this many parameters, guesses from neighbours are quadratic.
@@ -57,6 +60,7 @@ class Tiles(NamedTuple):
     size: int
     """Systems in one compiled call."""
     workers: int
+    programs: "Programs"
 
     @property
     def parameters(self) -> Float[np.ndarray, "S p"]:
@@ -79,7 +83,8 @@ class Tiles(NamedTuple):
         order = np.random.default_rng(0).permutation(S)
         bar = tqdm(total=S, disable=not progress, desc="cycles")
         rows = order[: self.size]
-        out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
+        with uncollected:  # here the programs are compiled
+            out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
         bar.update(len(rows))
         while (done := len(out.result)) < S:
             rows = order[done : 2 * done]
@@ -90,7 +95,7 @@ class Tiles(NamedTuple):
         late = np.flatnonzero(out.size > 1)
         if len(late):
             start, period = _pick((out.start, out.period), late)
-            out = _replace(out, late, self._newton(order[late], start, period, _NEWTON))
+            out = _replace(out, late, self._newton(order[late], start, period, _NEWTON - _USUAL))
         return _pick(self._again(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
@@ -104,7 +109,9 @@ class Tiles(NamedTuple):
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
-        begin = self._in_tiles(_settled, self._threads, rows[failed], *self._given(len(failed)))
+        begin = self._in_tiles(
+            self.programs.settled, self._threads, rows[failed], *self._given(len(failed))
+        )
         there = np.isfinite(begin[0].q).all(axis=(1, 2))
         if not there.any():
             return out
@@ -139,14 +146,14 @@ class Tiles(NamedTuple):
                 break
             part = self._step(rows[going], *_pick((out.start, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        judged = self._in_tiles(_verdict, 1, rows, out.start, out.period, out.seen)
+        judged = self._in_tiles(self.programs.verdict, 1, rows, out.start, out.period, out.seen)
         start, period, factors, result = judged
         return out._replace(start=start, period=period, factors=factors, result=result)
 
     def _step(self, rows, start: Lanes, period) -> Rounds:
         """One step of Newton's method."""
         start, period, residual, jacobian, seen, codes = self._in_tiles(
-            _turn, self._threads, rows, start, period
+            self._turn, self._threads, rows, start, period
         )
         q, size = newton_step(start.q[..., 0], residual, jacobian)
         # A turn that closes but met its section too often was given too long a period.
@@ -155,6 +162,10 @@ class Tiles(NamedTuple):
         size[extra] = np.inf
         start, once = eqx.tree_at(lambda x: x.q, start, q[..., None]), np.ones(len(rows), int)
         return Rounds(start, size, period, seen.factors, seen, codes, -once, once)
+
+    def _turn(self, *arguments):
+        *found, codes = self.programs.turn(*arguments)
+        return *found, front(np.asarray(codes))
 
     @property
     def _threads(self) -> int:
@@ -193,14 +204,21 @@ def _join(*parts):
 def _of_one_width(parts):
     """Arrays with as many columns as the widest, filled up with -1 (codes of events)."""
     width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
+    if all(x.ndim != 2 or x.shape[1] == width for x in parts):
+        return parts
     fill = lambda x: ((0, 0), (0, width - x.shape[1]))  # noqa: E731
     return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
-    place = np.arange(len(out.result))
-    place[rows] = len(place) + np.arange(len(rows))
-    return _pick(_join(out, new), place)
+    """`out` with other values in some rows, which are written in place where they fit."""
+
+    def put(x, y):
+        x, y = _of_one_width((x, y))
+        x[rows] = y
+        return x
+
+    return jax.tree_util.tree_map(put, out, new)
 
 
 def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
@@ -216,14 +234,9 @@ def _kind(guess: LimitCycle) -> ReturnMap:
     return ReturnMap(guess.base, guess.conserved, guess.turns)
 
 
-def _turn(*arguments):
+def _turn(systems, guess: LimitCycle, start: Lanes, period, settings):
     """One turn of every system from its start, at the same phase of its own clock."""
-    *found, codes = _turn_with_codes(*arguments)
-    return *found, front(np.asarray(codes))
 
-
-@eqx.filter_jit
-def _turn_with_codes(systems, guess: LimitCycle, start: Lanes, period, settings):
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
         kind = _kind(guess)
@@ -236,7 +249,6 @@ def _turn_with_codes(systems, guess: LimitCycle, start: Lanes, period, settings)
     return eqx.filter_vmap(one)(systems, start, period)
 
 
-@eqx.filter_jit
 def _verdict(systems, guess: LimitCycle, start: Lanes, period, seen: Turn, settings):
     """The starts ready to be left, periods, factors, and result codes."""
 
@@ -246,7 +258,6 @@ def _verdict(systems, guess: LimitCycle, start: Lanes, period, seen: Turn, setti
     return eqx.filter_vmap(one)(systems, start, period, seen)
 
 
-@eqx.filter_jit
 def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
     """Where systems are after they have flowed freely for a while, at the guess's phase or
     section (NaN for those that do not get there), and their expected periods."""
@@ -279,3 +290,17 @@ def _on_clock(system, guess: LimitCycle, start: Lanes, expected: Array):
         expected = guess.turns * jnp.asarray(system.period(), float)
         start = eqx.tree_at(lambda x: x.t, start, guess.start.t / guess.period * expected)
     return start, expected
+
+
+class Programs(NamedTuple):
+    """The functions above, compiled."""
+
+    turn: Callable
+    verdict: Callable
+    settled: Callable
+
+
+# For few systems, and for many.
+QUICK, FULL = (
+    Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, eqx.filter_jit)
+)

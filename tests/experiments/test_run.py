@@ -16,6 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
+from hybridjax._core.compile import quick_jit
 from hybridjax.experiments import campaign, respond
 
 from ..conftest import OUTPUTS
@@ -171,8 +172,9 @@ def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isoc
     assert not compiled
 
 
+@pytest.mark.parametrize("small", (True, False))
 def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
-    hopper_cycle, placed_isochrons, monkeypatch
+    hopper_cycle, placed_isochrons, monkeypatch, small
 ):
     traced = []
 
@@ -180,8 +182,10 @@ def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
         traced.append(1)
         return respond.respond(*arguments)
 
-    monkeypatch.setattr(campaign, "_respond", eqx.filter_jit(counted))
+    programs = {True: quick_jit(counted), False: eqx.filter_jit(counted)}
+    monkeypatch.setattr(campaign, "_respond", programs)
     monkeypatch.setattr(campaign, "_compiled", set())
+    monkeypatch.setattr(campaign, "_SMALL", campaign._SMALL * small)
     u = np.zeros((2, 32, 1))
     for accuracy in (1e-7, 1e-8):  # a plan of its own for each
         data = hj.run_experiments(
@@ -191,7 +195,7 @@ def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
     assert len(traced) == 1
 
 
-@hypothesis.settings(max_examples=15, deadline=None)
+@hypothesis.settings(max_examples=15)
 @hypothesis.given(st.integers(0, 2**32 - 1), st.sampled_from([60, 80, 100]))
 def test_second_order_products_can_be_kept_off_the_lines(seed, experiments):
     design = hj.multisine(

@@ -83,8 +83,9 @@ def test_programs_in_threads_factorise_nothing(wheel):
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
     start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.start, wheel.period))
     start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
-    lowered = tiles._turn_with_codes.lower(systems, wheel, start, period, wheel.settings)
-    assert "lapack" not in lowered.as_text()
+    for programs in (tiles.QUICK, tiles.FULL):
+        lowered = programs.turn.lower(systems, wheel, start, period, wheel.settings)
+        assert "lapack" not in lowered.as_text()
 
 
 def test_a_guess_with_too_long_a_period(wheel):
