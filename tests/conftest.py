@@ -1,5 +1,6 @@
 import pathlib
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import hybridjax as hj
 
 
 hj.enable_x64()
+hypothesis.settings.register_profile("untimed", hypothesis.settings.default, deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 DATA = pathlib.Path(__file__).parent / "data"
 

@@ -93,7 +93,7 @@ def test_a_file_can_be_read_without_the_package(folder, things):
 numbers = st.floats(width=64)  # with NaN, infinities, signed zeros and subnormals
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.data())
 def test_round_trip_of_any_htf(folder, data):
     F, ny, nu = data.draw(array_shapes(min_dims=3, max_dims=3, max_side=3))
@@ -105,7 +105,7 @@ def test_round_trip_of_any_htf(folder, data):
     assert same(htf, trip(folder, htf))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.data())
 def test_round_trip_of_any_fit(folder, data):
     ny, p, q = (data.draw(st.integers(1, 3)) for _ in range(3))
@@ -119,7 +119,7 @@ def test_round_trip_of_any_fit(folder, data):
     assert same(fit, trip(folder, fit))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_damaged_files_are_refused_or_harmless(folder, things, data):
     thing = things[data.draw(st.integers(0, len(things) - 1))]

@@ -26,7 +26,7 @@ bands = st.tuples(st.integers(1, 9), st.integers(2, 12)).flatmap(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     bands,
     st.integers(0, 5),

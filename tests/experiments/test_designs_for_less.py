@@ -31,7 +31,7 @@ def test_even_products_miss_the_lines(lines, periods, count, frequencies):
         assert products(j, periods).isdisjoint(np.minimum(j % periods, -j % periods).tolist())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(3, 24),
     st.integers(2, 16),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, given, strategies as st
 
 from hybridjax.fitting.identifiability import diagnose
 
@@ -43,7 +43,6 @@ def test_everything_seen_and_nothing_seen():
     assert few.descriptions() == ["a and b apart, only their product"]
 
 
-@settings(deadline=None)
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=3))
 def test_the_basis_spans_what_is_not_seen(rows):
     rows = np.array(rows, float)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 import hybridjax as hj
 from hybridjax.fitting.parameters import free_parameters
@@ -15,7 +15,6 @@ VALUES = st.floats(0.6, 39.0)
 COORDINATES = st.floats(-8.0, 8.0)
 
 
-@settings(deadline=None)
 @given(VALUES, BOUNDS, COORDINATES)
 def test_values_come_back_and_keep_to_their_bounds(value, bounds, x):
     parameters = free_parameters(HOPPER(k=value), {"k": bounds})

@@ -14,7 +14,7 @@ def model(A):
     return hj.LDTP(A, jnp.ones((len(A), d, 1)), jnp.ones((len(A), 1, d)))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**16), st.floats(1e-6, 0.5))
 def test_it_is_bounded_as_stated(seed, smoothing):
     A = np.random.default_rng(seed).normal(size=(2, 3, 3))

@@ -63,7 +63,7 @@ def test_grazing(gap):
         np.testing.assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(exponent=st.floats(-9.0, -1.0))
 def test_a_guard_that_dips_within_a_step_fires(exponent):
     depth = 10**exponent
@@ -108,7 +108,7 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, or
     assert found.after[-1, 2] == len(found.events)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @example(gap=2e-12, sign=1, k=1.0)  # the later one is found first, then the other is behind
 @given(
     gap=st.floats(-12.0, -2.0).map(lambda x: 10**x),
@@ -144,7 +144,7 @@ def test_scheduled_events():
     np.testing.assert_allclose(on_cycle.after[-1, 0], x0, rtol=1e-10)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(k=st.integers(1, 40), pieces=st.integers(2, 7))
 def test_a_tick_at_the_end_of_a_piece_happens_once(k, pieces):
     """Times such as 0.3 and 3 * 0.1 differ by rounding; the tick between is counted once."""
@@ -267,7 +267,7 @@ def test_bad_inputs(value, message):
         hj.simulate(hj.models.BouncingBall(), "fall", (1.0, 0.0), 1.0, input=value)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(y=st.floats(), v=st.floats(), duration=st.floats(), time=st.floats())
 def test_any_numbers_give_a_trajectory_or_a_clear_error(y, v, duration, time):
     try:

@@ -41,7 +41,7 @@ def test_the_transient_of_the_paper(hopper, paper_estimate, exact):
 SHAPES = [((2, 3, 1, 2), 2, 1, 6), ((1, 3, 2), 1, 2, 5), ((2,), 1, 1, 9)]
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_any_system_is_identified_exactly(shape, seed):
     dims, ny, nu, periods = shape

@@ -39,7 +39,7 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_random_systems(shape, seed):
     dims, ny, nu = shape

@@ -175,7 +175,7 @@ def test_coherence_is_one_but_for_noise(model):
         hj.estimate_coherence(realised(model, 1))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 3), st.integers(1, 40), st.integers(0, 70), st.integers(1, 3))
 def test_any_record_is_estimated_or_refused(model, sections, periods, samples, repeats):
     """Whatever N and P are said to be: a number for every line, or a sentence."""

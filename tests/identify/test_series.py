@@ -46,7 +46,7 @@ def test_the_hopper_is_found_exactly(hopper, multipliers):
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.sampled_from(SHAPES), st.integers(0, 99), st.integers(0, 3))
 def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     """Two records of odd lengths, with bad outputs and inputs here and there."""

@@ -45,7 +45,7 @@ def test_evaluation_between_the_lines(exact, hopper):
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_random_systems(shape, seed):
     """The state beyond the rank dies within one period, as dimensions fall to 2 or less."""

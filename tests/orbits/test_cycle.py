@@ -120,7 +120,7 @@ def test_settling_on_an_unstable_cycle_fails():
         vanderpol(-1.0, (2.1, 0.0), settle=60.0)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(amplitude=st.floats(0.1, 10.0))
 def test_a_conservative_system_has_a_family_of_cycles(amplitude):
     with pytest.raises(hj.ComputationError, match="multiplier of exactly 1 .* form a family"):

@@ -67,7 +67,7 @@ def test_neimark_sacker_of_the_juggler(juggling):
         branch.find("Hopf")
 
 
-@settings(max_examples=6, deadline=None, phases=(Phase.generate,))
+@settings(max_examples=6, phases=(Phase.generate,))
 @given(
     st.sampled_from(["A", "restitution", "g", "T"]),
     st.floats(0.75, 0.95) | st.floats(1.05, 1.3),

@@ -92,7 +92,7 @@ def test_hopper_at_all_frequencies_and_harmonics(exact, reference):
     assert exact.harmonic_errors(expected).shape == (32, 2)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([0.125, 0.375, -0.375, 0.875]))
 def test_three_ways_agree(seed, shape, f):
     dims, ny, nu = shape
@@ -122,7 +122,7 @@ def test_three_ways_agree(seed, shape, f):
     np.testing.assert_allclose(htf.H[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seeds, st.sampled_from(SHAPES), st.floats(-3, 3))
 def test_symmetry_for_real_signals_and_period_in_f(seed, shape, f):
     dims, ny, nu = shape
@@ -134,7 +134,7 @@ def test_symmetry_for_real_signals_and_period_in_f(seed, shape, f):
         np.testing.assert_allclose(htf[m][2], htf[m][0], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seeds, st.sampled_from(SHAPES))
 def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape

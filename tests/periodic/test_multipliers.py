@@ -97,7 +97,7 @@ def test_dimensions_that_vary_add_no_multipliers(multipliers):
     assert product_rank(factors[5:] + factors[:5], RTOL) == len(found)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), st.integers(1, 7), st.integers(1, 9))
 def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
     rng = np.random.default_rng(seed)

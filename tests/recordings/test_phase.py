@@ -26,7 +26,7 @@ def test_the_angle_of_a_circle_is_time(wave):
     assert "cycles in 1 stretches of 1 trials; period 1" in repr(phase)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 1000), st.floats(0.0, 0.3), st.booleans())
 def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     rng = np.random.default_rng(seed)
@@ -82,7 +82,7 @@ def test_events_missed_and_doubled(wave, causal):
                                [0.3, 0.55, 0.3], atol=2e-6)  # fmt: skip
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 1000), st.floats(0.0, 0.05), st.booleans())
 def test_irregular_events(seed, jitter, causal):
     """Jitter, missed and doubled events: the phase grows, is right at the events, or nearly so."""
@@ -132,7 +132,7 @@ def test_what_is_no_phase(wave):
         hj.estimate_phase(one, CIRCLE)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 1000), st.integers(8, 60), st.floats(0.02, 0.3))
 def test_splines_are_those_of_scipy(seed, n, bandwidth):
     rng = np.random.default_rng(seed)
