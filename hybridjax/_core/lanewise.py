@@ -4,6 +4,7 @@ Lanes stand on the last axis of an array. What all lanes share (a system's param
 passed as it is; where each lane has its own, it is marked by `PerLane`.
 """
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -56,13 +57,17 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     def one(arrays, *arguments):
         return function(*eqx.combine(arrays, rest), *arguments)
 
+    @ft.cache
+    def program(common: tuple[bool, ...], many: bool):
+        in_axes = (axes, *[None if c else -1 for c in common])
+        work = vectorised(one, alone + list(common)) if many else one
+        # Traced once, however often it is called: a Runge-Kutta step has ten stages.
+        return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
+
     def call(*arguments):
         lanes = max(x.shape[-1] for x in arguments)
-        common = [x.shape[-1] < lanes for x in arguments]
+        common = tuple(x.shape[-1] < lanes for x in arguments)
         arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
-        in_axes = (axes, *[None if c else -1 for c in common])
-        many = lanes >= _MANY
-        work = vectorised(one, alone + common) if many else one
-        return jax.vmap(work, in_axes=in_axes, out_axes=-1)(arrays, *arguments)
+        return program(common, lanes >= _MANY)(arrays, *arguments)
 
     return call

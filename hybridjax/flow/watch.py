@@ -25,7 +25,7 @@ class Watch(NamedTuple):
 
 def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
     """Field of chart a over lanes."""
-    field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u))
+    field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u), name=("field", a))
     return lambda t, q: field(t, q, u)
 
 
@@ -49,15 +49,17 @@ def watched(s: Structure, a: int, target: Target) -> list[int]:
 def values(s: Structure, a: int, target: Target, t, q, u, index, f) -> Watch:
     """Chart a's watched functions over lanes, in the order of `watched`; f is the field there."""
 
+    guards = s.guards(a)
+    level = len(watched(s, a, target)) > len(guards)
+
     def one(s, levels, t, q, u, i, f):
         def all_of_them(t, q):
-            guards = [s.guard(g, t, q, u) for g in s.guards(a)]
-            level = len(watched(s, a, target)) > len(guards)
-            return jnp.stack(guards + ([levels.level(s, a, i, t, q)] if level else []))
+            rows = [s.guard(g, t, q, u) for g in guards]
+            return jnp.stack(rows + ([levels.level(s, a, i, t, q)] if level else []))
 
         return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
 
-    return Watch(*s.by_lane(one, target.levels)(t, q, u, index, f))
+    return Watch(*s.by_lane(one, target.levels, name=("watch", a))(t, q, u, index, f))
 
 
 def watch(

@@ -4,7 +4,7 @@ Everything below `systems` sees a system through `Structure`: charts and transit
 functions that return arrays, guards that fall through zero at their event.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -41,10 +41,22 @@ class Structure:
         self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
         self.d = max(self.dims)
         self.nu = len(system.inputs)
+        self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
-    def by_lane(self, function: Callable, *trees: Any) -> Callable:
+    def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
         """Vectorise `function(structure, *trees, *arguments)` over the lanes on the last axis of
-        `arguments`. Lanes may have parameters of their own (see `PerLane`)."""
+        `arguments`. Lanes may have parameters of their own (see `PerLane`).
+
+        A function with a `name` is made once, for the same trees, and with that traced once.
+        """
+        known = self._made.get(name)
+        if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
+            known = self._by_lane(function, *trees), trees
+            if name is not None:
+                self._made[name] = known
+        return known[0]
+
+    def _by_lane(self, function, *trees):
         if not isinstance(self.source, PerLane):
             return by_lane(lambda *rest: function(self, *rest), *trees)
         return by_lane(
