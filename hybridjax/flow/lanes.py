@@ -51,7 +51,8 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     """
     if x.shape[-1] < mask.shape[0]:
         return x
-    return jnp.where(mask, x, x[..., jnp.argmax(mask)][..., None])
+    one = jax.lax.dynamic_slice_in_dim(x, jnp.argmax(mask), 1, axis=-1)
+    return jnp.where(mask, x, one)
 
 
 def needed(mask: Bool[Array, " L"], tree):
