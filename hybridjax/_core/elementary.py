@@ -21,7 +21,7 @@ Each has derivatives of all orders, in forward and reverse mode. Arguments of ot
 """
 
 import functools as ft
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -219,18 +219,14 @@ _FEW = 1
 _OUTER = ("jit", "pjit", "cond", "while", "scan")
 
 
-def vectorised(function: Callable, common: Sequence[bool] | None = None) -> Callable:
+def vectorised(function: Callable) -> Callable:
     """`function` with the trigonometric functions of this module in place of those of `jnp`.
 
     It is traced anew at every call, so it may close over tracers. What is written with `jax.lax`
     counts too, and so does what is inside of `jit`, `cond`, `while_loop` and `scan`. Away from
     CPU, `function` is called as it is.
 
-    **Arguments:**
-
-    - `function`, from pytrees of arrays or numbers to a pytree of arrays or numbers.
-    - `common`: for each leaf of the arguments, whether it is one number for all that the result is
-      mapped over. What depends on nothing else is left as it is.
+    **Arguments:** `function`, from pytrees of arrays or numbers to a pytree of arrays or numbers.
 
     **Returns:** a function with the same arguments that returns arrays of the same shapes, dtypes
     and weak types as `jax.jit(function)` would.
@@ -243,9 +239,7 @@ def vectorised(function: Callable, common: Sequence[bool] | None = None) -> Call
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
         program, shapes = trace(*arguments)
-        jaxpr = program.jaxpr
-        kept = _depend_on(jaxpr, common or [False] * len(jaxpr.invars))
-        program = program.replace(jaxpr=_replaced(_row_by_row(jaxpr, kept), kept))
+        program = program.replace(jaxpr=_replaced(_row_by_row(program.jaxpr)))
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
         return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
@@ -264,17 +258,7 @@ def _number(eqn: jex.JaxprEqn) -> int:
     return sum(_number(eqn) for eqns in inner for eqn in eqns)
 
 
-def _depend_on(jaxpr: jex.Jaxpr, common: Sequence[bool]) -> list[bool]:
-    """For each equation, whether it depends on nothing but `common` arguments."""
-    known = {v for v, one in zip(jaxpr.invars, common, strict=True) if one} | set(jaxpr.constvars)
-    out = []
-    for eqn in jaxpr.eqns:
-        out.append(all(isinstance(v, jex.Literal) or v in known for v in eqn.invars))
-        known |= set(eqn.outvars) if out[-1] else set()
-    return out
-
-
-def _row_by_row(jaxpr: jex.Jaxpr, kept: Sequence[bool]) -> jex.Jaxpr:
+def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
     """A program that puts the numbers of a vector in their places one after the other, if more
     than a few of our functions are behind them.
 
@@ -285,8 +269,7 @@ def _row_by_row(jaxpr: jex.Jaxpr, kept: Sequence[bool]) -> jex.Jaxpr:
     behind: dict[jex.Var, frozenset] = {}
     for k, eqn in enumerate(jaxpr.eqns):
         sources = [behind.get(v, frozenset()) for v in eqn.invars if isinstance(v, jex.Var)]
-        number = 0 if kept[k] else _number(eqn)
-        functions = frozenset((k, j) for j in range(number)).union(*sources)
+        functions = frozenset((k, j) for j in range(_number(eqn))).union(*sources)
         behind |= dict.fromkeys(eqn.outvars, functions)
         vector = eqn.primitive.name in ("stack", "concatenate") and eqn.outvars[0].aval.ndim == 1
         if vector and len(functions) > _FEW:
@@ -305,12 +288,9 @@ def _rows(*parts):
     return out
 
 
-def _replaced(jaxpr: jex.Jaxpr, kept: Sequence[bool] | None = None) -> jex.Jaxpr:
-    """A program of the same type with our functions, save in the equations that are `kept`; itself
-    if there is nothing to replace."""
-    kept = kept or [False] * len(jaxpr.eqns)
-    pairs = zip(jaxpr.eqns, kept, strict=True)
-    eqns = [eqn if keep else _replaced_equation(eqn) for eqn, keep in pairs]
+def _replaced(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
+    """A program of the same type with our functions; itself if there is nothing to replace."""
+    eqns = [_replaced_equation(eqn) for eqn in jaxpr.eqns]
     changed = any(new is not old for new, old in zip(eqns, jaxpr.eqns, strict=True))
     return jaxpr.replace(eqns=eqns) if changed else jaxpr
 

@@ -37,13 +37,6 @@ def shared(tree: Any) -> Any:
     return tree.tree if isinstance(tree, PerLane) else tree
 
 
-def _own(tree: Any) -> tuple[bool, ...]:
-    """Which of the tree's arrays have one entry for each lane."""
-    if isinstance(tree, PerLane):
-        return tree.own
-    return tuple(False for _ in jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_array)))
-
-
 def by_lane(function: Callable, *trees: Any) -> Callable:
     """Vectorise `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
@@ -52,7 +45,6 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     """
     arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
-    alone = [not own for x in trees for own in _own(x)]
 
     def one(arrays, *arguments):
         return function(*eqx.combine(arrays, rest), *arguments)
@@ -60,7 +52,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     @ft.cache
     def program(common: tuple[bool, ...], many: bool):
         in_axes = (axes, *[None if c else -1 for c in common])
-        work = vectorised(one, alone + list(common)) if many else one
+        work = vectorised(one) if many else one
         # Traced once, however often it is called: a Runge-Kutta step has ten stages.
         return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from .._core.collection import uncollected
-from .._core.compile import full_jit, quick_jit
+from .._core.compile import quick_jit
 from .._core.errors import ComputationError, DefinitionError
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
@@ -146,7 +146,7 @@ class Campaign:
         return on_cycle + embed @ np.asarray(x0).T
 
 
-_respond = {True: quick_jit(respond), False: full_jit(respond)}
+_respond = {True: quick_jit(respond), False: eqx.filter_jit(respond)}
 _compiling, _compiled = threading.Lock(), set()
 
 

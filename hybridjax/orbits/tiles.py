@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from .._core.collection import uncollected
-from .._core.compile import full_jit, quick_jit
+from .._core.compile import quick_jit
 from .._core.results import Result
 from .._core.threads import in_threads
 from ..flow.lanes import Lanes
@@ -301,4 +301,6 @@ class Programs(NamedTuple):
 
 
 # For few systems, and for many.
-QUICK, FULL = (Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, full_jit))
+QUICK, FULL = (
+    Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, eqx.filter_jit)
+)

@@ -309,16 +309,3 @@ def test_vectors_of_several_functions_are_put_together_row_by_row():
         np.testing.assert_allclose(new, old, rtol=1e-15)
     new, old = (jax.jacfwd(f)(t, q)[0] for f in (vectorised(field), field))
     np.testing.assert_allclose(new, old, rtol=1e-14)
-
-
-def test_what_depends_on_common_arguments_is_left_alone():
-    def force(parameters, t, q):
-        a, b = parameters
-        return jnp.stack([a * jnp.sin(b * t), jnp.cos(q) - jnp.sin(2.0)])
-
-    arguments = (2.0, 3.0), 0.4, 0.7
-    common = vectorised(force, [True, True, True, False])
-    assert left(common, *arguments) == {"sin"}
-    assert left(vectorised(force, [True, True, False, False]), *arguments) == {"sin"}
-    assert str(jax.make_jaxpr(common)(*arguments)).count(" sin ") == 2
-    np.testing.assert_allclose(common(*arguments), force(*arguments), rtol=1e-15)

@@ -16,7 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
-from hybridjax._core.compile import full_jit, quick_jit
+from hybridjax._core.compile import quick_jit
 from hybridjax.experiments import campaign, respond
 
 from ..conftest import OUTPUTS
@@ -182,7 +182,7 @@ def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
         traced.append(1)
         return respond.respond(*arguments)
 
-    programs = {True: quick_jit(counted), False: full_jit(counted)}
+    programs = {True: quick_jit(counted), False: eqx.filter_jit(counted)}
     monkeypatch.setattr(campaign, "_respond", programs)
     monkeypatch.setattr(campaign, "_compiled", set())
     monkeypatch.setattr(campaign, "_SMALL", campaign._SMALL * small)
