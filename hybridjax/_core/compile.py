@@ -23,7 +23,6 @@ def quick_jit(function: Callable) -> Callable:
     `filter_jit`: there the outer program decides.
     """
     plain = eqx.filter_jit(function)
-    on_cpu = lambda: jax.default_backend() == "cpu"  # noqa: E731
 
     @ft.cache
     def quick():
@@ -31,7 +30,7 @@ def quick_jit(function: Callable) -> Callable:
 
     def run(*arguments):
         # JAX refuses the options below the top level only after it has traced the function.
-        if not on_cpu() or is_traced(arguments):
+        if not _on_cpu() or is_traced(arguments):
             return plain(*arguments)
         try:
             return quick()(*arguments)
@@ -45,8 +44,12 @@ def quick_jit(function: Callable) -> Callable:
         with uncollected:
             return run(*arguments)
 
-    call.lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)
+    call.lower = lambda *arguments: (quick() if _on_cpu() else plain).lower(*arguments)
     return call
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 @ft.cache

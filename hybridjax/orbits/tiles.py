@@ -61,6 +61,7 @@ class Tiles(NamedTuple):
     """Systems in one compiled call."""
     workers: int
     programs: "Programs"
+    """`QUICK` or `FULL`."""
 
     @property
     def parameters(self) -> Float[np.ndarray, "S p"]:
