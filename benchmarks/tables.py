@@ -53,7 +53,8 @@ def targets(values: dict, baseline: dict) -> str:
 def experiments(values: dict, baseline: dict) -> str:
     """Seconds and errors of each at its fastest setting with errors below 1e-9."""
     who = {
-        "run": "`run_experiments`", "program": "its compiled program", "c": "C loop",
+        "run": "`run_experiments`", "program": "its compiled program",
+        "loops": "`run_experiments`, loop kernels", "c": "C loop",
         "heyoka.scalar": "heyoka, one by one", "heyoka.simd": "heyoka, batches of 8",
         "heyoka.batch": "heyoka, batches of 80", "scipy": "scipy DOP853", "jaxonomy": "jaxonomy",
     }  # fmt: skip

@@ -7,6 +7,7 @@ from ._core.errors import (
     HybridJaxError as HybridJaxError,
     PrecisionError as PrecisionError,
 )
+from ._core.kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
 from .experiments.crest import optimise_phases as optimise_phases

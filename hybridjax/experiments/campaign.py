@@ -106,11 +106,16 @@ class Campaign:
                     part = _once_compiled(program, single(arguments))
             return [np.asarray(x)[: S - k] for x in part]
 
+        base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
+        y, rest = np.empty((S, u.shape[1] // N, *base.shape)), []
         parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
-        y, result, failed_at, error = (np.concatenate(x) for x in zip(*bar, strict=True))
-        y, error = y.astype(float, copy=False), error.astype(float) + self.rounding
-        base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
+        for k, (part, *others) in zip(range(0, S, size), bar, strict=True):
+            np.subtract(part.reshape(-1, *y.shape[1:]), base, out=y[k : k + size])
+            rest.append(others)
+        y = y.reshape(S, u.shape[1], -1)
+        result, failed_at, error = map(np.concatenate, zip(*rest, strict=True))
+        error = error.astype(float) + self.rounding
         finite = np.isfinite(y)
         if not (finite.all() or (finite.all(axis=(1, 2)) | (result != Result.OK)).all()):
             for a in np.unique(self.placed.lanes.chart):
@@ -119,7 +124,6 @@ class Campaign:
                 "an output is NaN although its experiment ran well: it is not defined everywhere "
                 "that the experiments go."
             )
-        y.reshape(S, -1, N, y.shape[2])[...] -= base
         return ExperimentData(
             u,
             y,

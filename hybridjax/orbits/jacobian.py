@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..flow.batching import vmap_to_lanes
 from ..flow.lanes import Lanes
@@ -25,9 +25,10 @@ def flow_jacobian(
     result: Int[Array, " L"] | None = None,
     of_states: bool = False,
     new_input: bool = True,
+    wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Float[Array, "L n m"], Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
-    respect to q only (`of_states`).
+    respect to q only (`of_states`). Zero where it is not `wanted`, which costs a third.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearising first
@@ -38,7 +39,15 @@ def flow_jacobian(
     zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
     go = constant((system, lanes, zero, target))
     moved, tape = record(*go, settings, h, result, new_input, tangents=True)
-    jacobian, end = tape_jacobian(system, lanes, target, tape, of_states)
+
+    def push():
+        return tape_jacobian(system, lanes, target, tape, of_states)
+
+    def keep():
+        shape = jax.eval_shape(push)[0].shape
+        return jnp.zeros(shape), jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
+
+    jacobian, end = push() if wanted is True else jax.lax.cond(wanted, push, keep)
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
     return jacobian, moved, tape
 

@@ -58,6 +58,8 @@ def as_placed(cycle: LimitCycle, sections) -> PlacedSections:
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
     other = sections.cycle
+    if other is cycle:
+        return sections
     mine, theirs = ((c.system, c.start, c.period) for c in (cycle, other))
     if is_traced((mine, theirs)):
         return place_sections(cycle, sections.sections)

@@ -5,6 +5,7 @@ the Jacobian of the return map, and they themselves are the factors of the monod
 """
 
 import dataclasses
+import functools as ft
 
 import equinox as eqx
 import jax
@@ -181,10 +182,11 @@ def _residual(q, system, start, base, expected, settings):
     return residual + jacobian @ (q - fixed), seen
 
 
-def turn_with_jacobian(q, system, start, kind, expected, settings):
-    """P(q) - q, what was seen on the way, and the Jacobian."""
+def turn_with_jacobian(q, system, start, kind, expected, settings, wanted=True):
+    """P(q) - q, what was seen on the way, and the Jacobian (nonsense where it is not `wanted`)."""
+    flow = ft.partial(_flow_with_jacobian, wanted=wanted)
     residual, end, result, (legs, jacobians, codes) = turn(
-        q, system, start, kind, expected, settings, _flow_with_jacobian
+        q, system, start, kind, expected, settings, flow
     )
     n = q.shape[0]
     factors = jacobians[:, 0, 1 : n + 1]
@@ -221,10 +223,9 @@ def _flow(system, lanes, target, settings, h, result):
     return move(system, lanes, u, target, settings, h, result, new_input=False), None
 
 
-def _flow_with_jacobian(system, lanes, target, settings, h, result):
-    jacobian, moved, tape = flow_jacobian(
-        system, lanes, target, settings, h, result, of_states=True, new_input=False
-    )
+def _flow_with_jacobian(system, lanes, target, settings, h, result, wanted):
+    go = system, lanes, target, settings, h, result
+    jacobian, moved, tape = flow_jacobian(*go, of_states=True, new_input=False, wanted=wanted)
     return moved, (lanes, jacobian, tape.code)
 
 
@@ -245,7 +246,7 @@ def turn(q, system, start: Lanes, kind: ReturnMap, expected, settings, flow):
         moved, extra = flow(system, lanes, eqx.combine(target, common), settings, h, result)
         return (moved.lanes, moved.h, moved.result), extra
 
-    begin = (lanes, (0.1 * expected / LEGS)[None], jnp.zeros(1, jnp.int32))
+    begin = (lanes, (0.5 * expected / LEGS)[None], jnp.zeros(1, jnp.int32))
     (end, _, result), extra = jax.lax.scan(leg, begin, each)
     valid = jnp.arange(s.d) < jnp.array(s.dims)[start.chart[0]]
     same = (result[0] == Result.OK) & (end.chart[0] == start.chart[0])

@@ -37,6 +37,7 @@ class Rounds(NamedTuple):
     """What the last Newton step of S systems saw; S is the leading axis of every array."""
 
     start: Lanes
+    jacobian: Float[np.ndarray, "S d d"]
     size: Float[np.ndarray, " S"]
     """Of that step, relative to the tolerance; infinite where the turn was too long, NaN where it
     failed."""
@@ -89,8 +90,9 @@ class Tiles(NamedTuple):
         bar.update(len(rows))
         while (done := len(out.result)) < S:
             rows = order[done : 2 * done]
+            rows = order[done : 2 * done] = rows[cKDTree(parameters[rows]).indices]
             guesses = self._by_neighbours(parameters[order[:done]], out, parameters[rows])
-            out = _join(out, self._newton(rows, *guesses, _USUAL))
+            out = _join(out, self._newton(rows, *self._first_step(rows, *guesses), _USUAL))
             bar.update(len(rows))
         bar.close()
         late = np.flatnonzero(out.size > 1)
@@ -100,10 +102,8 @@ class Tiles(NamedTuple):
         return _pick(self._again(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
-        return _pick(
-            jax.tree_util.tree_map(lambda x: x[None], (self.guess.start, self.guess.period)),
-            np.zeros(count, int),
-        )
+        given = self.guess.start, self.guess.period
+        return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
 
     def _again(self, rows, out: Rounds) -> Rounds:
         """Another try for the systems that failed, from where they are after flowing freely."""
@@ -119,24 +119,37 @@ class Tiles(NamedTuple):
         failed, begin = failed[there], _pick(begin, there)
         return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
 
-    def _by_neighbours(self, known, out: Rounds, wanted) -> tuple[Lanes, Float[np.ndarray, " S"]]:
-        """The cycle of the nearest system, moved as those around it in the same chart suggest."""
+    def _by_neighbours(self, known, out: Rounds, wanted):
+        """The cycle of the nearest system, moved as those around it in the same chart suggest:
+        its start, its period, and the Jacobian there (NaN where nothing is known)."""
         ok = np.flatnonzero(out.result == Result.OK)
         if not len(ok):
-            return self._given(len(wanted))
+            blank = np.full((len(wanted), *out.jacobian.shape[1:]), np.nan)
+            return *self._given(len(wanted)), blank
         known = known[ok]
         terms = _powers(known[:1]).shape[1]
         _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
-        start, period = _pick((out.start, out.period), ok)
-        values = np.concatenate([start.q[..., 0], period[:, None]], axis=1)
+        start, period, jacobian = _pick((out.start, out.period, out.jacobian), ok)
+        flat = jacobian.reshape(len(ok), -1)
+        values = np.concatenate([start.q[..., 0], period[:, None], flat], axis=1)
         same = start.chart[near] == start.chart[first][:, None]
         apart = _powers(known[near] - known[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
         slope = np.linalg.pinv(apart, rcond=1e-6) @ change
         guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
-        return eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :-1, None]), guess[:, -1]
+        d = start.q.shape[1]
+        start = eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :d, None])
+        return start, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
+
+    def _first_step(self, rows, start: Lanes, period, jacobian):
+        """Newton's first step, with Jacobians that are guessed: the turn costs a third."""
+        turned = self._in_tiles(self._turn, self._threads, rows, start, period, wanted=False)
+        start, period, residual, *_ = turned
+        q, _ = newton_step(start.q[..., 0], residual, jacobian)
+        q = np.where(np.isfinite(q), q, start.q[..., 0])
+        return eqx.tree_at(lambda x: x.q, start, q[..., None]), period
 
     def _newton(self, rows, start: Lanes, period, steps: int) -> Rounds:
         """Newton's method; systems that are done make room for others."""
@@ -162,10 +175,10 @@ class Tiles(NamedTuple):
         period[extra] = self.guess.turns * seen.period[extra] / seen.meetings[extra]
         size[extra] = np.inf
         start, once = eqx.tree_at(lambda x: x.q, start, q[..., None]), np.ones(len(rows), int)
-        return Rounds(start, size, period, seen.factors, seen, codes, -once, once)
+        return Rounds(start, jacobian, size, period, seen.factors, seen, codes, -once, once)
 
-    def _turn(self, *arguments):
-        *found, codes = self.programs.turn(*arguments)
+    def _turn(self, *arguments, wanted: bool = True):
+        *found, codes = self.programs.turn(*arguments, np.asarray(wanted))
         return *found, front(np.asarray(codes))
 
     @property
@@ -174,14 +187,14 @@ class Tiles(NamedTuple):
         would wait for each other forever."""
         return 1 if self.guess.conserved else self.workers
 
-    def _in_tiles(self, work, workers: int, rows, *arguments):
+    def _in_tiles(self, work, workers: int, rows, *arguments, **options):
         """`work` for some systems, in calls of one size, so that there is one program for all."""
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
 
         def tile(k):
             some = np.arange(k, k + self.size) % len(rows)
             systems = eqx.combine(_pick(arrays, rows[some]), rest)
-            part = work(systems, self.guess, *_pick(arguments, some), self.settings)
+            part = work(systems, self.guess, *_pick(arguments, some), self.settings, **options)
             return _pick(part, slice(len(rows) - k))
 
         return _join(*in_threads(tile, range(0, len(rows), self.size), workers))
@@ -235,14 +248,15 @@ def _kind(guess: LimitCycle) -> ReturnMap:
     return ReturnMap(guess.base, guess.conserved, guess.turns)
 
 
-def _turn(systems, guess: LimitCycle, start: Lanes, period, settings):
-    """One turn of every system from its start, at the same phase of its own clock."""
+def _turn(systems, guess: LimitCycle, start: Lanes, period, settings, wanted):
+    """One turn of every system from its start, at the same phase of its own clock, with the
+    Jacobian if it is `wanted`."""
 
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
         kind = _kind(guess)
         residual, seen, jacobian = turn_with_jacobian(
-            start.q[:, 0], system, start, kind, expected, settings
+            start.q[:, 0], system, start, kind, expected, settings, wanted
         )
         bare = eqx.tree_at(lambda x: x.codes, seen, None)
         return start, expected, residual, jacobian, bare, seen.codes.ravel()
