@@ -1,4 +1,4 @@
-"""Loops as single kernels, an option of XLA for long computations on CPU, switched on by request."""
+"""Whole loops as single kernels: an option of XLA on CPU, switched on by request."""
 
 import os
 

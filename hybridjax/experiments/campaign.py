@@ -156,7 +156,8 @@ _compiling, _compiled = threading.Lock(), set()
 
 def _once_compiled(program, arguments):
     """What `program` gives. Threads that need the same one wait until one has compiled it."""
-    kind = _kind(program, arguments)
+    placed, _, _, u, outputs, _ = arguments
+    kind = _kind(program, placed, u.shape, outputs)
     if kind in _compiled:
         return program(*arguments)
     with _compiling, uncollected:
@@ -165,11 +166,12 @@ def _once_compiled(program, arguments):
     return out
 
 
-def _kind(program, arguments):
-    """What tells compiled programs apart."""
-    leaves, structure = jax.tree_util.tree_flatten(arguments)
-    shapes = tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
-    return program, structure, shapes
+def _kind(program, placed: PlacedSections, shape, outputs):
+    """What tells compiled programs apart: `placed` and the shape of the inputs determine those of
+    all other arguments."""
+    leaves, structure = jax.tree_util.tree_flatten((placed, outputs))
+    kinds = tuple((x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+    return program, structure, kinds, shape
 
 
 def _compile_ahead(program, placed: PlacedSections, shape, outputs) -> None:
@@ -178,12 +180,12 @@ def _compile_ahead(program, placed: PlacedSections, shape, outputs) -> None:
     It is traced in this one: what threads trace at the same time differs from run to run, and is
     not found again in a cache on disk.
     """
+    if _kind(program, placed, shape, outputs) in _compiled:
+        return
     N, n = placed.count, 1 + placed.lanes.q.shape[0]
     plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
     start, u = jnp.asarray(np.zeros((n, shape[0]))), jnp.asarray(np.zeros(shape))
     arguments = placed, plan, start, u, outputs, Settings(1.0, 1.0, PATIENCE)
-    if _kind(program, arguments) in _compiled:
-        return
     with uncollected:
         lowered = program.lower(*arguments)
 

@@ -84,7 +84,8 @@ def test_programs_in_threads_factorise_nothing(wheel):
     start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.start, wheel.period))
     start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
     for programs in (tiles.QUICK, tiles.FULL):
-        lowered = programs.turn.lower(systems, wheel, start, period, wheel.settings, jnp.array(True))
+        arguments = systems, wheel, start, period, wheel.settings, jnp.array(True)
+        lowered = programs.turn.lower(*arguments)
         assert "lapack" not in lowered.as_text()
 
 
