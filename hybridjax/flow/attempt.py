@@ -78,7 +78,7 @@ def attempt(
     span: Float[Array, " L"],
     unroll: bool,
     in_step: bool,
-    tangents: bool,
+    tangents: Bool[Array, ""] | bool,
 ) -> Attempt:
     """Let the lanes of `mask` step, and land those that come close to the zero they aim at.
 
@@ -104,11 +104,13 @@ def attempt(
         )
         tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
-        if tangents:
+        if tangents is not False:
             aside = _ASIDE * jnp.cos(1.0 + jnp.arange(n))[:, None] * tolerance / rtol
             field = chart_field(s, a, uu)
             near = jax.lax.cond(
-                some, lambda: rk_step(field, t, q + aside, tau, unroll).error, lambda: q
+                some & tangents,
+                lambda: rk_step(field, t, q + aside, tau, unroll).error,
+                lambda: step.error,
             )
             change = jnp.max(jnp.abs(near - step.error) / tolerance, axis=0, initial=0.0) / _ASIDE
             error = jnp.maximum(error, jnp.where(jnp.isfinite(change), change, 0.0))

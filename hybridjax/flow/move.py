@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.lanewise import PerLane, shared
 from .._core.results import Result
@@ -43,7 +43,7 @@ class _How(NamedTuple):
     tape: bool
     glide: bool
     new_input: bool
-    tangents: bool
+    tangents: Bool[Array, ""] | bool
 
 
 def move(
@@ -80,7 +80,7 @@ def record(
     setout: Stride | Float[Array, " L"] | None = None,
     result: Int[Array, " L"] | None = None,
     new_input: bool = True,
-    tangents: bool = False,
+    tangents: Bool[Array, ""] | bool = False,
 ) -> tuple[Moved, Tape]:
     """As `move`, with a record of every step, which has no derivatives.
 
@@ -122,11 +122,11 @@ def constant(tree):
 @eqx.filter_jit
 def _search(system, lanes, u, target, setout, result, settings, how: _How):
     bare = dataclasses.replace(target, levels=None)
-    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane, how))
-    return run((system, target.levels, settings), (lanes, u, bare, setout, result))
+    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane))
+    return run((system, target.levels, settings, how), (lanes, u, bare, setout, result))
 
 
-def _run(system, levels, settings, lanes, u, target, setout, result, how: _How):
+def _run(system, levels, settings, how: _How, lanes, u, target, setout, result):
     settings = shared(settings)
     return search(
         Structure(system),
@@ -150,7 +150,7 @@ def _move(system, lanes, u, target, setout, result, settings, how: _How):
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
-    taped = how._replace(tape=True, glide=False, tangents=how.tangents or not how.glide)
+    taped = how._replace(tape=True, glide=False, tangents=how.tangents is not False or not how.glide)
     go = (constant(x) for x in (system, lanes, u, target, setout, result))
     moved, tape = _search(*go, settings, taped)
 

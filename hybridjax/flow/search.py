@@ -61,7 +61,7 @@ def search(
     tape: bool,
     glide: bool,
     new_input: bool,
-    tangents: bool,
+    tangents: Bool[Array, ""] | bool,
 ) -> tuple[Moved, Tape | None]:
     """Flow every lane to its target, or to a result code that says why not.
 

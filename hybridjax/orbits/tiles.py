@@ -29,6 +29,8 @@ from .return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_j
 _NEWTON, _USUAL = 6, 3
 # Periods for which a system flows freely before Newton tries again.
 _SETTLE = 40
+# Least squares count directions in which neighbours are this much nearer, squared, as none.
+_RIDGE = 1e-12
 # Up to this many parameters, guesses from neighbours are quadratic.
 _FEW = 4
 
@@ -137,14 +139,18 @@ class Tiles(NamedTuple):
         same = start.chart[near] == start.chart[first][:, None]
         apart = _powers(known[near] - known[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
-        slope = np.linalg.pinv(apart, rcond=1e-6) @ change
+        across = apart.transpose(0, 2, 1)
+        gram = across @ apart
+        size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+        ridge = np.where(size > 0, _RIDGE * size, 1.0) * np.eye(gram.shape[-1])
+        slope = np.linalg.solve(gram + ridge, across @ change)
         guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
         d = start.q.shape[1]
         start = eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :d, None])
         return start, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
 
     def _first_step(self, rows, start: Lanes, period, jacobian):
-        """Newton's first step, with Jacobians that are guessed: the turn costs a third."""
+        """Newton's first step, with Jacobians that are guessed: the turn costs a fifth."""
         turned = self._in_tiles(self._turn, self._threads, rows, start, period, wanted=False)
         start, period, residual, *_ = turned
         q, _ = newton_step(start.q[..., 0], residual, jacobian)
@@ -277,7 +283,7 @@ def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
     """Where systems are after they have flowed freely for a while, at the guess's phase or
     section (NaN for those that do not get there), and their expected periods."""
     base = guess.base
-    patient = Settings(rtol=1e-8, atol=1e-8, max_steps=512 * _SETTLE)
+    patient = Settings(rtol=1e-6, atol=1e-6, max_steps=512 * _SETTLE)
 
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
