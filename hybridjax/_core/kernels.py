@@ -28,13 +28,11 @@ def enable_loop_kernels() -> None:
 
     **Raises:** `ComputationError` if it comes too late, or if this version of XLA cannot do it.
     """
-    before = os.environ.get("XLA_FLAGS")
-    os.environ["XLA_FLAGS"] = f"{before} {_FLAG}" if before else _FLAG
+    before = os.environ.get("XLA_FLAGS", "")
+    if _FLAG not in before.split():
+        os.environ["XLA_FLAGS"] = f"{before} {_FLAG}".strip()
     if jax.default_backend() == "cpu" and not _in_use():
-        if before is None:
-            del os.environ["XLA_FLAGS"]
-        else:
-            os.environ["XLA_FLAGS"] = before
+        os.environ["XLA_FLAGS"] = before
         raise ComputationError(
             "XLA does not make single kernels of loops: it has read its options already (call "
             "`enable_loop_kernels()` before JAX computes anything), or it is of another version."

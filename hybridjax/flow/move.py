@@ -150,7 +150,8 @@ def _move(system, lanes, u, target, setout, result, settings, how: _How):
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     system, lanes, u, target, setout, result, settings, how = primals
-    taped = how._replace(tape=True, glide=False, tangents=how.tangents is not False or not how.glide)
+    closely = how.tangents is not False or not how.glide
+    taped = how._replace(tape=True, glide=False, tangents=closely)
     go = (constant(x) for x in (system, lanes, u, target, setout, result))
     moved, tape = _search(*go, settings, taped)
 

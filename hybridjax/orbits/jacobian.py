@@ -28,7 +28,7 @@ def flow_jacobian(
     wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Float[Array, "L n m"], Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
-    respect to q only (`of_states`). Zero where it is not `wanted`, which costs a fifth.
+    respect to q only (`of_states`). Zero where it is not `wanted`, which costs a third.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearising first

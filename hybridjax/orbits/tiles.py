@@ -150,7 +150,7 @@ class Tiles(NamedTuple):
         return start, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
 
     def _first_step(self, rows, start: Lanes, period, jacobian):
-        """Newton's first step, with Jacobians that are guessed: the turn costs a fifth."""
+        """Newton's first step, with Jacobians that are guessed: the turn costs a third."""
         turned = self._in_tiles(self._turn, self._threads, rows, start, period, wanted=False)
         start, period, residual, *_ = turned
         q, _ = newton_step(start.q[..., 0], residual, jacobian)
