@@ -73,6 +73,18 @@ def experiments(values: dict, baseline: dict) -> str:
     return markdown(("", *(job.replace(".", ", ") for job in JOBS)), rows)
 
 
+def loops(values: dict, baseline: dict) -> str:
+    """Seconds of compiling the program of experiments, and of running it, without and with."""
+    rows = []
+    for job in JOBS:
+        name = f"experiments.{job}"
+        keys = [f"{name}.{x}.compile" for x in ("run", "loops")]
+        keys += [f"{name}.at_1e-09.{x}.cpu" for x in ("run", "loops")]
+        rows.append((job.replace(".", ", "), *(number(values.get(x)) for x in keys)))
+    head = "job", "compile", "compile, loop kernels", "run", "run, loop kernels"
+    return markdown(head, rows)
+
+
 def honesty(values: dict, baseline: dict) -> str:
     rows = []
     own = [x for x in values if x.startswith("honesty.")]
@@ -140,7 +152,7 @@ def precision(values: dict, baseline: dict) -> str:
 
 
 TABLES: dict[str, Callable[[dict, dict], str]] = {
-    "machines": machines, "targets": targets, "experiments": experiments, "honesty": honesty,
+    "machines": machines, "targets": targets, "experiments": experiments, "loops": loops, "honesty": honesty,
     "precision": precision, "sizes": sizes, "derivatives": derivatives,
 }  # fmt: skip
 

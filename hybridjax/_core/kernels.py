@@ -18,7 +18,7 @@ def enable_loop_kernels() -> None:
 
     XLA otherwise makes a function of every few operations in a loop, and calls one after the other
     whenever the loop goes round: up to half of the time of an experiment. With whole loops,
-    experiments run about 1.5 times as fast; programs compile 1.1 to 2.5 times as long, since large
+    experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long, since large
     functions do (docs/benchmarks.md has figures). So it pays for long computations, the more so
     with `enable_compilation_cache()`. Results are the same up to rounding.
 
