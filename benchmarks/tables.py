@@ -152,8 +152,8 @@ def precision(values: dict, baseline: dict) -> str:
 
 
 TABLES: dict[str, Callable[[dict, dict], str]] = {
-    "machines": machines, "targets": targets, "experiments": experiments, "loops": loops, "honesty": honesty,
-    "precision": precision, "sizes": sizes, "derivatives": derivatives,
+    "machines": machines, "targets": targets, "experiments": experiments, "loops": loops,
+    "honesty": honesty, "precision": precision, "sizes": sizes, "derivatives": derivatives,
 }  # fmt: skip
 
 
