@@ -26,13 +26,16 @@ def enable_loop_kernels() -> None:
     JAX in this process and in those that it starts, by the environment variable `XLA_FLAGS`. On
     other devices than CPU it changes nothing.
 
-    **Raises:** `ComputationError` if it comes too late, or if this version of XLA cannot do it.
+    **Raises:** `ComputationError`, on CPU, if it comes too late, or if this version of XLA cannot
+    do it.
     """
-    before = os.environ.get("XLA_FLAGS", "")
-    if _FLAG not in before.split():
-        os.environ["XLA_FLAGS"] = f"{before} {_FLAG}".strip()
+    before = os.environ.get("XLA_FLAGS")
+    if _FLAG not in (before or "").split():
+        os.environ["XLA_FLAGS"] = f"{before} {_FLAG}" if before else _FLAG
     if jax.default_backend() == "cpu" and not _in_use():
-        os.environ["XLA_FLAGS"] = before
+        os.environ.pop("XLA_FLAGS")
+        if before is not None:
+            os.environ["XLA_FLAGS"] = before
         raise ComputationError(
             "XLA does not make single kernels of loops: it has read its options already (call "
             "`enable_loop_kernels()` before JAX computes anything), or it is of another version."

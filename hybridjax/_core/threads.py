@@ -26,7 +26,7 @@ def thread_count(workers: int | None) -> int:
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
     """`work` of each item, in order, under the caller's configuration of JAX. A single worker is
-    the caller's own thread: another one would have to ask the system for all its memory again."""
+    the caller's own thread: in a new one the allocator of memory starts empty."""
     if workers == 1:
         yield from map(work, items)
         return

@@ -111,9 +111,9 @@ class Campaign:
         parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
         for k, (part, *others) in zip(range(0, S, size), bar, strict=True):
-            np.subtract(part.reshape(-1, *y.shape[1:]), base, out=y[k : k + size])
+            np.subtract(part.reshape(len(part), *y.shape[1:]), base, out=y[k : k + size])
             rest.append(others)
-        y = y.reshape(S, u.shape[1], -1)
+        y = y.reshape(S, u.shape[1], base.shape[1])
         result, failed_at, error = map(np.concatenate, zip(*rest, strict=True))
         error = error.astype(float) + self.rounding
         finite = np.isfinite(y)

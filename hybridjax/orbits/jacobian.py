@@ -28,7 +28,7 @@ def flow_jacobian(
     wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Float[Array, "L n m"], Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
-    respect to q only (`of_states`). Zero where it is not `wanted`, which costs a third.
+    respect to q only (`of_states`). If it is not `wanted`, zeros: only the flow is computed then.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearising first
@@ -55,7 +55,7 @@ def tape_jacobian(
     wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
     """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
-    (t, q) at the targets; zeros where they are not `wanted`."""
+    (t, q) at the targets; both are zeros if they are not `wanted`."""
     columns, end = _push(system, lanes, target, tape, of_states, wanted)
     return columns.transpose(2, 1, 0), end
 

@@ -29,8 +29,11 @@ from .return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_j
 _NEWTON, _USUAL = 6, 3
 # Periods for which a system flows freely before Newton tries again.
 _SETTLE = 40
-# Least squares count directions in which neighbours are this much nearer, squared, as none.
+# Ridge of the least squares, relative to their trace: directions in which neighbours hardly differ
+# get no slope.
 _RIDGE = 1e-12
+# A step with a guessed Jacobian is taken if it is at most this part of the state.
+_NEAR = 0.03
 # Up to this many parameters, guesses from neighbours are quadratic.
 _FEW = 4
 
@@ -92,15 +95,18 @@ class Tiles(NamedTuple):
         bar.update(len(rows))
         while (done := len(out.result)) < S:
             rows = order[done : 2 * done]
-            rows = order[done : 2 * done] = rows[cKDTree(parameters[rows]).indices]
+            rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbours
+            order[done : 2 * done] = rows
             guesses = self._by_neighbours(parameters[order[:done]], out, parameters[rows])
-            out = _join(out, self._newton(rows, *self._first_step(rows, *guesses), _USUAL))
+            part = self._newton(rows, *self._first_step(rows, *guesses), _USUAL)
+            out = _join(out, part._replace(steps=part.steps + 1))
             bar.update(len(rows))
         bar.close()
         late = np.flatnonzero(out.size > 1)
         if len(late):
             start, period = _pick((out.start, out.period), late)
-            out = _replace(out, late, self._newton(order[late], start, period, _NEWTON - _USUAL))
+            part = self._newton(order[late], start, period, _NEWTON - _USUAL)
+            out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
         return _pick(self._again(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
@@ -150,11 +156,15 @@ class Tiles(NamedTuple):
         return start, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
 
     def _first_step(self, rows, start: Lanes, period, jacobian):
-        """Newton's first step, with Jacobians that are guessed: the turn costs a third."""
+        """Newton's first step, with Jacobians that are guessed, where it is a small one."""
+        if not np.isfinite(jacobian).any():
+            return start, period
         turned = self._in_tiles(self._turn, self._threads, rows, start, period, wanted=False)
         start, period, residual, *_ = turned
-        q, _ = newton_step(start.q[..., 0], residual, jacobian)
-        q = np.where(np.isfinite(q), q, start.q[..., 0])
+        before = start.q[..., 0]
+        q, _ = newton_step(before, residual, jacobian)
+        small = (np.abs(q - before) <= _NEAR * (1 + np.abs(before))).all(axis=1, keepdims=True)
+        q = np.where(small, q, before)
         return eqx.tree_at(lambda x: x.q, start, q[..., None]), period
 
     def _newton(self, rows, start: Lanes, period, steps: int) -> Rounds:

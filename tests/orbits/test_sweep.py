@@ -69,6 +69,29 @@ def test_without_a_clock_and_in_waves(wheel):
     assert {found[i].order for i in range(11)} == {(0,)}
 
 
+def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
+    """And one that is not small, or guessed from nothing, is not taken."""
+    steps = []
+    first_step = tiles.Tiles._first_step
+
+    def watched(self, rows, start, period, jacobian):
+        end, after = first_step(self, rows, start, period, jacobian)
+        steps.append((rows, start.q[..., 0], end.q[..., 0]))
+        for guess in (1e-6 * jacobian, np.full_like(jacobian, np.nan)):
+            np.testing.assert_array_equal(
+                first_step(self, rows, start, period, guess)[0].q, start.q
+            )
+        return end, after
+
+    monkeypatch.setattr(tiles.Tiles, "_first_step", watched)
+    slopes = np.linspace(0.08, 0.1, 11)
+    found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
+    rows, before, after = map(np.concatenate, zip(*steps, strict=True))
+    error = [np.abs(q - found.start.q[rows, :, 0]).max(axis=1) for q in (before, after)]
+    assert len(rows) == 7 and np.all(error[1] < 0.3 * error[0])
+    assert found.ok.all() and found.iterations[rows].max() <= 3
+
+
 def test_systems_that_are_alike_or_undefined(wheel):
     """Neither takes the others down with it."""
     slopes = [0.08] * 9 + [np.nan, 0.08]
