@@ -6,16 +6,16 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
 
 - `paper`: 80 experiments of 84 cycles from the limit cycle, the first 20 discarded.
 - `full`: 620 lines (P = 64), 20 experiments; `odd`: 640 lines (f = odd/128), 20 experiments. Both
-  without discarded cycles, from the start that the linearisation predicts (`predicted`) and from
+  without discarded cycles, from the start that the linearization predicts (`predicted`) and from
   the nonlinear periodic response (`steady`).
 - `unknown`: 20 experiments of 84 cycles that start on the limit cycle and know nothing: with the
   first 20 cycles discarded, with the transient fitted and removed, and with it interpolated between
   lines that are not excited, by local polynomials (odd lines, all 84 cycles). All 620 lines or odd
   ones.
 - `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
-- `coverage`: 1000 runs at 20 dB, each some realisations of 20 experiments (P = 32, 300 lines) with
+- `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % discs of H_0, H_1 and H_-1 at ten fixed frequencies
-  hold the best linear approximation, the mean over 2000 realisations without noise. `p`: the
+  hold the best linear approximation, the mean over 2000 realizations without noise. `p`: the
   smallest binomial p-value times the number of tests (60, for each family and amplitude), which is
   above 0.01 where the discs are right. `distortion`: the part of the variance that is not noise.
   `bias`: the best linear approximation less the exact H_0, at these frequencies.
@@ -36,7 +36,7 @@ HARMONICS = (-2, -1, 0, 1, 2)
 N = 32
 STEPS = ("crest", "leakage", "periodic", "unknown", "coverage")
 SEED = {"isochron": 16 * 10**6, "kinematic": 18 * 10**6}
-# rms of the inputs where distortion is a small and a large part of the variance, and realisations.
+# rms of the inputs where distortion is a small and a large part of the variance, and realizations.
 COVERAGE = {
     "isochron": ((0.005, 4), (2.0, 4)),
     "kinematic": ((0.005, 4), (0.6, 4), (0.2, 4), (0.2, 8)),
@@ -86,7 +86,7 @@ def unknown(family: Family) -> None:
     for name, lines in (("full", "all"), ("odd", "odd")):
         data = family.run(hj.multisine(lines=lines).scaled(rms), discard=20)
         family.report(f"unknown.{name}.discarded.{rms}", data)
-        fit = hj.remove_transient(data)
+        fit = hj.identify.remove_transient(data)
         family.report(f"unknown.{name}.removed.{rms}", fit.data)
         error = np.abs(fit.multipliers - family.cycle.multipliers[0]).min()
         family.show(f"unknown.{name}.removed.{rms}.multiplier", error)
@@ -103,12 +103,12 @@ def interpolated(data, degree: int):
     weights = np.linalg.pinv(powers)[0]
     transient = sum(w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True))
     y = np.fft.ifft(Y - transient, axis=1).real
-    return hj.ExperimentData(data.u, y, sections=N, periods=data.periods, outputs=OUTPUTS)
+    return hj.ExperimentData(data.u, y, n_sections=N, periods=data.periods, outputs=OUTPUTS)
 
 
 def crest() -> None:
-    random, low = hj.multisine(), hj.multisine(phases="optimised")
-    for name, design in (("random", random), ("optimised", low)):
+    random, low = hj.multisine(), hj.multisine(phases="optimized")
+    for name, design in (("random", random), ("optimized", low)):
         factors = design.crest_factors()
         print(f"estimation.crest.{name}.mean {factors.mean():.2f}")
         print(f"estimation.crest.{name}.max {factors.max():.2f}")
@@ -117,7 +117,7 @@ def crest() -> None:
 def leakage(family: Family) -> None:
     design = hj.multisine(highest_harmonic=2)
     for output, value in zip(
-        OUTPUTS, hj.predict_leakage(design, family.model, (0,))[0], strict=True
+        OUTPUTS, hj.identify.predict_leakage(design, family.model, (0,))[0], strict=True
     ):
         family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
 
@@ -128,7 +128,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     chosen = [f[np.argmin(np.abs(f - x))] for x in np.geomspace(0.06, 9.9, 10)]
 
     def chunk(count, seed):
-        return family.run(design.realisations(count, seed), start="periodic", discard=32)
+        return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
     truth = hj.estimate_htf((chunk(100, seed + 10**5 + k) for k in range(20)), (-1, 0, 1))
     truth = np.asarray(truth.at(chosen).H)
@@ -139,9 +139,9 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         for k in range(part):
             rows = slice(k * size, (k + 1) * size)
             one = hj.ExperimentData(
-                data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
+                data.u[rows], data.y[rows], n_sections=N, periods=32, outputs=OUTPUTS
             )
-            noisy = hj.add_noise(one, snr=20, seed=seed + first + k)
+            noisy = hj.experiments.add_noise(one, snr=20, seed=seed + first + k)
             estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
             error = np.abs(np.asarray(estimate.H) - truth)
             hits += error <= np.asarray(estimate.confidence_radius())
@@ -181,8 +181,8 @@ def main() -> None:
             if step.__name__ not in options.skip:
                 step(family)
         if "coverage" not in options.skip:
-            for k, (rms, realisations) in enumerate(COVERAGE[name]):
-                coverage(family, rms, realisations, options.runs, SEED[name] + 10**6 * k)
+            for k, (rms, realizations) in enumerate(COVERAGE[name]):
+                coverage(family, rms, realizations, options.runs, SEED[name] + 10**6 * k)
 
 
 if __name__ == "__main__":

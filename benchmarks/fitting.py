@@ -67,7 +67,9 @@ class Series:
         return hj.ObservedSeries(self.data, SECTIONS)
 
     def noisy(self, seed: int):
-        return hj.ObservedSeries(hj.add_noise(self.data, snr=SNR, seed=seed), SECTIONS, self.std)
+        return hj.ObservedSeries(
+            hj.experiments.add_noise(self.data, snr=SNR, seed=seed), SECTIONS, self.std
+        )
 
 
 def show(name: str, value) -> None:

@@ -39,7 +39,7 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     )
     placed = hj.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
-    N = placed.count
+    N = placed.n_sections
     design = hj.multisine(
         N, PERIODS, f_max=min(4.0, N / 2), amplitude=case.amplitude or 1.0, lines="odd"
     )
@@ -63,7 +63,7 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
         "title": case.title,
         "period": float(cycle.period),
         "events": [e.name for e in cycle.trajectory().events],
-        "sections": exact.sections,
+        "sections": exact.n_sections,
         "multipliers": [[z.real, z.imag] for z in multipliers],
         "multiplier error": float(np.max(np.abs(multipliers - truth)) / np.max(np.abs(truth))),
         "source": case.source,
@@ -108,10 +108,10 @@ def branches(path: Path) -> None:
         for guess in (walker.guess(), walker.short_gait())
     ]
     panels = [
-        ("x", [hj.follow(hj.find_limit_cycle(m.Duffing()), "rate", (0.5, 2.0))]),
-        ("v", [hj.follow(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0)),
-               hj.follow(doubled, "Vin", (24.0, 25.5))]),
-        ("th", [hj.follow(gait, "slope", (0.002, 0.018)) for gait in gaits]),
+        ("x", [hj.continuation(hj.find_limit_cycle(m.Duffing()), "rate", (0.5, 2.0))]),
+        ("v", [hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0)),
+               hj.continuation(doubled, "Vin", (24.0, 25.5))]),
+        ("th", [hj.continuation(gait, "slope", (0.002, 0.018)) for gait in gaits]),
     ]  # fmt: skip
     with hj.plot.style():
         figure, axes = pyplot.subplots(

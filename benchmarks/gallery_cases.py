@@ -3,7 +3,7 @@
 Truths are from the closed forms that the models give as `exact`, or were computed apart from
 hybridjax, by Newton on the return map with DOP853 (relative tolerance 1e-13, events polished on the
 true guard), refined with a high-order integrator in mpmath (34 digits); Duffing's by scipy alone,
-as in tests/orbits/test_follow.py.
+as in tests/orbits/test_continuation.py.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ m = hj.models
 class Case(NamedTuple):
     """One entry.
 
-    `sections` are for linearisation and experiments, `output` and `input` name what is measured and
+    `sections` are for linearization and experiments, `output` and `input` name what is measured and
     pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An experiment
     begins in the predicted periodic response, or where there is none, on the cycle (`start`).
     """

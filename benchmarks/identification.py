@@ -7,7 +7,7 @@ fits with several estimates of it, the closest).
   the structured fit of all harmonics, the rational fit of H_0 (two poles, one zero), AAA, and the
   output-error fit of the first 20 experiments with all of their cycles.
 - `small`: 20 experiments of 64 cycles at amplitude 0.001, with all 620 lines and with the odd ones,
-  from the periodic start that the linearisation predicts and from the nonlinear one (`steady`).
+  from the periodic start that the linearization predicts and from the nonlinear one (`steady`).
 - `noise.S`: 20 experiments of 84 cycles (odd lines, rms 0.02, predicted periodic start) with white
   noise at S dB, `--seeds` draws of it. `bound`: the Cramer-Rao bound of the rms error with all
   numerators unknown. `rms`: of the structured fit, which is told no variances; `bias`: the error
@@ -15,11 +15,11 @@ fits with several estimates of it, the closest).
   the true multiplier. `ratio`: rms / bound.
 - `white`: 300 cycles of white input (rms 0.002) from the limit cycle: output error without noise
   and at 20 dB, `--series` draws.
-- `coverage`: as in estimation.py, of the multiplier: `--runs` runs at 20 dB, each four realisations
+- `coverage`: as in estimation.py, of the multiplier: `--runs` runs at 20 dB, each four realizations
   of 20 experiments with new phases and noise; the truth is the fit to the mean over 2000
-  realisations without noise, with the mean variances of the runs. `p`: that of the binomial test,
+  realizations without noise, with the mean variances of the runs. `p`: that of the binomial test,
   times the number of tests (4). `bias`: the truth less the multiplier for small inputs.
-- `realised`: error of H_0 of the state-space model found from the series at 20 dB, relative to
+- `realized`: error of H_0 of the state-space model found from the series at 20 dB, relative to
   max |H_0|, and its fit in percent to noise-free validation data.
 
     python benchmarks/identification.py [--seeds 200] [--series 50] [--runs 1000] [--skip STEP ...]
@@ -58,12 +58,12 @@ def paper(family: Identification) -> None:
     data = family.run(hj.paper_design())
     estimate = hj.estimate_htf(data)
     family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
-    rational, aaa = hj.fit_rational(estimate), hj.fit_aaa(estimate, tolerance=1e-4)
+    rational, aaa = hj.fit_rational(estimate), hj.identify.fit_aaa(estimate, tolerance=1e-4)
     for k, output in enumerate(OUTPUTS):
         for name, fit in (("rational", rational), ("aaa", aaa)):
             family.show(f"paper.{name}.{output}", np.nanmin(abs(fit.multipliers[k] - family.true)))
     some = hj.ExperimentData(
-        data.u[:20], data.y[:20], sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
+        data.u[:20], data.y[:20], n_sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
     )
     family.show("paper.series", family.error(hj.fit_series(some, 2, start="rest")))
     for lines in ("all", "odd"):
@@ -79,14 +79,14 @@ def noise(family: Identification, seeds: int) -> None:
     clean = hj.fit_multipliers(hj.estimate_htf(data, BAND), 2)
     family.show("noise.bias", family.error(clean))
     for snr in (40, 20, 0):
-        noisy = [hj.add_noise(data, snr=snr, seed=seed) for seed in range(seeds)]
+        noisy = [hj.experiments.add_noise(data, snr=snr, seed=seed) for seed in range(seeds)]
         sigma = np.std(data.y, axis=(0, 1)) * 10 ** (-snr / 20)
         exact = family.model.htf(design.frequencies, BAND)
         a = design.amplitude[0]
         variance = np.broadcast_to(
             4 * sigma[:, None] ** 2 / (N * design.periods * a**2), exact.H.shape
         )
-        bound = hj.multiplier_bound(
+        bound = hj.identify.multiplier_bound(
             family.model,
             hj.HTF(exact.f, exact.H, BAND, N, data.inputs, OUTPUTS, variance=variance),
         ).standard_errors[0]
@@ -111,19 +111,19 @@ def white(family: Identification, draws: int) -> None:
     data = family.run(u, start="cycle", discard=0)
 
     def one(s, y):
-        return hj.Record(data.u[s], y[s], sections=N, inputs=data.inputs, outputs=OUTPUTS)
+        return hj.Record(data.u[s], y[s], n_sections=N, inputs=data.inputs, outputs=OUTPUTS)
 
     family.show("white.clean", family.error(hj.fit_series(one(0, data.y), 2)))
-    noisy = hj.add_noise(data, snr=20, seed=0)
+    noisy = hj.experiments.add_noise(data, snr=20, seed=0)
     fits = [hj.fit_series(one(s, noisy.y), 2) for s in range(draws)]
     report(family, "white.20", fits)
-    model = hj.realise(fits[0], order=2)
+    model = hj.identify.realize(fits[0], order=2)
     f = np.arange(0.05, 10, 0.1)
     exact = family.model.htf(f, 0)
     for k, error in enumerate(np.asarray(model.htf(f, 0).error(exact))):
-        family.show(f"realised.20.H0.{OUTPUTS[k]}", error)
+        family.show(f"realized.20.H0.{OUTPUTS[k]}", error)
     for k, fit in enumerate(hj.validate(model, one(draws + 1, data.y)).fit):
-        family.show(f"realised.20.fit.{OUTPUTS[k]}", fit)
+        family.show(f"realized.20.fit.{OUTPUTS[k]}", fit)
 
 
 def coverage(family: Identification, rms: float, runs: int) -> None:
@@ -131,7 +131,7 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
     chosen = (-1, 0, 1)
 
     def chunk(count, seed):
-        return family.run(design.realisations(count, seed), start="periodic", discard=32)
+        return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
     mean = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), chosen)
     fits, variances, each, part = [], [], 4, 25
@@ -141,9 +141,9 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
         for k in range(part):
             rows = slice(k * size, (k + 1) * size)
             one = hj.ExperimentData(
-                data.u[rows], data.y[rows], sections=N, periods=32, outputs=OUTPUTS
+                data.u[rows], data.y[rows], n_sections=N, periods=32, outputs=OUTPUTS
             )
-            noisy = hj.add_noise(one, snr=20, seed=first + k)
+            noisy = hj.experiments.add_noise(one, snr=20, seed=first + k)
             estimate = hj.estimate_htf(noisy, chosen, repeats=2)
             fits.append(hj.fit_multipliers(estimate, 2))
             variances.append(estimate.variance)

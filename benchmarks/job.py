@@ -68,7 +68,7 @@ MODELS = {"VerticalHopper": "hopper", "TwoLeggedBar": "bar"}
 
 def make_job(cycle, sections, u) -> Job:
     """A job from a limit cycle of hybridjax, `PlacedSections` on it, and inputs (S, n[, 1])."""
-    system, family = cycle.system, sections.sections
+    system, family = cycle.system, sections.family
     parameters = {x.name: float(getattr(system, x.name)) for x in dataclasses.fields(system)}
     states = np.asarray(sections.lanes.q, float).T
     names = list(system.charts())
@@ -90,7 +90,7 @@ def make_job(cycle, sections, u) -> Job:
 
 
 def _planes(records, center, scale):
-    """Lines through the centre, each at 2 pi / N from the last one in the scaled plane."""
+    """Lines through the center, each at 2 pi / N from the last one in the scaled plane."""
     position, velocity = ((records - center) / scale).T
     angle = np.unwrap(np.arctan2(velocity, position))
     sense = np.sign(angle[1] - angle[0])

@@ -20,11 +20,11 @@ import numpy as np
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.recordings.spoil import spoil
+from hybridjax.testing.dirt import spoil
 
 
-ANGLE = hj.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
-APEX = hj.EventPhase("apex")
+ANGLE = hj.recordings.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+APEX = hj.recordings.EventPhase("apex")
 PHASES = {"apex": APEX, "angle": ANGLE}
 RATE, BANDWIDTH, RMS = 500, 8.0, 0.0205  # Hz, Hz, N: outputs deviate by 9.7e-4 m (rms)
 NOISES = (0.0, 1e-4, 1e-3)
@@ -33,8 +33,8 @@ NOISES = (0.0, 1e-4, 1e-3)
 def hopper(strides, seeds, force=RMS):
     """Recordings of the paper's hopper, one for each seed, and its multipliers."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    u = [hj.random_force(strides, RATE, BANDWIDTH, rms=force, seed=seed) for seed in seeds]
-    both = hj.simulate_recording(cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1)
+    u = [hj.testing.random_force(strides, RATE, BANDWIDTH, rms=force, seed=seed) for seed in seeds]
+    both = hj.testing.simulate_recording(cycle, np.stack(u), ("yM", "vM"), rate=RATE, steps=1)
     return [eqx.tree_at(lambda r: r.trials, both, (t,)) for t in both.trials], cycle.multipliers
 
 
@@ -54,9 +54,9 @@ def start_of(recording, strides):
     return eqx.tree_at(lambda r: r.trials, recording, tuple(map(cut, recording.trials)))
 
 
-def at_sections(recording, phase, sections=32, **options):
+def at_sections(recording, phase, n_sections=32, **options):
     options |= {"inputs": "u", "outputs": ("yM", "vM"), "sections": sections}
-    return hj.section_data(recording, phase, **options)
+    return hj.recordings.section_data(recording, phase, **options)
 
 
 def distance(multipliers, true):
@@ -75,9 +75,9 @@ def errors(seeds=10):
             fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
-            plain.append(distance(hj.plain_regression(data, 2), true))
+            plain.append(distance(hj.recordings.plain_regression(data, 2), true))
             through = at_sections(dirty, PHASES[name], bandwidth=np.inf)
-            rough.append(distance(hj.plain_regression(through, 2), true))
+            rough.append(distance(hj.recordings.plain_regression(through, 2), true))
         row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
         row = "  ".join(f"{x:9.1e}" for x in row)
         print(f"{name:5s}  {strides:7d}  {noise:6.0e}  {row}", flush=True)
@@ -102,12 +102,12 @@ def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
     print(f"what all samples would tell if the hopper were linear: {bound(strides, noise):.1e}")
 
 
-def bound(strides, noise, sections=32, seed=0):
-    """The standard error from all samples of the linearised hopper, as means over sections."""
+def bound(strides, noise, n_sections=32, seed=0):
+    """The standard error from all samples of the linearized hopper, as means over sections."""
     rate = 16 * sections
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     placed = hj.place_sections(cycle, hj.ClockPhase(sections))
-    force = hj.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=seed)
+    force = hj.testing.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=seed)
     u = force.reshape(-1, 16, 1).mean(axis=1)
     y = np.array(hj.linearize(cycle, placed, ("yM", "vM")).simulate(u))
     y += noise * np.sqrt(sections / RATE) * np.random.default_rng(seed).normal(size=y.shape)
@@ -119,7 +119,7 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, sections=16, phases=tuple(PHASES)):
+def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=tuple(PHASES)):
     print(
         f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {sections} sections, "
         f"noise {noise:g}"
@@ -171,8 +171,8 @@ def dirt(seeds=5, strides=500, noise=1e-4):
             else:
                 dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
             if "drift" in options:
-                rough = hj.estimate_phase(dirty, phase)
-                dirty = hj.without_drift(dirty, rough, ("yM", "vM"), options["drift"])
+                rough = hj.recordings.estimate_phase(dirty, phase)
+                dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), options["drift"])
             fit = hj.fit_series(at_sections(dirty, phase, **options).records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
@@ -187,8 +187,8 @@ def dirt(seeds=5, strides=500, noise=1e-4):
 def walker(seeds=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
-    oscillator, angle = hj.models.VanDerPol(mu=0.1), hj.AnglePhase("x", "v")
-    middle = hj.EventPhase("middle")
+    oscillator, angle = hj.models.VanDerPol(mu=0.1), hj.recordings.AnglePhase("x", "v")
+    middle = hj.recordings.EventPhase("middle")
     # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
     # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
@@ -207,10 +207,10 @@ def walker(seeds=30, strides=100, trials=5, noise=1e-4):
         period, true = float(cycle.period), np.asarray(cycle.multipliers)[:order]
         rate = 200 / period
         force = [
-            hj.random_force(strides * period, rate, 8 / period, rms=size, seed=k)
+            hj.testing.random_force(strides * period, rate, 8 / period, rms=size, seed=k)
             for k in range(seeds * trials)
         ]
-        made = hj.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
+        made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
         hits, widths, found = 0, [], []
         for seed in range(seeds):
             own = made.trials[seed * trials : (seed + 1) * trials]
@@ -218,8 +218,8 @@ def walker(seeds=30, strides=100, trials=5, noise=1e-4):
             one = spoil(one, outputs, noise=noise, seed=seed)
             if mark:
                 one = one.mark("middle", mark[0], direction=mark[1], bandwidth=20 / period)
-            data = hj.section_data(
-                one, phase, inputs="u", outputs=outputs, sections=16, time="duration"
+            data = hj.recordings.section_data(
+                one, phase, inputs="u", outputs=outputs, n_sections=16, time="duration"
             )
             fit = hj.fit_series(data.records, order, overhang=16 * overhang, check=False)
             hits += bool(fit.contains(true).all())
@@ -258,9 +258,10 @@ def write_trials(files, minutes, rate):
     hj.enable_x64()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     force = [
-        hj.random_force(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k) for k in range(len(files))
+        hj.testing.random_force(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k)
+        for k in range(len(files))
     ]
-    made = hj.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
+    made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
     made = spoil(made, ("yM", "vM"), noise=1e-4)
     for file, trial in zip(files, made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])

@@ -1,4 +1,4 @@
-from hybridjax.cli import main
+from hybridjax.apps.cli import main
 
 
 if __name__ == "__main__":

@@ -24,17 +24,17 @@ import numpy as np
 from jaxtyping import jaxtyped
 
 from . import __version__
-from ._core.errors import DefinitionError, FileFormatError, HybridJaxError
 from ._core.precision import require_x64
 from ._core.tracing import is_traced
+from .errors import DefinitionError, FileFormatError, HybridJaxError
 from .experiments.data import ExperimentData
-from .experiments.design import Design
-from .identify.rational import RationalFit
-from .identify.records import Record
-from .identify.series import SeriesFit
-from .identify.structured import StructuredFit
-from .periodic.htf import HTF
-from .periodic.ldtp import LDTP
+from .experiments.design.design import Design
+from .identify.multipliers.structured import StructuredFit
+from .identify.rational.fit import RationalFit
+from .identify.series.fit import SeriesFit
+from .identify.series.layout import Record
+from .linear.htf import HTF
+from .linear.ldtp import LDTP
 
 
 Saved = Design | ExperimentData | HTF | LDTP | RationalFit | Record | SeriesFit | StructuredFit

@@ -38,16 +38,16 @@ SECTIONS, OUTPUTS = 8, ("yM", "vM")
 # ## Parameters from harmonic transfer functions
 #
 # The experiments: multisines as a force on the body, at a signal to noise ratio of 20 dB, and
-# four realisations of the design, so that the estimate knows its own variances.
+# four realizations of the design, so that the estimate knows its own variances.
 
 # %%
 truth = hj.models.VerticalHopper()
 cycle = hj.find_limit_cycle(truth)
 apex = hj.Crossing("vM", "falling")
 sections = hj.ClockPhase(SECTIONS, start=apex)
-design = hj.multisine(SECTIONS, periods=16, f_max=3.0, amplitude=0.02, seed=0).realisations(4)
+design = hj.multisine(SECTIONS, periods=16, f_max=3.0, amplitude=0.02, seed=0).realizations(4)
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
-data = hj.add_noise(data, snr=20, seed=0)
+data = hj.experiments.add_noise(data, snr=20, seed=0)
 estimate = hj.estimate_htf(data, (-1, 0, 1))
 print(estimate)
 
@@ -90,7 +90,7 @@ with hj.plot.style():
         for axes, m in zip(panels[row], (-1, 0, 1), strict=True):
             axes.plot(
                 estimate.f[order], np.abs(estimate[m][order, row, 0]), ".", ms=3, label="estimate",
-                color=hj.plot.COLORS["grey"],
+                color=hj.plot.COLORS["gray"],
             )  # fmt: skip
             axes.plot(f, np.abs(exact["start"][m][:, row, 0]), "--", label="start")
             axes.plot(f, np.abs(exact["fitted"][m][:, row, 0]), label="fit")
@@ -153,7 +153,7 @@ real = hj.find_limit_cycle(Hopper(damping=true_law))
 phases = hj.ClockPhase(SECTIONS, start=0.5)
 force = 0.5 * np.random.default_rng(0).normal(size=(8, PERIODS * SECTIONS, 1))
 records = hj.run_experiments(real, phases, force, OUTPUTS, start="cycle", discard=0)
-records = hj.add_noise(records, snr=40, seed=0)
+records = hj.experiments.add_noise(records, snr=40, seed=0)
 print(records.summary())
 
 measured = jnp.asarray(records.y + np.tile(records.cycle_outputs, (PERIODS, 1)))
@@ -165,7 +165,7 @@ start = jnp.zeros((5, 8)).at[:3].set(jnp.array([[0.5], *records.cycle_outputs[0]
 # through 8 experiments of 4 periods with a touchdown and a lift-off each. The network has few
 # weights, so that their derivatives by all of them are cheap in forward mode, and least squares
 # by Levenberg and Marquardt's iteration end at the noise within 60 steps. (Of a larger network
-# one would take the gradient, in reverse mode, and an optimiser for such, of `optax` say; here
+# one would take the gradient, in reverse mode, and an optimizer for such, of `optax` say; here
 # 400 steps of Adam's end at twelve times the variance of the noise.) A weak pull towards zero
 # keeps what the data do not see.
 
@@ -216,13 +216,13 @@ speeds = np.asarray(q)[np.asarray(chart) == 0, 3]
 v = jnp.linspace(speeds.min(), speeds.max(), 200)
 with hj.plot.style():
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(hj.plot.PAGE, 2.8), layout="constrained")
-    left.plot(v, jax.vmap(true_law)(v), color=hj.plot.COLORS["grey"], lw=4, alpha=0.5, label="true")
+    left.plot(v, jax.vmap(true_law)(v), color=hj.plot.COLORS["gray"], lw=4, alpha=0.5, label="true")
     left.plot(v, 5 * v, "--", color="C1", label="guess")
     left.plot(v, jax.vmap(learned)(v), color="C2", label="learned")
     left.set(xlabel="speed of the foot (m/s)", ylabel="damping force (N)")
     left.legend()
     right.plot(v, 5 * v - jax.vmap(true_law)(v), "--", color="C1", label="guess")
     right.plot(v, jax.vmap(learned)(v) - jax.vmap(true_law)(v), color="C2", label="learned")
-    right.axhline(0, color=hj.plot.COLORS["grey"], lw=0.8)
+    right.axhline(0, color=hj.plot.COLORS["gray"], lw=0.8)
     right.set(xlabel="speed of the foot (m/s)", ylabel="error of the damping force (N)")
     right.legend()

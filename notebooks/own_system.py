@@ -149,7 +149,7 @@ print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
 #
 # Sixteen sections of the phase plane, evenly spaced in the angle of height and speed: of a system
 # without a clock, sections must be given by the state. (None of them may lie exactly on an event.
-# At the bottom the speed is zero, as it is at the apex, so that the centre is moved a little.)
+# At the bottom the speed is zero, as it is at the apex, so that the center is moved a little.)
 # Then multisine forces, held between sections, and the response.
 
 # %%
@@ -158,7 +158,7 @@ center = [(np.min(x) + np.max(x)) / 2 + 0.1 * np.ptp(x) for x in orbit]
 scale = [(np.max(x) - np.min(x)) / 2 for x in orbit]
 phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, start=apex)
 model = hj.linearize(cycle, phase, outputs=("y", "v"))
-design = hj.multisine(sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
+design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
 data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))
 print(data.summary())
 estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
@@ -178,8 +178,8 @@ print(fit.compare(cycle.multipliers))
 
 # %%
 def multiplier(robot):
-    neighbour = hj.find_limit_cycle(robot, guess=cycle)
-    return jnp.trace(hj.linearize(neighbour, [apex], outputs="y").monodromy())
+    neighbor = hj.find_limit_cycle(robot, guess=cycle)
+    return jnp.trace(hj.linearize(neighbor, [apex], outputs="y").monodromy())
 
 
 slopes = jax.jit(jax.jacfwd(multiplier))(robot)

@@ -236,10 +236,10 @@ figure = hj.plot.poles_zeros(rational)
 # multipliers depend on the mass of the body, each cycle found from the last:
 
 # %%
-neighbour = cycle
+neighbor = cycle
 for mass in (2.0, 1.9, 1.8):
-    neighbour = hj.find_limit_cycle(dataclasses.replace(hopper, M=mass), neighbour)
-    print(f"M = {mass} kg: {neighbour.multipliers[0]:.9f}")
+    neighbor = hj.find_limit_cycle(dataclasses.replace(hopper, M=mass), neighbor)
+    print(f"M = {mass} kg: {neighbor.multipliers[0]:.9f}")
 
 # %% [markdown]
 # The estimated transfer functions predict the response to another input of the same frequencies:

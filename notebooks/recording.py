@@ -38,9 +38,9 @@ hj.enable_x64()
 
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-force = np.stack([hj.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)])
-clean = hj.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
-recording = hj.spoil(
+force = np.stack([hj.testing.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)])
+clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
+recording = hj.testing.spoil(
     clean, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0), seed=0
 )
 print(recording)
@@ -48,12 +48,12 @@ print(recording)
 # %% [markdown]
 # ## The five lines
 #
-# Phase is the angle of position and velocity about the centre of their loop, which is estimated;
+# Phase is the angle of position and velocity about the center of their loop, which is estimated;
 # each cycle is sampled at 32 phases; two multipliers are fitted.
 
 # %%
-phase = hj.estimate_phase(recording, hj.AnglePhase("yM", "vM"))
-data = hj.section_data(recording, phase, inputs="u", outputs=("yM", "vM"), sections=32)
+phase = hj.recordings.estimate_phase(recording, hj.recordings.AnglePhase("yM", "vM"))
+data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"), n_sections=32)
 fit = hj.fit_series(data.records, order=2)
 print(phase, data, fit, sep="\n")
 
@@ -73,8 +73,8 @@ print("held by the 95 % regions:", fit.contains(cycle.multipliers))
 
 # %%
 marked = recording.mark("apex", "vM", direction="falling", bandwidth=16)
-strides = hj.section_data(
-    marked, hj.EventPhase("apex"), inputs="u", outputs=("yM", "vM"), sections=32
+strides = hj.recordings.section_data(
+    marked, hj.recordings.EventPhase("apex"), inputs="u", outputs=("yM", "vM"), n_sections=32
 )
 surer = hj.fit_series(strides.records, order=2)
 print(surer)
@@ -97,12 +97,12 @@ figure = hj.plot.section_data(data)
 #
 # The order that predicts strides best that it was not fitted to; and a model of the first three
 # quarters, simulated on the last. What is left is correlated in time since the splines smooth over
-# neighbouring sections, and with the input since numerators are estimates (98 at each section, from
+# neighboring sections, and with the input since numerators are estimates (98 at each section, from
 # 360 strides) and the hopper is not quite linear.
 
 # %%
-print("order:", hj.choose_order(data))
-held_out = hj.hold_out(data, order=2)
+print("order:", hj.recordings.choose_order(data))
+held_out = hj.recordings.hold_out(data, order=2)
 print(held_out.validation)
 figure = hj.plot.validation(held_out.validation)
 
@@ -113,7 +113,7 @@ figure = hj.plot.validation(held_out.validation)
 # errors that other numbers of strides would give.
 
 # %%
-advice = hj.advise(data, fit)
+advice = hj.recordings.advise(data, fit)
 print(advice)
 for strides, errors in zip(advice.strides, advice.expected, strict=True):
     print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
@@ -122,7 +122,7 @@ axes = hj.plot.multiplier_regions(fit, advice.plain)
 # %% [markdown]
 # ## Transfer functions and impulse responses
 #
-# Harmonic transfer functions beside the exact ones of the linearised hopper, and what a brief push
+# Harmonic transfer functions beside the exact ones of the linearized hopper, and what a brief push
 # does at each phase.
 
 # %%
@@ -135,7 +135,7 @@ f = np.arange(1, 161) / 20
 figure = hj.plot.bode(fit.htf(f), exact.htf(f))
 
 # %%
-figure = hj.plot.impulse_responses(hj.impulse_responses(fit, data))
+figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 
 # %% [markdown]
 # ## The next experiment
@@ -145,7 +145,7 @@ figure = hj.plot.impulse_responses(hj.impulse_responses(fit, data))
 # %%
 design = hj.multisine(periods=64, f_max=8.0, lines="odd").scaled(rms=0.02)
 with tempfile.TemporaryDirectory() as folder:
-    hj.write_design(Path(folder) / "by_phase.csv", design)
+    hj.recordings.write_design(Path(folder) / "by_phase.csv", design)
     print((Path(folder) / "by_phase.csv").read_text()[:120])
 
 # %% [markdown]
@@ -159,7 +159,7 @@ with tempfile.TemporaryDirectory() as folder:
 
 # %%
 found = hj.identify_recording(
-    recording, hj.AnglePhase("yM", "vM"), inputs="u", outputs=("yM", "vM"), order=2
+    recording, hj.recordings.AnglePhase("yM", "vM"), inputs="u", outputs=("yM", "vM"), order=2
 )
 with tempfile.TemporaryDirectory() as folder:
     page = hj.write_report(found, Path(folder) / "results")

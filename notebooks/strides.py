@@ -40,13 +40,13 @@ print("true multipliers", np.round(truth, 4))
 # tell us later what scatters. Printing a design says what it costs.
 
 # %%
-design = hj.multisine(lines="odd", periods=64, seed=1).realisations(4).scaled(rms=0.005)
+design = hj.multisine(lines="odd", periods=64, seed=1).realizations(4).scaled(rms=0.005)
 print(design)
 
 # %%
 outputs = ("yM", "vM")
 clean = hj.run_experiments(cycle, phase, design, outputs)  # the first 20 strides are discarded
-data = hj.add_noise(clean, snr=20)  # one part in ten of noise
+data = hj.experiments.add_noise(clean, snr=20)  # one part in ten of noise
 hj.plot.experiment(data)
 print(data.summary())
 
@@ -55,8 +55,8 @@ print(data.summary())
 #
 # A rhythmic system answers one frequency at many: harmonic m of the transfer function says what
 # comes out m cycles per stride away from what went in. The band is where the true value lies with
-# a probability of 95 %, as the four realisations show. It narrows with the number of
-# realisations, but it does not know about mistakes that all of them share.
+# a probability of 95 %, as the four realizations show. It narrows with the number of
+# realizations, but it does not know about mistakes that all of them share.
 
 # %%
 estimate = hj.estimate_htf(data, (-1, 0, 1))
@@ -90,11 +90,11 @@ hj.plot.multipliers(truth, {"20 dB": fit})
 
 # %%
 for count in (1, 2, 4):
-    some = hj.multisine(lines="odd", periods=64, seed=1).realisations(count).scaled(rms=0.005)
+    some = hj.multisine(lines="odd", periods=64, seed=1).realizations(count).scaled(rms=0.005)
     record = hj.run_experiments(cycle, phase, some, outputs)
     errors = []
     for seed in range(10):
-        noisy = hj.estimate_htf(hj.add_noise(record, snr=20, seed=seed), (-1, 0, 1))
+        noisy = hj.estimate_htf(hj.experiments.add_noise(record, snr=20, seed=seed), (-1, 0, 1))
         errors.append(hj.fit_multipliers(noisy, order=2).multipliers[0] - truth[0])
     rms = np.sqrt(np.mean(np.abs(errors) ** 2))
     print(f"{len(record.y) * 84:5d} strides: error of the multipliers {rms:.1e}")
@@ -110,10 +110,10 @@ for count in (1, 2, 4):
 rng = np.random.default_rng(0)
 pushes = 0.005 * rng.standard_normal((2, 300 * 32, 1))
 walk = hj.run_experiments(cycle, phase, pushes, outputs, discard=0)
-noisy = hj.add_noise(walk, snr=20)
+noisy = hj.experiments.add_noise(walk, snr=20)
 y = noisy.y[0].copy()
 y[1000:1100] = np.nan  # a hundred samples were lost
-series = hj.fit_series(hj.Record(noisy.u[0], y, sections=32, outputs=outputs), order=2)
+series = hj.fit_series(hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2)
 print(series)
 print("error", np.max(np.abs(series.multipliers - truth)))
 
@@ -124,8 +124,8 @@ print("error", np.max(np.abs(series.multipliers - truth)))
 # more than 90 % of it.
 
 # %%
-test = hj.Record(noisy.u[1], noisy.y[1], sections=32, outputs=outputs)
-report = hj.validate(hj.realise(series), test)
+test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
+report = hj.validate(hj.identify.realize(series), test)
 print(report)
 hj.plot.validation(report)
 

@@ -36,7 +36,7 @@ POINTS = 100  # in each direction
 # %% [markdown]
 # ## Limit cycles and multipliers of all of them
 #
-# One call. Newton starts from one hopper's cycle, and then from those of neighbours; where that
+# One call. Newton starts from one hopper's cycle, and then from those of neighbors; where that
 # fails a hopper is left to itself for 40 periods first. What has no cycle of this kind is listed by
 # index, with the reason.
 
@@ -51,15 +51,15 @@ print(cycles.summary(limit=2))
 # %% [markdown]
 # Each hopper has four multipliers, two of which are zero: touchdown forgets the foot. The
 # largest modulus says how fast disturbances die out; below one the hopper is stable. As a picture,
-# the colour is the angle of the first multiplier (red for positive, cyan for negative real ones)
+# the color is the angle of the first multiplier (red for positive, cyan for negative real ones)
 # and the brightness its modulus. White: no cycle with one flight and one stance per period.
 
 # %%
 first = cycles.multipliers[:, 0].reshape(POINTS, POINTS)
 modulus = np.abs(first)
 hue = np.abs(np.angle(first)) / (2 * np.pi)
-colours = hsv_to_rgb(np.stack([np.nan_to_num(hue), np.ones_like(hue), np.nan_to_num(modulus)], -1))
-colours[np.isnan(modulus)] = 1.0
+colors = hsv_to_rgb(np.stack([np.nan_to_num(hue), np.ones_like(hue), np.nan_to_num(modulus)], -1))
+colors[np.isnan(modulus)] = 1.0
 extent = (k_axis[0], k_axis[-1], b_axis[0], b_axis[-1])
 
 
@@ -76,23 +76,23 @@ with hj.plot.style():
     left.clabel(lines, fontsize=6)
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     label(left, "contraction in one period")
-    right.imshow(colours, extent=extent, origin="lower", aspect="auto", interpolation="nearest")
+    right.imshow(colors, extent=extent, origin="lower", aspect="auto", interpolation="nearest")
     label(right, "the first multiplier: angle and modulus")
     right.set_ylabel("")
 
 # %% [markdown]
-# Multipliers meet on the real axis where the picture changes from colours to plain red or cyan.
+# Multipliers meet on the real axis where the picture changes from colors to plain red or cyan.
 # The modulus of the largest has a kink there, and its derivative grows without bound on one side.
 #
 # ## The best hopper of a given height
 #
-# `hj.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
+# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
 # $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its slopes
 # and those of the height of the apex go through the limit cycle and its events; forwards, since
-# there are only two parameters. The optimiser is one of scipy, for losses with constraints.
+# there are only two parameters. The optimizer is one of scipy, for losses with constraints.
 
 # %%
-WANTED = 2.3  # height of the body at the apex, in metres
+WANTED = 2.3  # height of the body at the apex, in meters
 apex = hj.Crossing("vM", "falling")
 
 
@@ -104,7 +104,7 @@ def look(kb):
         system = hj.models.VerticalHopper(k=kb[0], b=kb[1])
         found = hj.find_limit_cycle(system, cycle)
         height = hj.place_sections(found, [apex]).lanes.q[0, 0]
-        values = jnp.stack([height, jnp.log(hj.spectral_radius(found, smoothing=1e-4))])
+        values = jnp.stack([height, jnp.log(hj.fitting.spectral_radius(found, smoothing=1e-4))])
         return values, values
 
     slopes, values = jax.jacfwd(both, has_aux=True)(kb)
@@ -135,7 +135,7 @@ print("multipliers at the optimum:", best.multipliers)
 # ## Against all of them
 #
 # Heights of all hoppers, from the states at the 16 points that each cycle keeps (`legs`): the cubic
-# through its neighbours has its top where the speed is zero, good to 0.03 mm. In each of the
+# through its neighbors has its top where the speed is zero, good to 0.03 mm. In each of the
 # 100 columns of the sweep, interpolation gives the hopper with the wanted height.
 
 # %%
@@ -167,7 +167,7 @@ with hj.plot.style():
     image = left.pcolormesh(k_axis, b_axis, modulus, cmap="viridis", vmin=0, rasterized=True)
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     left.plot(*line[:, :2].T, color="white", lw=1.2, label=f"apex at {WANTED} m")
-    left.plot(*path.T, ".-", color=red, label="steps of the optimiser")
+    left.plot(*path.T, ".-", color=red, label="steps of the optimizer")
     left.plot(*path[-1], "*", ms=11, color=red, mec="white", label="optimum")
     label(left, "where the apex has the wanted height")
     legend = left.legend(loc="upper left", frameon=True, framealpha=0.6, facecolor="black")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.cli import main
+from hybridjax.apps.cli import main
 
 
 def _python(*arguments):
@@ -18,7 +18,7 @@ def _python(*arguments):
 @pytest.mark.parametrize("arguments", [["--help"], ["reproduce", "--help"]])
 def test_help_does_not_import_jax(arguments):
     code = (
-        "import sys; from hybridjax.cli import main\n"
+        "import sys; from hybridjax.apps.cli import main\n"
         "try: main(sys.argv[1:])\n"
         "except SystemExit: pass\n"
         "print('heavy:', [m for m in ('jax', 'numpy', 'matplotlib') if m in sys.modules])"

@@ -50,12 +50,12 @@ def ldtp():
 
 @pytest.fixture(scope="module")
 def things(ldtp):
-    design = hj.multisine(sections=2, periods=16, f_max=1.0, inputs=("force", "torque é"))
-    data = hj.simulate_experiments(ldtp, design)
+    design = hj.multisine(n_sections=2, periods=16, f_max=1.0, inputs=("force", "torque é"))
+    data = hj.experiments.simulate_experiments(ldtp, design)
     htf = hj.estimate_htf(data)
     plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
     fits = hj.fit_rational(htf), hj.fit_multipliers(htf, ldtp, overhang=2)
-    record = hj.Record(data.u[0], data.y[0], sections=2, start=1)
+    record = hj.Record(data.u[0], data.y[0], n_sections=2, start=1)
     series = hj.fit_series(data, ldtp, overhang=2)
     return [design, data, htf, ldtp, plain, *fits, record, series]
 
@@ -70,7 +70,7 @@ def test_failed_experiments_and_cycle_outputs(folder):
     y = np.ones((2, 6, 1))
     y[1, 3:] = np.nan
     data = hj.ExperimentData(
-        np.zeros((2, 6, 1)), y, sections=3, periods=1, result=[0, hj.Result.GRAZING],
+        np.zeros((2, 6, 1)), y, n_sections=3, periods=1, result=[0, hj.Result.GRAZING],
         failed_at=[-1, 3], cycle_outputs=np.arange(3.0)[:, None], family="by hand",
     )  # fmt: skip
     object.__setattr__(data, "periods", np.int64(1))  # as where nobody checks annotations
@@ -113,7 +113,7 @@ def test_round_trip_of_any_fit(folder, data):
     other = [data.draw(arrays(complex, s)) for s in ((ny, p), (ny, q), (ny, p))]
     code = data.draw(arrays(np.int64, ny))
     names = tuple(f"y{i}" for i in range(ny))
-    fit = hj.RationalFit(
+    fit = hj.identify.RationalFit(
         *real[:2], *other, real[2], code, 0, 32, "delayed", "uniform", names, data.draw(st.text())
     )
     assert same(fit, trip(folder, fit))
@@ -136,7 +136,7 @@ def test_damaged_files_are_refused_or_harmless(folder, things, data):
     path.write_bytes(content)
     try:
         assert same(thing, hj.load(path))
-    except hj.FileFormatError as error:
+    except hj.errors.FileFormatError as error:
         assert str(path) in str(error)
 
 
@@ -175,7 +175,7 @@ def test_foreign_content(folder, things, change, says):
     path = folder / "foreign.npz"
     hj.save(path, things[2])
     rewrite(path, **change)
-    with pytest.raises(hj.FileFormatError, match=says):
+    with pytest.raises(hj.errors.FileFormatError, match=says):
         hj.load(path)
 
 
@@ -183,7 +183,7 @@ def test_fields_are_checked_against_each_other(folder, things):
     path = folder / "foreign.npz"
     hj.save(path, things[5])
     rewrite(path, arrays={"poles": np.zeros((7, 2), complex)})
-    with pytest.raises(hj.FileFormatError, match="poles"):
+    with pytest.raises(hj.errors.FileFormatError, match="poles"):
         hj.load(path)
 
 
@@ -191,24 +191,24 @@ def test_pickles_are_not_executed(folder, things):
     path = folder / "trap.npz"
     hj.save(path, things[2])
     rewrite(path, arrays={"H": np.array([_Trap()], dtype=object)})
-    with pytest.raises(hj.FileFormatError, match="damaged"):
+    with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(pickle.dumps(_Trap()))
-    with pytest.raises(hj.FileFormatError, match="not an npz file"):
+    with pytest.raises(hj.errors.FileFormatError, match="not an npz file"):
         hj.load(path)
 
 
 def test_other_files(folder):
     path = folder / "other.npz"
     np.savez(path, a=np.zeros(3))
-    with pytest.raises(hj.FileFormatError, match="not written by hybridjax.save"):
+    with pytest.raises(hj.errors.FileFormatError, match="not written by hybridjax.save"):
         hj.load(path)
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("readme.txt", "hello")
-    with pytest.raises(hj.FileFormatError, match="damaged"):
+    with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(b"")
-    with pytest.raises(hj.FileFormatError, match="not an npz file"):
+    with pytest.raises(hj.errors.FileFormatError, match="not an npz file"):
         hj.load(path)
 
 

@@ -13,23 +13,23 @@ import hybridjax
 ROOT = pathlib.Path(hybridjax.__file__).parent
 # Each entry imports only from entries before it, and from itself.
 LAYERS = [
+    "errors",
     "_core",
     "systems",
     "models",
-    "periodic",
-    "flow",
+    "linear",
+    "engine",
+    "sections",
     "orbits",
+    "maps",
     "experiments",
     "identify",
     "fitting",
     "recordings",
+    "testing",
     "plot",
     "io",
-    "store",
-    "report",
-    "recording_report",
-    "reproduce",
-    "cli",
+    "apps",
     "__main__",
 ]
 

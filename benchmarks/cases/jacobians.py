@@ -14,7 +14,7 @@ import truth
 from peers import contest
 
 import hybridjax as hj
-from hybridjax.orbits.linearize import _section_jacobians
+from hybridjax.maps.linearize import _section_jacobians
 
 from .problems import ALL, Problem, first_and_later, problem
 
@@ -42,13 +42,13 @@ def run(show, options) -> None:
             name = f"{task.label}.program.rtol_{rtol:.0e}"
             settings = hj.Settings(rtol=rtol, atol=rtol)
             cycle = dataclasses.replace(task.cycle, settings=settings)
-            work = ft.partial(_program, hj.place_sections(cycle, task.placed.sections))
+            work = ft.partial(_program, hj.place_sections(cycle, task.placed.family))
             (A, B), compiling, seconds = first_and_later(work, repeat)
             if rtol == RTOL[0]:
                 show(f"{name}.compile", compiling)
             show(f"{name}.cpu", seconds.cpu)
             show(f"{name}.error", _error((A, B), exact))
-            work = ft.partial(_placing, cycle, task.placed.sections)
+            work = ft.partial(_placing, cycle, task.placed.family)
             show(f"{task.label}.placing.rtol_{rtol:.0e}.cpu", first_and_later(work, repeat)[2].cpu)
         name = f"{task.label}.linearize"
         work = ft.partial(hj.linearize, task.cycle, task.placed, task.outputs)

@@ -6,19 +6,19 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
-from .collection import uncollected
+from .garbage_collector import uncollected
 from .tracing import is_traced
 
 
-# What makes XLA compile for the CPU in a third of the time: no optimisation passes of LLVM, and
+# What makes XLA compile for the CPU in a third of the time: no optimization passes of LLVM, and
 # the older of its two code generators. Options that an XLA does not know are left out.
 _QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 def quick_jit(function: Callable) -> Callable:
-    """`equinox.filter_jit` for programs that run a few times: compiled with little optimisation.
+    """`equinox.filter_jit` for programs that run a few times: compiled with little optimization.
 
-    Finding a cycle or linearising it takes milliseconds, and compiling the program for it
+    Finding a cycle or linearizing it takes milliseconds, and compiling the program for it
     seconds. Inside of another jit, or under any other transformation of JAX, this is
     `filter_jit`: there the outer program decides.
     """

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .errors import PrecisionError
+from ..errors import PrecisionError
 
 
 def enable_x64() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from .errors import DefinitionError
+from ..errors import DefinitionError
 from .precision import require_x64
 
 

@@ -11,25 +11,25 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from .._core.collection import uncollected
 from .._core.compile import quick_jit
-from .._core.errors import ComputationError, DefinitionError
+from .._core.garbage_collector import uncollected
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
 from .._core.threads import in_threads, meanwhile, thread_count
-from ..flow.move import Settings
+from ..engine.move import Settings
+from ..errors import ComputationError, DefinitionError
+from ..linear.ldtp import LDTP
+from ..maps.linearize import linearize
+from ..maps.place import PATIENCE, as_placed
+from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
-from ..orbits.linearize import linearize
-from ..orbits.place import PATIENCE, as_placed
-from ..orbits.placed import PlacedSections
-from ..orbits.plan import Plan, check_accuracy, plan_flow
-from ..periodic.ldtp import LDTP
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
 from .data import ExperimentData
-from .design import Design
+from .design.design import Design
+from .plan import Plan, check_accuracy, plan_flow
 from .respond import observe, respond
-from .single import plan_single
+from .single_precision import plan_single
 
 
 # Experiments in one compiled call: on CPU, where more of them leave the cache and fewer share the
@@ -72,7 +72,7 @@ class Campaign:
     workers: int
     """Threads that run calls at the same time."""
     small: bool
-    """Whether the program is compiled with little optimisation, since it will not run for long."""
+    """Whether the program is compiled with little optimization, since it will not run for long."""
 
     def inputs(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
         """The inputs of some experiments."""
@@ -82,7 +82,7 @@ class Campaign:
 
     def run(self, rows: slice, progress: bool = False) -> ExperimentData:
         """Run some of the experiments."""
-        N, size = self.placed.count, self.size
+        N, size = self.placed.n_sections, self.size
         u = self.inputs(rows)
         S = len(u)
         start, program = self._start(u), _respond[self.small]
@@ -127,7 +127,7 @@ class Campaign:
         return ExperimentData(
             u,
             y,
-            sections=N,
+            n_sections=N,
             periods=self.periods,
             inputs=self.placed.cycle.system.inputs,
             outputs=self.outputs.names,
@@ -135,7 +135,7 @@ class Campaign:
             failed_at=failed_at,
             error=error,
             cycle_outputs=base,
-            family=self.placed.sections.label,
+            family=self.placed.family.label,
         )
 
     def _start(self, u) -> Float[np.ndarray, "n S"]:
@@ -145,7 +145,7 @@ class Campaign:
         if self.model is None:
             return np.repeat(on_cycle, len(u), axis=1)
         embed = np.asarray(self.placed.frames()[0][0])[:, : self.model.A.shape[1]]
-        window = jnp.asarray(u[:, : self.periods * self.placed.count])
+        window = jnp.asarray(u[:, : self.periods * self.placed.n_sections])
         x0 = jax.vmap(lambda u: self.model.periodic_state(u, self.periods))(window)
         return on_cycle + embed @ np.asarray(x0).T
 
@@ -182,7 +182,7 @@ def _compile_ahead(program, placed: PlacedSections, shape, outputs) -> None:
     """
     if _kind(program, placed, shape, outputs) in _compiled:
         return
-    N, n = placed.count, 1 + placed.lanes.q.shape[0]
+    N, n = placed.n_sections, 1 + placed.lanes.q.shape[0]
     plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
     start, u = jnp.asarray(np.zeros((n, shape[0]))), jnp.asarray(np.zeros(shape))
     arguments = placed, plan, start, u, outputs, Settings(1.0, 1.0, PATIENCE)
@@ -232,13 +232,13 @@ def prepare(
         largest = np.abs(cycle.multipliers[0])
         raise ComputationError(
             f"the limit cycle is not stable (largest multiplier {largest:.4g} in modulus), so "
-            "experiments would leave it: stabilise the system, or use the exact linearisation "
+            "experiments would leave it: stabilize the system, or use the exact linearization "
             "(`linearize`), which needs no experiments."
         )
     if precision not in _ACCURACY:
         raise DefinitionError(f"precision is 'double' or 'single', not {precision!r}.")
     nu = len(cycle.system.inputs)
-    source, count, cycles, periods = _source(design, placed.count, nu, start, discard, periods)
+    source, count, cycles, periods = _source(design, placed.n_sections, nu, start, discard, periods)
     model = None
     if start == "periodic":
         if cycles % periods:
@@ -250,7 +250,7 @@ def prepare(
     size, workers = divide(together, batch, workers, precision)
     accuracy = _ACCURACY[precision] if accuracy is None else float(accuracy)
     check_accuracy(accuracy)
-    samples = cycles * placed.count
+    samples = cycles * placed.n_sections
     small = count * samples <= _SMALL
     if precision == "double":
         _compile_ahead(_respond[small], placed, (size, samples, nu), tuple(z.items))
@@ -302,9 +302,9 @@ def _source(design, N: int, nu: int, start: str, discard, periods):
     if discard < 0 or discard != int(discard):
         raise DefinitionError(f"discard is the number of cycles before the window, not {discard}.")
     if isinstance(design, Design):
-        if design.sections != N:
+        if design.n_sections != N:
             raise DefinitionError(
-                f"the design is for {design.sections} sections, but the family has {N}."
+                f"the design is for {design.n_sections} sections, but the family has {N}."
             )
         if len(design.input_names) != nu:
             raise DefinitionError(
@@ -342,5 +342,5 @@ def _source(design, N: int, nu: int, start: str, discard, periods):
 @quick_jit
 def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
     s = Structure(placed.cycle.system)
-    u = jnp.zeros((s.nu, placed.count))
+    u = jnp.zeros((s.nu, placed.n_sections))
     return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T

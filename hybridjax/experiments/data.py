@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.errors import DefinitionError
+from .._core.arguments import names
 from .._core.results import Result
-from ..periodic._checks import names
-from ..periodic.ldtp import LDTP
-from .design import Design
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from .design.design import Design
 from .noise import draw_process_noise
 
 
@@ -31,7 +31,7 @@ class ExperimentData(eqx.Module):
     - `error`: (S,) estimates of the largest error of a simulation, relative to the sizes of the
       states on the cycle, or None if not known.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
-    - `sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
+    - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
     - `inputs`, `outputs`: names. `family`: name of the section family, for labels.
     """
 
@@ -41,7 +41,7 @@ class ExperimentData(eqx.Module):
     failed_at: Int[np.ndarray, " S"]
     error: Float[np.ndarray, " S"] | None
     cycle_outputs: Float[np.ndarray, "N ny"] | None
-    sections: int = eqx.field(static=True)
+    n_sections: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
@@ -52,7 +52,7 @@ class ExperimentData(eqx.Module):
         u: Any,
         y: Any,
         *,
-        sections: int,
+        n_sections: int,
         periods: int,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
@@ -82,7 +82,7 @@ class ExperimentData(eqx.Module):
         self.cycle_outputs = (
             None if cycle_outputs is None else _real("cycle_outputs", cycle_outputs)
         )
-        self.sections, self.periods, self.family = sections, periods, family
+        self.n_sections, self.periods, self.family = n_sections, periods, family
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
 
@@ -90,7 +90,7 @@ class ExperimentData(eqx.Module):
 
     def _check(self) -> None:
         S, n, _ = self.u.shape
-        N, P, ny = self.sections, self.periods, self.y.shape[2]
+        N, P, ny = self.n_sections, self.periods, self.y.shape[2]
         if N < 1 or P < 1:
             raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
         if n % N:
@@ -133,45 +133,45 @@ class ExperimentData(eqx.Module):
     @property
     def window(self) -> slice:
         """The samples that estimates use: the last P periods."""
-        return slice(self.u.shape[1] - self.sections * self.periods, None)
+        return slice(self.u.shape[1] - self.n_sections * self.periods, None)
 
     def windows(self, repeats: int = 1) -> list[slice]:
         """The last `repeats` windows of P periods each, one after the other.
 
         **Raises:** `DefinitionError` if the record is too short.
         """
-        n, length = self.u.shape[1], self.sections * self.periods
+        n, length = self.u.shape[1], self.n_sections * self.periods
         if repeats < 1 or repeats * length > n:
             raise DefinitionError(
                 f"{repeats} windows of P = {self.periods} periods need {repeats * self.periods} "
-                f"cycles (and repeats >= 1), but the record has {n // self.sections}: record more "
-                "cycles, or take fewer repeats."
+                f"cycles (and repeats >= 1), but the record has {n // self.n_sections}: record "
+                "more cycles, or take fewer repeats."
             )
         first = n - repeats * length
         return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
 
     def summary(self, limit: int = 5) -> str:
         """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
-        return summary(self.result, self.failed_at, self.sections, limit)
+        return summary(self.result, self.failed_at, self.n_sections, limit)
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
         family = f"{self.family}, " if self.family else ""
         return (
-            f"ExperimentData({family}{self.summary()}; {n // self.sections} cycles of "
-            f"{self.sections} sections each, window P = {self.periods} periods; "
+            f"ExperimentData({family}{self.summary()}; {n // self.n_sections} cycles of "
+            f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
         )
 
 
 def summary(
-    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], sections: int, limit: int
+    result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], n_sections: int, limit: int
 ) -> str:
     """What became of experiments, and where and why the first `limit` that failed did so."""
     failed = np.flatnonzero(result != Result.OK)
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:
-        cycle, section = divmod(int(failed_at[s]), sections)
+        cycle, section = divmod(int(failed_at[s]), n_sections)
         where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
         text.append(f"#{s}: {where}{Result(int(result[s])).message}")
     if len(failed) > limit:
@@ -217,10 +217,10 @@ def simulate_experiments(
     """
     if start not in ("rest", "periodic"):
         raise DefinitionError(f"start must be 'rest' or 'periodic', not {start!r}.")
-    if ldtp.sections != design.sections or len(ldtp.inputs) != len(design.input_names):
+    if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
         raise DefinitionError(
-            f"the design is for N = {design.sections} and {len(design.input_names)} inputs, the "
-            f"model has N = {ldtp.sections} and {len(ldtp.inputs)}."
+            f"the design is for N = {design.n_sections} and {len(design.input_names)} inputs, the "
+            f"model has N = {ldtp.n_sections} and {len(ldtp.inputs)}."
         )
     if discard is None:
         discard = 20 if start == "rest" else 0
@@ -236,7 +236,7 @@ def simulate_experiments(
     return ExperimentData(
         u,
         y,
-        sections=design.sections,
+        n_sections=design.n_sections,
         periods=design.periods,
         inputs=ldtp.inputs,
         outputs=ldtp.outputs,

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 
 
 def draw_process_noise(

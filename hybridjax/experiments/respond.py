@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
-from ..flow.lanes import Lanes, for_each_chart, needed, only
-from ..flow.move import Settings, move
-from ..orbits.placed import PlacedSections
-from ..orbits.plan import Plan
+from ..engine.lanes import Lanes, for_each_chart, needed, only
+from ..engine.move import Settings, move
+from ..maps.placed import PlacedSections
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
+from .plan import Plan
 
 
 # Error that rounding alone may leave, relative to the states' scales.
@@ -51,7 +51,7 @@ def respond(
     system, cycle = placed.cycle.system, placed.cycle
     s = Structure(system)
     z = s.resolve_outputs(outputs)
-    N, (S, n, _) = placed.count, u.shape
+    N, (S, n, _) = placed.n_sections, u.shape
     one_turn = len(cycle.order)
     first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
     lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)

@@ -9,7 +9,7 @@ from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import chunks, prepare
 from .data import ExperimentData
-from .design import Design
+from .design.design import Design
 from .variation import vary
 
 
@@ -50,7 +50,7 @@ def run_experiments(
         (by default all that are not discarded).
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
     - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
-        linearisation predicts, so that there is almost no transient, and "steady" in the periodic
+        linearization predicts, so that there is almost no transient, and "steady" in the periodic
         response itself, found by Newton's method, with none.
     - `discard`: cycles that come before the design's periods and are meant to be discarded. By
         default 20 from the cycle (the paper's) and 0 from a periodic start.

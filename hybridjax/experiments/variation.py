@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from .._core.errors import ComputationError
+from ..errors import ComputationError
 from ..systems.output import Output
 from ..systems.structure import Structure
 from .campaign import Campaign
@@ -50,10 +50,10 @@ class Variation(Campaign):
     def _settle(self, u, begin, first: int):
         r"""Starts from which the responses repeat after P periods: zeros of $F(x) - x$.
 
-        Newton's method with the Jacobian of the linearisation, $\Phi^P$, as precise as the response
+        Newton's method with the Jacobian of the linearization, $\Phi^P$, as precise as the response
         is linear. Experiments that fail keep the start that they had.
         """
-        N, P = self.placed.count, self.periods
+        N, P = self.placed.n_sections, self.periods
         once = np.concatenate([u[:, : N * P], u[:, :N]], axis=1)
         lanes = self.placed.lanes
         cycle = np.concatenate([lanes.t[None], lanes.q])[:, :1]
@@ -77,7 +77,7 @@ class Variation(Campaign):
         s = int(np.argmax(worst))
         raise ComputationError(
             f"experiment {first + s}: no periodic response was found near the one that the "
-            f"linearisation predicts (after {P} periods the state differs by {worst[s]:.1e} of its "
+            f"linearization predicts (after {P} periods the state differs by {worst[s]:.1e} of its "
             "size): make the input smaller, or discard cycles instead."
         )
 

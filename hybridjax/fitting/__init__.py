@@ -1,0 +1,6 @@
+"""What a fit of physical parameters is made of, and what it gives back."""
+
+import lazy_loader
+
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

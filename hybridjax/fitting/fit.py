@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from .._core.errors import ComputationError, DefinitionError
 from .._core.results import Result
+from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle, find_limit_cycle
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from .identifiability import Identifiability, diagnose
 from .model_fit import ModelFit, Starts
 from .observations import AbstractObservation
 from .parameters import Free, Parameters, free_parameters
 from .problem import MAX_STEPS, Problem, evaluate, levenberg_marquardt
+from .sensitivity import Identifiability, diagnose
 
 
 # Without variances, a fit that explains all but this part of the data (mean square) is perfect.

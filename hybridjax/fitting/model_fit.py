@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from .._core.errors import DefinitionError
 from .._core.results import Result
+from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem
-from .identifiability import Identifiability
 from .problem import Problem, evaluate
+from .sensitivity import Identifiability
 
 
 class Starts(eqx.Module):

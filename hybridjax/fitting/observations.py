@@ -10,19 +10,19 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._core.errors import DefinitionError
+from ..engine.move import Settings
+from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
+from ..experiments.plan import Plan
 from ..experiments.respond import observe, respond
-from ..experiments.response import response_function
-from ..flow.move import Settings
-from ..flow.sections import AbstractSections, as_sections
-from ..identify.values import check_values, weights_of
+from ..experiments.response_function import response_function
+from ..identify.multipliers.weights import check_values, weights_of
+from ..linear.htf import HTF
+from ..maps.linearize import linearize
+from ..maps.place import place_sections
+from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
-from ..orbits.linearize import linearize
-from ..orbits.place import place_sections
-from ..orbits.placed import PlacedSections
-from ..orbits.plan import Plan
-from ..periodic.htf import HTF
+from ..sections.families import AbstractSections, as_sections
 from ..systems.structure import Structure
 
 
@@ -76,9 +76,10 @@ class ObservedHTF(AbstractObservation):
         """
         self.f, self.H, self.sections = htf.f, htf.H, as_sections(sections)
         self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
-        if self.sections.count != htf.sections:
+        if self.sections.n_sections != htf.n_sections:
             raise DefinitionError(
-                f"the HTFs belong to {htf.sections} sections, the family has {self.sections.count}."
+                f"the HTFs belong to {htf.n_sections} sections, the family has "
+                f"{self.sections.n_sections}."
             )
         self.weights = jnp.asarray(weights_of(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
@@ -126,9 +127,9 @@ class ObservedSeries(AbstractObservation):
         an `std` that is not positive.
         """
         self.sections = as_sections(sections)
-        if self.sections.count != data.sections:
+        if self.sections.n_sections != data.n_sections:
             raise DefinitionError(
-                f"the data have {data.sections} sections, the family {self.sections.count}."
+                f"the data have {data.n_sections} sections, the family {self.sections.n_sections}."
             )
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is nothing to fit to.")
@@ -145,7 +146,7 @@ class ObservedSeries(AbstractObservation):
         self.weighted = jnp.asarray(std is not None)
         self.absolute = data.cycle_outputs is not None
         if self.absolute:
-            y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.sections, 1))
+            y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
         self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
         self.flow = None
 
@@ -156,7 +157,9 @@ class ObservedSeries(AbstractObservation):
         plan, settings = self.flow
         y = respond(placed, plan, start, self.u, self.outputs, settings).y
         if not self.absolute:
-            y = y - jnp.tile(_at_sections(placed, self.outputs), (y.shape[1] // placed.count, 1))
+            y = y - jnp.tile(
+                _at_sections(placed, self.outputs), (y.shape[1] // placed.n_sections, 1)
+            )
         return ((y - self.y) / self.scale).ravel()
 
     def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
@@ -212,7 +215,7 @@ class ObservedCycle(AbstractObservation):
         """
         self.sections = as_sections(sections)
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        N, ny = self.sections.count, len(self.outputs)
+        N, ny = self.sections.n_sections, len(self.outputs)
         given = {
             "values": (values, std, (N, ny)),
             "times": (times, times_std, (N,)),
@@ -237,7 +240,7 @@ class ObservedCycle(AbstractObservation):
         placed = place_sections(cycle, sections)
         outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         values = _at_sections(placed, outputs) if outputs else None
-        return cls(placed.sections, outputs, values, times=_times(placed), period=cycle.period)
+        return cls(placed.family, outputs, values, times=_times(placed), period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
@@ -263,7 +266,7 @@ class ObservedCycle(AbstractObservation):
 def _at_sections(placed: PlacedSections, outputs: tuple[str, ...]) -> Float[Array, "N ny"]:
     s = Structure(placed.cycle.system)
     z = s.resolve_outputs(outputs)
-    return observe(s, z, placed.lanes, jnp.zeros((s.nu, placed.count))).T
+    return observe(s, z, placed.lanes, jnp.zeros((s.nu, placed.n_sections))).T
 
 
 def _times(placed: PlacedSections) -> Float[Array, " N"]:

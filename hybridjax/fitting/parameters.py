@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 from ..systems.system import HybridSystem
 
 

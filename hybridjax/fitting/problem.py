@@ -60,7 +60,7 @@ def _residuals(x, problem, guess, free):
 
 @_residuals.def_jvp
 def _residuals_jvp(primals, tangents):
-    """optimistix linearises at every trial point, so that this is one evaluation for each."""
+    """optimistix linearizes at every trial point, so that this is one evaluation for each."""
     x, problem, guess, free = primals
     r, J = _with_jacobian(problem, x, guess)
     return (r, (r, J)), (free * (J @ tangents[0]), (None, None))

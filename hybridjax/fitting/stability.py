@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from ..linear.time_response import monodromy
 from ..orbits.cycle import LimitCycle
-from ..periodic.ldtp import LDTP
-from ..periodic.response import monodromy
 
 
 def spectral_radius(model: LDTP | LimitCycle, smoothing: float = 1e-3) -> Float[Array, ""]:

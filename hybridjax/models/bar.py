@@ -34,8 +34,8 @@ class _Standing(Chart):
 class TwoLeggedBar(HybridSystem):
     """A rigid bar, hopping on a hind and a front leg over a table that shakes up and down.
 
-    States: height `y` of the centre and its speed `v`, pitch `q` (a small angle by definition) and
-    its rate `p`. Input `u` is a vertical force at the centre. A foot that lands loses the share
+    States: height `y` of the center and its speed `v`, pitch `q` (a small angle by definition) and
+    its rate `p`. Input `u` is a vertical force at the center. A foot that lands loses the share
     1 - rho of its speed relative to the table in an impulse; it lets go when its leg has its rest
     length again.
     """

@@ -10,21 +10,21 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.compile import quick_jit
-from .._core.errors import ComputationError, DefinitionError
+from .._core.memo import remembered
 from .._core.precision import require_x64
-from .._core.remember import remembered
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..flow.lanes import Lanes
-from ..flow.move import Settings
-from ..flow.sections import AtEvent, Crossing
-from ..flow.target import until
-from ..flow.trajectory import Trajectory, simulate
-from ..flow.watch import slopes, watch
-from ..periodic.multipliers import product_eigenvalues
+from ..engine.lanes import Lanes
+from ..engine.move import Settings
+from ..engine.target import until
+from ..engine.trajectory import Trajectory, simulate
+from ..engine.watch import slopes, watch
+from ..errors import ComputationError, DefinitionError
+from ..linear.multipliers import product_eigenvalues
+from ..sections.families import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
-from .begin import begin
+from .guess import begin
 from .return_map import ReturnMap, solve
 
 
@@ -277,7 +277,7 @@ def _check_conserved(cycle: LimitCycle) -> None:
         after = gradient @ monodromy[: s.dims[a], : s.dims[a]]
         if not np.allclose(after, gradient, rtol=0, atol=1e-6 * np.max(np.abs(gradient))):
             raise DefinitionError(
-                f"'{name}' is not conserved by {type(cycle.system).__name__}: neighbours of the "
+                f"'{name}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
                 "cycle change it in one turn. Leave it out of `conserved`."
             )
 

@@ -17,14 +17,14 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.results import Result
-from ..flow.events import arm, start_lanes
-from ..flow.lanes import Lanes
-from ..flow.move import move
-from ..flow.sections import AtEvent, Crossing, ListLevels
-from ..flow.target import Target, toward, until
-from ..flow.watch import slopes, watch
+from ..engine.events import arm, start_lanes
+from ..engine.jacobian import flow_jacobian
+from ..engine.lanes import Lanes
+from ..engine.move import move
+from ..engine.target import Target, toward, until
+from ..engine.watch import slopes, watch
+from ..sections.families import AtEvent, Crossing, ListLevels
 from ..systems.structure import Structure
-from .jacobian import flow_jacobian
 
 
 # Pieces into which one turn is cut: their Jacobians are the factors of the monodromy.
@@ -158,7 +158,7 @@ def _root(system, start, kind, expected, settings, damped, max_steps):
 @_root.def_jvp
 def _root_jvp(primals, tangents):
     """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
-    where it is taken twice, since JAX cannot vectorise the derivative of `flow_jacobian`.)"""
+    where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""
     *parameters, settings, _, _ = primals
     q, seen, steps = _root(*primals)
 

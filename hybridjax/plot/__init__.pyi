@@ -1,4 +1,11 @@
-from .branch import branch as branch
+from .branches import branch as branch
+from .fit_quality import amplitude as amplitude, validation as validation
+from .frequency import (
+    bode as bode,
+    bodes as bodes,
+    harmonics as harmonics,
+    magnitude as magnitude,
+)
 from .look import COLORS as COLORS, COLUMN as COLUMN, PAGE as PAGE, save as save, style as style
 from .orbit import cycle as cycle
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
@@ -9,10 +16,3 @@ from .recorded import (
     section_data as section_data,
 )
 from .signals import experiment as experiment
-from .transfer import (
-    bode as bode,
-    bodes as bodes,
-    harmonics as harmonics,
-    magnitude as magnitude,
-)
-from .validation import amplitude as amplitude, validation as validation

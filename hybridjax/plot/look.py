@@ -1,4 +1,4 @@
-"""One look for all figures: sizes of a two-column paper, colours, fonts; and saving."""
+"""One look for all figures: sizes of a two-column paper, colors, fonts; and saving."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 
 
 COLUMN = 3.5
@@ -28,9 +28,9 @@ COLORS = {
     "orange": "#E69F00",
     "sky": "#56B4E9",
     "black": "#000000",
-    "grey": "#8C8C8C",
+    "gray": "#8C8C8C",
 }
-"""The palette of Okabe and Ito (2008), which colour-blind readers can tell apart, and a grey."""
+"""The palette of Okabe and Ito (2008), which color-blind readers can tell apart, and a gray."""
 
 CYCLE = [COLORS[name] for name in ("blue", "red", "green", "purple", "orange", "sky")]
 

@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from .._core.errors import DefinitionError
-from ..flow.trajectory import Trajectory
+from ..engine.trajectory import Trajectory
+from ..errors import DefinitionError
+from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
-from ..orbits.placed import PlacedSections
 from ..systems.structure import Structure
 from .look import COLORS, axes_or_new, label_of
 
@@ -31,7 +31,7 @@ def cycle(
     numbers: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """The limit cycle in the plane of two states or outputs, coloured by chart.
+    """The limit cycle in the plane of two states or outputs, colored by chart.
 
     Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
     along the section where it is a curve in this plane (its level depends on x and y only),
@@ -74,7 +74,7 @@ def cycle(
         ax.margins(0.08)
         ax.locator_params(axis="x", nbins=6)
         if sections is not None:
-            step = max(1, round(sections.count / 8)) if numbers is None else numbers
+            step = max(1, round(sections.n_sections / 8)) if numbers is None else numbers
             _sections(ax, s, sections, (x, y), center, step)
         if perturbed is not None:
             ax.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
@@ -155,7 +155,7 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center, ste
     lanes = placed.lanes
     charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     bars = []
-    for i in range(placed.count):
+    for i in range(placed.n_sections):
         a, t, q = int(charts[i]), times[i], states[:, i]
         here = _point(s, a, names, t, q)
         along = _along(s, placed, i, a, t, q, names, unit)
@@ -165,7 +165,7 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center, ste
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
     flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]
-    ax.plot(*flat, color="0.35", lw=0.8, zorder=4, label=f"sections ({placed.count})")
+    ax.plot(*flat, color="0.35", lw=0.8, zorder=4, label=f"sections ({placed.n_sections})")
 
 
 def _along(s: Structure, placed: PlacedSections, i, a, t, q, names, unit) -> np.ndarray:

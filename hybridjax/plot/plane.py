@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from .._core.errors import DefinitionError
-from ..identify.compare import compare_multipliers
-from ..identify.estimate import MultiplierEstimate
-from ..identify.rational import RationalFit
+from ..errors import DefinitionError
+from ..identify.multipliers.compare import compare_multipliers
+from ..identify.multipliers.estimate import MultiplierEstimate
+from ..identify.rational.fit import RationalFit
+from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from ..periodic.ldtp import LDTP
 from .look import (
     COLORS,
     COLUMN,
@@ -94,7 +94,7 @@ def poles_zeros(
     """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
 
     The upper row shows them all, the lower one the surroundings of the poles. A family of
-    sections has one colour, so that one sees whether another family moves poles or zeros.
+    sections has one color, so that one sees whether another family moves poles or zeros.
 
     **Arguments:** `fits`: by name of the section family, all with the same outputs.
 
@@ -207,9 +207,9 @@ def _largest_part(z: np.ndarray) -> np.ndarray:
 
 
 def _unit_circle(ax: Axes) -> None:
-    ax.add_patch(Circle((0, 0), 1, fill=False, ec=COLORS["grey"], lw=0.6, zorder=0))
-    ax.axhline(0, color=COLORS["grey"], lw=0.3, zorder=0)
-    ax.axvline(0, color=COLORS["grey"], lw=0.3, zorder=0)
+    ax.add_patch(Circle((0, 0), 1, fill=False, ec=COLORS["gray"], lw=0.6, zorder=0))
+    ax.axhline(0, color=COLORS["gray"], lw=0.3, zorder=0)
+    ax.axvline(0, color=COLORS["gray"], lw=0.3, zorder=0)
 
 
 def _complex_axes(ax: Axes, symbol: str) -> None:

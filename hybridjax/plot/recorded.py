@@ -7,10 +7,10 @@ from jaxtyping import Complex
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..identify.series import SeriesFit
+from ..identify.series.fit import SeriesFit
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
-from ..recordings.sections import SectionData
+from ..recordings.sampling import SectionData
 from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
 
@@ -26,9 +26,9 @@ def phase(found: Phase) -> Figure:
             left.plot(at, periods, ".", ms=2, color=CYCLE[k % len(CYCLE)])
             first += len(periods)
         left.axhline(found.period, color="black", lw=0.6)
-        left.set(xlabel="cycle (trials in different colours)", ylabel="period (s)")
+        left.set(xlabel="cycle (trials in different colors)", ylabel="period (s)")
         right.hist(
-            np.concatenate(found.periods), bins=30, orientation="horizontal", color=COLORS["grey"]
+            np.concatenate(found.periods), bins=30, orientation="horizontal", color=COLORS["gray"]
         )
         right.set_ylim(left.get_ylim())
         right.tick_params(labelleft=False)
@@ -40,7 +40,7 @@ def phase(found: Phase) -> Figure:
 def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) -> Figure:
     """For each signal the average cycle, the deviations from it, and the input's spectrum.
 
-    Left: the average cycle. Middle: deviations against phase, grey, with twice their standard
+    Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
     deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
     cycle, at the section where it is largest.
     """
@@ -62,7 +62,7 @@ def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) 
             )
             at = np.concatenate([(r.start + np.arange(len(r.u))) % N for r in data.records])
             thin = slice(None, None, max(1, len(at) // 20000))
-            spread.plot(at[thin] / N, values[thin], ",", color=COLORS["grey"], rasterized=True)
+            spread.plot(at[thin] / N, values[thin], ",", color=COLORS["gray"], rasterized=True)
             std = np.array([np.nanstd(values[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(at_phase, sign * std, color=CYCLE[0])
@@ -144,7 +144,7 @@ def multiplier_regions(
             boxes[1].locator_params(nbins=3)
             ax.indicate_inset_zoom(boxes[1], edgecolor="0.4")
         for box in boxes:
-            box.plot(circle.real, circle.imag, color=COLORS["grey"], lw=0.6, zorder=0)
+            box.plot(circle.real, circle.imag, color=COLORS["gray"], lw=0.6, zorder=0)
             if plain is not None:
                 box.plot(
                     plain.real, plain.imag, "x", color=COLORS["red"], ms=5, label="plain regression"

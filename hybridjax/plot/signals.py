@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from .._core.errors import DefinitionError
 from .._core.results import Result
+from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from .look import COLORS, COLUMN, CYCLE, label_of, new_figure, style
 
@@ -25,7 +25,7 @@ def experiment(
     if not -S <= index < S:
         raise DefinitionError(f"there is no experiment {index}; there are {S}.")
     index = index % S
-    time = np.arange(n) / data.sections
+    time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
     rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
     with style():
@@ -40,7 +40,7 @@ def experiment(
             text = label_of(name, labels)
             ax.set_ylabel(text if is_input else rf"$\delta$ {text}")
             if data.window.start:
-                ax.axvspan(0, data.window.start / data.sections, color="0.92", zorder=0)
+                ax.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
             if not data.ok[index] and data.failed_at[index] >= 0:
                 ax.axvline(time[data.failed_at[index]], color=COLORS["red"], lw=0.8)
             ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)

@@ -7,16 +7,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .._core.errors import DefinitionError
 from .._core.results import Result
-from ..identify.compare import compare_multipliers
-from ..identify.estimate import roots_of
-from ..identify.prediction import predict
-from ..identify.records import Record, lay_out, pieces_of
-from ..identify.regression import Delayed, delayed_outputs, initial, linearise, set_up
-from ..identify.series import SeriesFit, fit_series, quick_fit, refuse_order
-from ..identify.validate import Validation, validate
-from .sections import SectionData
+from ..errors import DefinitionError
+from ..identify.multipliers.compare import compare_multipliers
+from ..identify.multipliers.estimate import roots_of
+from ..identify.series.fit import SeriesFit, fit_series, quick_fit, refuse_order
+from ..identify.series.layout import Record, lay_out, pieces_of
+from ..identify.series.prediction import predict
+from ..identify.series.regression import Delayed, delayed_outputs, initial, linearize, set_up
+from ..identify.series.validation import Validation, validate
+from .sampling import SectionData
 from .spectra import input_band, input_spectrum
 
 
@@ -61,7 +61,7 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     for d in range(1, most + 1):
         problem = set_up(layout, d, layout.y.shape[2], False)
         c = initial(delayed_outputs(problem, d))
-        found = linearise(problem, c)
+        found = linearize(problem, c)
         if (found.freedom <= 2 * d).any():
             break
         fit = quick_fit(problem, c, found, layout)
@@ -69,7 +69,7 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
         misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
     if not misfits:
         raise DefinitionError(
-            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.sections} "
+            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
             "sections: record more, or take fewer sections."
         )
     return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _TIE))
@@ -108,11 +108,11 @@ def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]
 
 
 def _part(record: Record, rows: slice) -> Record:
-    start = (record.start + rows.start) % record.sections
+    start = (record.start + rows.start) % record.n_sections
     return Record(
         record.u[rows],
         record.y[rows],
-        sections=record.sections,
+        n_sections=record.n_sections,
         start=start,
         inputs=record.inputs,
         outputs=record.outputs,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 from .phase import Phase
 from .recording import Recording, Trial
 from .smoothing import FEWEST, gaps, inside, means, spline

@@ -5,13 +5,13 @@ from typing import Any
 
 import equinox as eqx
 
-from ..identify.series import SeriesFit, fit_series
+from ..identify.series.fit import SeriesFit, fit_series
 from .advice import ENOUGH, Advice, HeldOut, advise, choose_order, hold_out
 from .drift import without_drift
 from .impulse import ImpulseResponses, impulse_responses
 from .phase import AnglePhase, CrossingPhase, Definition, Phase, estimate_phase
 from .recording import Recording
-from .sections import SectionData, section_data
+from .sampling import SectionData, section_data
 
 
 class Identification(eqx.Module):
@@ -40,7 +40,7 @@ def identify_recording(
     *,
     inputs: str | Sequence[str],
     outputs: str | Sequence[str],
-    sections: int = 32,
+    n_sections: int = 32,
     order: int | None = None,
     drift: int | float | None = None,
     **options: Any,
@@ -69,7 +69,7 @@ def identify_recording(
         recording = without_drift(recording, phase, sorted(moved), drift)
         if not isinstance(definition, Phase):
             phase = estimate_phase(recording, definition)
-    about = {"inputs": inputs, "outputs": outputs, "sections": sections, "drift": drift}
+    about = {"inputs": inputs, "outputs": outputs, "n_sections": n_sections, "drift": drift}
     data = section_data(recording, phase, **about, **options)
     order = choose_order(data) if order is None else order
     held = hold_out(data, order)

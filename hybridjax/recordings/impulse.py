@@ -4,9 +4,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.errors import DefinitionError
-from ..identify.series import SeriesFit
-from .sections import SectionData
+from ..errors import DefinitionError
+from ..identify.series.fit import SeriesFit
+from .sampling import SectionData
 from .spectra import input_band
 
 

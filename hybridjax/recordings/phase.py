@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 from .recording import Recording, Trial
 from .smoothing import FEWEST, spline
 from .tracker import track
@@ -26,7 +26,7 @@ Pair = tuple[Number, Number]
 
 
 class AnglePhase(eqx.Module):
-    """Phase as the angle of two signals, a position and its velocity, say, around a centre.
+    """Phase as the angle of two signals, a position and its velocity, say, around a center.
 
     The angle of `(position - o_p) / s_p + i (velocity - o_v) / s_v`, counted in the sense in which
     it turns. Section 0 lies at `start`. At its sections the two signals are two sides of one
@@ -37,7 +37,7 @@ class AnglePhase(eqx.Module):
     - `position`, `velocity`: names of signals.
     - `center` (o_p, o_v), `scale` (s_p, s_v): by default the middle of each signal's range and
       half of its width, over all trials.
-    - `start`: angle of section 0 in rad; at 0 the velocity is that of the centre, and the position
+    - `start`: angle of section 0 in rad; at 0 the velocity is that of the center, and the position
       is beyond it.
     - `bandwidth`: of the splines through the signals, in Hz; by default 32 harmonics of the cycle.
     """
@@ -277,7 +277,7 @@ def _turns_per_time(angles) -> float:
     duration = sum(float(t[-1] - t[0]) for t, _ in angles if len(t))
     if abs(turns) < 2:
         raise DefinitionError(
-            f"the phase does not wind: {abs(turns):.2g} turns in {duration:.4g}; the centre must "
+            f"the phase does not wind: {abs(turns):.2g} turns in {duration:.4g}; the center must "
             "lie within the loop of the two signals, and two cycles or more are needed."
         )
     return turns / duration

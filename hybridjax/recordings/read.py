@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._core.errors import DefinitionError, FileFormatError
+from ..errors import DefinitionError, FileFormatError
 from .recording import Recording
 
 

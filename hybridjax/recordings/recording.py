@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 from .smoothing import spline
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solveh_banded
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 
 
 FEWEST = 5  # samples that a spline is drawn through
@@ -33,7 +33,7 @@ def spline(
     r"""A natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
-    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): the minimiser of
+    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): the minimizer of
     $\sum (y_i - f(t_i))^2 + \gamma \int f''^2$ passes a sine of frequency $f$ with the gain
     $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
     this is one half at b.

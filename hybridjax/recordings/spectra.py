@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import signal
 
-from ..identify.records import pieces_of
-from .sections import SectionData
+from ..identify.series.layout import pieces_of
+from .sampling import SectionData
 
 
 _EDGE = 0.01  # of the largest power: below that an input tells nothing

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 
 
 Number = int | float

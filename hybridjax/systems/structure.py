@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.errors import DefinitionError
-from .._core.lanewise import PerLane, by_lane, shared
+from .._core.per_lane import PerLane, by_lane, shared
 from .._core.tracing import is_traced
+from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output
 from .system import Driven, HybridSystem
@@ -44,7 +44,7 @@ class Structure:
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
-        """Vectorise `function(structure, *trees, *arguments)` over the lanes on the last axis of
+        """Vectorize `function(structure, *trees, *arguments)` over the lanes on the last axis of
         `arguments`. Lanes may have parameters of their own (see `PerLane`).
 
         A function with a `name` is made once, for the same trees, and with that traced once.

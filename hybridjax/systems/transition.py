@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.errors import DefinitionError
+from ..errors import DefinitionError
 
 
 Direction = Literal["falling", "rising"]

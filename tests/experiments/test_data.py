@@ -9,7 +9,7 @@ from ..periodic.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
-DESIGN = hj.multisine(sections=4, periods=5, f_max=2.0, inputs=("a", "b"))
+DESIGN = hj.multisine(n_sections=4, periods=5, f_max=2.0, inputs=("a", "b"))
 
 
 @pytest.fixture(scope="module")
@@ -18,19 +18,19 @@ def model():
 
 
 def test_simulation_from_rest_is_the_definition(model):
-    data = hj.simulate_experiments(model, DESIGN, discard=3)
+    data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
         np.testing.assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
     assert (data.inputs, data.outputs) == (("a", "b"), ("y0", "y1"))
     assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"
-    assert hj.simulate_experiments(model, DESIGN).u.shape[1] == 25 * 4
+    assert hj.experiments.simulate_experiments(model, DESIGN).u.shape[1] == 25 * 4
 
 
 def test_periodic_start_has_no_transient(model):
-    data = hj.simulate_experiments(model, DESIGN, start="periodic", discard=5)
+    data = hj.experiments.simulate_experiments(model, DESIGN, start="periodic", discard=5)
     np.testing.assert_allclose(data.y[:, :20], data.y[:, 20:], atol=1e-15)
-    assert hj.simulate_experiments(model, DESIGN, start="periodic").u.shape[1] == 5 * 4
+    assert hj.experiments.simulate_experiments(model, DESIGN, start="periodic").u.shape[1] == 5 * 4
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,9 @@ def test_periodic_start_has_no_transient(model):
 )
 def test_bad_simulations(model, message, arguments):
     # The hook that checks types in these tests would be the first to refuse a wrong `start`.
-    simulate = getattr(hj.simulate_experiments, "__wrapped__", hj.simulate_experiments)
+    simulate = getattr(
+        hj.experiments.simulate_experiments, "__wrapped__", hj.experiments.simulate_experiments
+    )
     with pytest.raises(hj.DefinitionError, match=message):
         simulate(model, **(dict(design=DESIGN) | arguments))
 
@@ -55,7 +57,7 @@ def test_failed_experiments_are_named():
     result, failed_at = np.zeros(80, int), np.full(80, -1)
     result[17], failed_at[17] = hj.Result.SECTION_MISSED, 41 * 32 + 21
     data = hj.ExperimentData(
-        np.ones_like(y), y, sections=32, periods=64, result=result, failed_at=failed_at
+        np.ones_like(y), y, n_sections=32, periods=64, result=result, failed_at=failed_at
     )
     assert data.summary() == (
         "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"
@@ -63,11 +65,11 @@ def test_failed_experiments_are_named():
     assert data.ok.sum() == 79 and not data.ok[17]
     assert "79/80 ok" in repr(data)
     result[:8] = hj.Result.BLOW_UP
-    data = hj.ExperimentData(np.ones_like(y), y, sections=32, periods=64, result=result)
+    data = hj.ExperimentData(np.ones_like(y), y, n_sections=32, periods=64, result=result)
     assert data.summary().endswith("and 4 more")
 
 
-GOOD = dict(u=np.ones((3, 12, 1)), y=np.ones((3, 12, 2)), sections=4, periods=3)
+GOOD = dict(u=np.ones((3, 12, 1)), y=np.ones((3, 12, 2)), n_sections=4, periods=3)
 HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
 
 
@@ -84,7 +86,7 @@ HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
         "result, failed_at and error": dict(result=[0, 0]),
         "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
         "`outputs` is": dict(outputs=("yM",)),
-        "must be at least 1": dict(sections=0),
+        "must be at least 1": dict(n_sections=0),
     }.items(),
 )
 def test_bad_records(message, change):

@@ -36,7 +36,7 @@ bands = st.tuples(st.integers(1, 9), st.integers(2, 12)).flatmap(
 )
 def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, halves, nu, more):
     N, P, top = band
-    arguments = dict(sections=N, periods=P, f_max=top / P, half_integers=halves, inputs=nu)
+    arguments = dict(n_sections=N, periods=P, f_max=top / P, half_integers=halves, inputs=nu)
     wanted = [j for j in range(top + 1) if halves == "two-phase" or (2 * j) % P]
     if not wanted:
         with pytest.raises(hj.DefinitionError, match="take more periods or a wider band"):
@@ -106,17 +106,19 @@ def test_signals_are_sums_of_cosines():
 
 
 def test_single_cosines():
-    design = hj.single_cosine(0.25, sections=8, periods=4, amplitude=0.5, phase=0.3)
+    design = hj.experiments.single_cosine(0.25, n_sections=8, periods=4, amplitude=0.5, phase=0.3)
     n = np.arange(32)
     np.testing.assert_allclose(
         design.inputs()[0, :, 0], 0.5 * np.cos(2 * np.pi * 0.25 / 8 * n + 0.3), atol=1e-14
     )
-    several = hj.single_cosine([0.25, 1.5, 4.0], 8, 4, half_integers="two-phase", inputs=2)
+    several = hj.experiments.single_cosine(
+        [0.25, 1.5, 4.0], 8, 4, half_integers="two-phase", inputs=2
+    )
     assert several.experiments == 8
     assert [lines_of(several, e) for e in range(4)] == [[1], [6], [6], [16]]
     np.testing.assert_array_equal(several.channel, [0] * 4 + [1] * 4)
     with pytest.raises(hj.DefinitionError, match="experiment 1: f = 1.5 lies on a multiple of 1/2"):
-        hj.single_cosine([0.25, 1.5], 8, 4)
+        hj.experiments.single_cosine([0.25, 1.5], 8, 4)
 
 
 BAD = {
@@ -135,16 +137,16 @@ BAD = {
 @pytest.mark.parametrize("message", BAD)
 def test_designs_that_break_a_rule_name_what_breaks_it(message):
     with pytest.raises(hj.DefinitionError, match=message):
-        hj.Design.from_lines(BAD[message], sections=8, periods=8)
+        hj.Design.from_lines(BAD[message], n_sections=8, periods=8)
 
 
 def test_half_integers_by_hand():
     phases = [[0.0], [1.0]]
-    design = hj.Design.from_lines([[1.5], [1.5]], 0.1, phases, sections=8, periods=8)
+    design = hj.Design.from_lines([[1.5], [1.5]], 0.1, phases, n_sections=8, periods=8)
     assert design.experiments == 2
-    hj.Design.from_lines([[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], sections=8, periods=8)
+    hj.Design.from_lines([[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8)
     with pytest.raises(hj.DefinitionError, match="f = 0 is zero at every section"):
-        hj.Design.from_lines([[0.0]], 0.1, np.pi / 2, sections=8, periods=8)
+        hj.Design.from_lines([[0.0]], 0.1, np.pi / 2, n_sections=8, periods=8)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +163,7 @@ def test_half_integers_by_hand():
 )
 def test_bad_arguments_of_a_design(message, arguments):
     with pytest.raises(hj.DefinitionError, match=message):
-        hj.Design.from_lines([[0.25, 0.375]], **(dict(sections=8, periods=8) | arguments))
+        hj.Design.from_lines([[0.25, 0.375]], **(dict(n_sections=8, periods=8) | arguments))
 
 
 @pytest.mark.parametrize(

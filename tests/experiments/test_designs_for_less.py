@@ -1,4 +1,4 @@
-"""Odd and 2-adic lines, few experiments, several inputs at once, crest factors, realisations."""
+"""Odd and 2-adic lines, few experiments, several inputs at once, crest factors, realizations."""
 
 import numpy as np
 import pytest
@@ -63,20 +63,20 @@ def test_few_experiments_on_the_hopper(hopper):
     assert counts[8] == counts[9] == counts[10] == 20
     design = hj.multisine(highest_harmonic=2)
     assert "assumes      H_m = 0 for |m| > 2" in repr(design)
-    leakage = hj.predict_leakage(design, hopper, (0,))
+    leakage = hj.identify.predict_leakage(design, hopper, (0,))
     assert np.all((leakage > 1e-5) & (leakage < 5e-3))
     htf = hopper.htf(design.frequencies, range(-15, 16))
-    np.testing.assert_allclose(hj.predict_leakage(design, htf, (0,)), leakage, rtol=1e-2)
-    assert hj.predict_leakage(hj.multisine(), hopper).max() < 1e-12
+    np.testing.assert_allclose(hj.identify.predict_leakage(design, htf, (0,)), leakage, rtol=1e-2)
+    assert hj.identify.predict_leakage(hj.multisine(), hopper).max() < 1e-12
     with pytest.raises(hj.DefinitionError, match="the HTF has N = 32"):
-        hj.predict_leakage(hj.multisine(4, 4, 1.0), htf)
-    data = hj.simulate_experiments(hopper, design, start="periodic")
+        hj.identify.predict_leakage(hj.multisine(4, 4, 1.0), htf)
+    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
     with pytest.raises(hj.DefinitionError, match="experiment 0: .* so their responses fall on"):
         hj.estimate_htf(data)
     with pytest.raises(hj.DefinitionError, match="beyond highest = 2 are taken as zero"):
         hj.estimate_htf(data, 3, highest=2)
     assert hj.estimate_htf(data, highest=2).harmonics == (-2, -1, 0, 1, 2)
-    assert len(hj.missing_frequencies(data, highest=2)) == 0
+    assert len(hj.identify.missing_frequencies(data, highest=2)) == 0
 
 
 def test_a_system_without_high_harmonics_needs_few_experiments():
@@ -85,7 +85,7 @@ def test_a_system_without_high_harmonics_needs_few_experiments():
     model = hj.LDTP(*(np.tile(x, (6, 1, 1)) for x in (A, B, C)))
     design = hj.multisine(6, 10, 3.0, highest_harmonic=0)
     assert design.experiments == 1
-    data = hj.simulate_experiments(model, design, start="periodic")
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
     estimate = hj.estimate_htf(data, highest=0)
     assert estimate.error(model.htf(estimate.f, 0)).max() < 1e-12
 
@@ -98,7 +98,7 @@ def test_several_inputs(excite, lines):
     together = np.abs(design.inputs()).max(axis=1) > 0
     assert together.mean() == {"alone": 1 / 3, "orthogonal": 1.0}.get(excite, together.mean())
     assert together.mean() > 0.6 or excite == "alone"
-    data = hj.simulate_experiments(model, design.realisations(2), start="periodic")
+    data = hj.experiments.simulate_experiments(model, design.realizations(2), start="periodic")
     estimate = hj.estimate_htf(data)
     assert len(estimate.f) == lines
     assert np.abs(estimate.H - model.htf(estimate.f).H).max() < 1e-11
@@ -111,16 +111,16 @@ def test_several_inputs(excite, lines):
 def test_inputs_that_cannot_be_told_apart():
     f, channels = [[0.25, 0.25]] * 2, [[0, 1]] * 2
     with pytest.raises(hj.DefinitionError, match="excites several inputs together"):
-        hj.Design.from_lines(f, sections=8, periods=8, channels=channels, inputs=2)
+        hj.Design.from_lines(f, n_sections=8, periods=8, channels=channels, inputs=2)
     phases = [[0, 0], [0, np.pi]]
-    hj.Design.from_lines(f, 0.1, phases, sections=8, periods=8, channels=channels, inputs=2)
+    hj.Design.from_lines(f, 0.1, phases, n_sections=8, periods=8, channels=channels, inputs=2)
     with pytest.raises(hj.DefinitionError, match="f = 0.25 is excited twice"):
-        hj.Design.from_lines([[0.25, 0.25]], sections=8, periods=8)
+        hj.Design.from_lines([[0.25, 0.25]], n_sections=8, periods=8)
 
 
 def test_crest_factors(hopper):
     band = dict(periods=32, f_max=3.0, seed=1)
-    random, low = hj.multisine(**band), hj.multisine(**band, phases="optimised")
+    random, low = hj.multisine(**band), hj.multisine(**band, phases="optimized")
     np.testing.assert_array_equal(low.line, random.line)
     np.testing.assert_array_equal(low.amplitude, random.amplitude)
     assert random.crest_factors().mean() > 2.9 and low.crest_factors().max() < 2.3
@@ -128,24 +128,24 @@ def test_crest_factors(hopper):
         [own(low, s) / 32 for s in range(6)] * 2,
         0.01,
         [*(low.phase[low.experiment == s] for s in range(6)),
-         *(hj.optimise_phases(random, 5).phase[low.experiment == s] for s in range(6))],
+         *(hj.experiments.optimize_phases(random, 5).phase[low.experiment == s] for s in range(6))],
         periods=32,
     )  # fmt: skip
-    data = hj.simulate_experiments(hopper, again, start="periodic", discard=32)
-    data = hj.add_noise(data, snr=20)
+    data = hj.experiments.simulate_experiments(hopper, again, start="periodic", discard=32)
+    data = hj.experiments.add_noise(data, snr=20)
     with pytest.raises(hj.DefinitionError, match="the phases are not random: 12 of 12 signals"):
         hj.estimate_htf(data, 0, repeats=2, variance="total")
     auto = hj.estimate_htf(data, 0, repeats=2)
     assert auto.noise_variance is None
     np.testing.assert_array_equal(auto.freedom, 2)
     with pytest.raises(hj.DefinitionError, match="belong together in several experiments"):
-        hj.optimise_phases(hj.multisine(4, 8, 2.0, inputs=2, excite="orthogonal"))
+        hj.experiments.optimize_phases(hj.multisine(4, 8, 2.0, inputs=2, excite="orthogonal"))
 
 
 def test_realisations_pairs_and_scales():
     design = hj.multisine(8, 6, 4.0, lambda f: 1 / (1 + f), half_integers="two-phase")
     np.testing.assert_allclose(design.amplitude, 1 / (1 + design.f))
-    many = design.realisations(5, seed=2)
+    many = design.realizations(5, seed=2)
     assert many.experiments == 5 * design.experiments and many.cycles(0) == 5 * design.cycles(0)
     np.testing.assert_array_equal(many.f, np.tile(design.f, 5))
     assert len(np.unique(many.phase)) > 4 * len(design.f) - 20
@@ -154,38 +154,46 @@ def test_realisations_pairs_and_scales():
     np.testing.assert_allclose(pairs[1::2], -design.inputs(), atol=1e-14)
     rms = np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1))
     np.testing.assert_allclose(rms, 0.3)
-    for bad in (lambda: design.scaled(0.0), lambda: design.realisations(0)):
+    for bad in (lambda: design.scaled(0.0), lambda: design.realizations(0)):
         with pytest.raises(hj.DefinitionError):
             bad()
 
 
 def test_expected_variance_is_that_of_the_estimate():
-    """Noise of unit variance as output, many realisations."""
+    """Noise of unit variance as output, many realizations."""
     design = hj.multisine(4, 8, 2.0, 0.5, half_integers="skip")
-    many = design.realisations(400)
+    many = design.realizations(400)
     u = many.inputs()
     y = np.random.default_rng(0).normal(size=(*u.shape[:2], 1))
-    estimate = hj.estimate_htf(hj.ExperimentData(u, y, sections=4, periods=8), 0)
+    estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
     expected = design.expected_variance()[:, 0] / 400
     np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
 
 
 def test_distortion_stands_where_a_linear_system_is_silent(hopper):
     design = hj.multisine(periods=8, f_max=2.0, lines="odd", experiments=6)
-    data = hj.simulate_experiments(hopper, design, start="periodic", discard=8)
-    linear = hj.output_levels(data, repeats=2)
+    data = hj.experiments.simulate_experiments(hopper, design, start="periodic", discard=8)
+    linear = hj.identify.output_levels(data, repeats=2)
     assert np.all(linear.even < 1e-15) and np.all(linear.odd < 1e-15)
-    even = hj.ExperimentData(data.u, data.y + data.u**2, sections=32, periods=8)
-    odd = hj.ExperimentData(data.u, data.y + data.u**3, sections=32, periods=8)
-    assert np.all(hj.output_levels(even).even > 1e-7) and np.all(hj.output_levels(even).odd < 1e-15)
-    assert np.all(hj.output_levels(odd).odd > 1e-10) and np.all(hj.output_levels(odd).even < 1e-15)
-    noisy = hj.output_levels(hj.add_noise(data, std=0.1), repeats=2)
+    even = hj.ExperimentData(data.u, data.y + data.u**2, n_sections=32, periods=8)
+    odd = hj.ExperimentData(data.u, data.y + data.u**3, n_sections=32, periods=8)
+    assert np.all(hj.identify.output_levels(even).even > 1e-7) and np.all(
+        hj.identify.output_levels(even).odd < 1e-15
+    )
+    assert np.all(hj.identify.output_levels(odd).odd > 1e-10) and np.all(
+        hj.identify.output_levels(odd).even < 1e-15
+    )
+    noisy = hj.identify.output_levels(hj.experiments.add_noise(data, std=0.1), repeats=2)
     np.testing.assert_allclose(noisy.noise, noisy.even, rtol=0.1)
     assert "excited" in repr(noisy)
     with pytest.raises(hj.DefinitionError, match="is an even line"):
-        hj.output_levels(hj.simulate_experiments(hopper, hj.multisine(periods=8, f_max=2.0)))
+        hj.identify.output_levels(
+            hj.experiments.simulate_experiments(hopper, hj.multisine(periods=8, f_max=2.0))
+        )
     with pytest.raises(hj.DefinitionError, match="an even number of periods"):
-        hj.output_levels(hj.simulate_experiments(hopper, hj.multisine(periods=5, f_max=2.0)))
+        hj.identify.output_levels(
+            hj.experiments.simulate_experiments(hopper, hj.multisine(periods=5, f_max=2.0))
+        )
 
 
 @pytest.mark.parametrize(

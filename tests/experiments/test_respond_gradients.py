@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.engine.move import Settings
+from hybridjax.experiments.plan import make_plan
 from hybridjax.experiments.respond import respond
-from hybridjax.flow.move import Settings
-from hybridjax.orbits.plan import make_plan
 
 from ..conftest import APEX, OUTPUTS
 

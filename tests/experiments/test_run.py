@@ -95,7 +95,7 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     after = broken.failed_at[17] + 1
     assert np.all(np.isfinite(broken.y[17, :after])) and np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
-    lost = hj.missing_frequencies(broken)
+    lost = hj.identify.missing_frequencies(broken)
     assert len(estimate.f) + len(lost) == len(design.frequencies)
 
 
@@ -141,7 +141,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     [
         (dict(outputs=("yM", "height")), "no output 'height'"),
         (
-            dict(design=hj.multisine(sections=16, f_max=7.0)),
+            dict(design=hj.multisine(n_sections=16, f_max=7.0)),
             "for 16 sections, but",
         ),
         (dict(design=np.zeros((2, 33, 1))), "multiple of the 32 sections"),

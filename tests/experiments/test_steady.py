@@ -22,7 +22,7 @@ def response(vanderpol_cycle):
 def settled(response):
     @eqx.filter_jit
     def run(u, system):
-        start = hj.steady_start(response, u, system)
+        start = hj.experiments.steady_start(response, u, system)
         return response(jnp.concatenate([u, u], axis=1), start, system).y
 
     return run
@@ -66,7 +66,7 @@ def test_the_root_has_exact_derivatives(vanderpol_cycle, settled):
 
 def test_bad_inputs(response):
     with pytest.raises(hj.DefinitionError, match="a multiple of the 4 sections"):
-        hj.steady_start(response, np.zeros((1, 5, 1)))
+        hj.experiments.steady_start(response, np.zeros((1, 5, 1)))
 
 
 def test_process_noise_acts_but_is_not_recorded(vanderpol_cycle):

@@ -39,7 +39,7 @@ def records(parts):
 
 @pytest.fixture
 def stored(arguments, tmp_path):
-    return hj.store_experiments(tmp_path / "runs", *arguments, chunk=40, **BATCH)
+    return hj.experiments.store_experiments(tmp_path / "runs", *arguments, chunk=40, **BATCH)
 
 
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
@@ -52,7 +52,7 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
-    parts = list(hj.stream_experiments(*arguments, chunk=40, **BATCH))
+    parts = list(hj.experiments.stream_experiments(*arguments, chunk=40, **BATCH))
     assert [len(part.u) for part in parts] == [40, 40, 20]
     np.testing.assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
@@ -65,7 +65,9 @@ def test_inputs_may_lie_on_disk(arguments, whole, tmp_path):
     np.save(tmp_path / "u.npy", whole.u)
     u = np.load(tmp_path / "u.npy", mmap_mode="r")
     cycle, placed, _, outputs = arguments
-    parts = hj.stream_experiments(cycle, placed, u, outputs, chunk=80, discard=20, **BATCH)
+    parts = hj.experiments.stream_experiments(
+        cycle, placed, u, outputs, chunk=80, discard=20, **BATCH
+    )
     np.testing.assert_array_equal(records(parts), whole.y)
 
 
@@ -94,9 +96,9 @@ def test_stored_experiments_are_those_of_the_whole(stored, whole):
     assert len(stored) == 3 and stored.experiments == COUNT and stored.missing() == []
     np.testing.assert_array_equal(records(stored), whole.y)
     np.testing.assert_allclose(hj.estimate_htf(stored).H, hj.estimate_htf(whole).H, rtol=1e-12)
-    assert len(hj.missing_frequencies(stored)) == 0
+    assert len(hj.identify.missing_frequencies(stored)) == 0
     assert stored.summary() == whole.summary() == "100/100 ok"
-    assert "100 experiments, 3 of 3 chunks" in repr(hj.StoredExperiments(stored.folder))
+    assert "100 experiments, 3 of 3 chunks" in repr(hj.experiments.StoredExperiments(stored.folder))
 
 
 def test_only_chunks_that_are_missing_are_run(stored, arguments, whole):
@@ -106,7 +108,7 @@ def test_only_chunks_that_are_missing_are_run(stored, arguments, whole):
     with pytest.raises(hj.DefinitionError, match="1 of 3 chunks .* missing, the first is 1"):
         hj.estimate_htf(stored)
     with no_compilation():
-        hj.store_experiments(stored.folder, *arguments, chunk=40, **BATCH)
+        hj.experiments.store_experiments(stored.folder, *arguments, chunk=40, **BATCH)
     np.testing.assert_array_equal(records(stored), whole.y)
     after = [stored.path(k).stat().st_mtime_ns for k in range(3)]
     assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, True]
@@ -114,25 +116,27 @@ def test_only_chunks_that_are_missing_are_run(stored, arguments, whole):
 
 def test_processes_share_the_chunks(arguments, whole, tmp_path):
     for rank in (1, 0):
-        stored = hj.store_experiments(tmp_path, *arguments, chunk=40, share=(rank, 2), **BATCH)
+        stored = hj.experiments.store_experiments(
+            tmp_path, *arguments, chunk=40, share=(rank, 2), **BATCH
+        )
         assert stored.missing() == ([0, 2] if rank else [])
     np.testing.assert_array_equal(records(stored), whole.y)
 
 
 def test_an_interruption_leaves_whole_chunks_only(arguments, tmp_path, monkeypatch):
-    import hybridjax.store
+    import hybridjax.experiments.store
 
-    save = hybridjax.store.save
+    save = hybridjax.experiments.store.save
 
     def interrupted(path, thing):
         if "000001" in path.name:
             raise KeyboardInterrupt
         save(path, thing)
 
-    monkeypatch.setattr(hybridjax.store, "save", interrupted)
+    monkeypatch.setattr(hybridjax.experiments.store, "save", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        hj.store_experiments(tmp_path, *arguments, chunk=40, **BATCH)
-    assert hj.StoredExperiments(tmp_path).missing() == [1, 2]
+        hj.experiments.store_experiments(tmp_path, *arguments, chunk=40, **BATCH)
+    assert hj.experiments.StoredExperiments(tmp_path).missing() == [1, 2]
     assert len(list(tmp_path.iterdir())) == 2  # the manifest and one chunk
 
 
@@ -151,37 +155,39 @@ def test_another_design_in_the_folder_is_refused(stored, arguments, change, what
     names = ("cycle", "sections", "design", "outputs")
     call = dict(zip(names, arguments, strict=True)) | dict(chunk=40) | BATCH | change
     with pytest.raises(hj.DefinitionError, match=f"other experiments .its `{what}`"):
-        hj.store_experiments(stored.folder, **call)
+        hj.experiments.store_experiments(stored.folder, **call)
 
 
 def test_another_system_in_the_folder_is_refused(stored, arguments):
     _, placed, design, outputs = arguments
     other = eqx.tree_at(lambda p: p.cycle.system.k, placed, jnp.asarray(10.001, float))
     with pytest.raises(hj.DefinitionError, match="its `parameters` is not the same"):
-        hj.store_experiments(stored.folder, other.cycle, other, design, outputs, chunk=40, **BATCH)
+        hj.experiments.store_experiments(
+            stored.folder, other.cycle, other, design, outputs, chunk=40, **BATCH
+        )
 
 
 def test_chunks_that_are_not_whole_or_belong_elsewhere_are_named(stored, arguments):
     chunk = stored.path(2)
     content = chunk.read_bytes()
     chunk.write_bytes(content[:-100])
-    with pytest.raises(hj.FileFormatError, match="000002-.* is damaged: delete it"):
-        hj.store_experiments(stored.folder, *arguments, chunk=40, **BATCH)
+    with pytest.raises(hj.errors.FileFormatError, match="000002-.* is damaged: delete it"):
+        hj.experiments.store_experiments(stored.folder, *arguments, chunk=40, **BATCH)
     chunk.write_bytes(content)
     chunk.rename(stored.folder / "000002-01234567.npz")
     with pytest.raises(hj.DefinitionError, match="000002-01234567.npz' does not belong"):
-        hj.StoredExperiments(stored.folder)
+        hj.experiments.StoredExperiments(stored.folder)
 
 
 def test_folders_without_experiments(tmp_path, arguments):
     with pytest.raises(hj.DefinitionError, match="there is no experiments.json"):
-        hj.StoredExperiments(tmp_path)
+        hj.experiments.StoredExperiments(tmp_path)
     (tmp_path / "experiments.json").write_text(json.dumps({"format": "something"}))
-    with pytest.raises(hj.FileFormatError, match="damaged, or of another version"):
-        hj.StoredExperiments(tmp_path)
+    with pytest.raises(hj.errors.FileFormatError, match="damaged, or of another version"):
+        hj.experiments.StoredExperiments(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.DefinitionError, match="cannot write to"):
-        hj.store_experiments(tmp_path / "file", *arguments, **BATCH)
+        hj.experiments.store_experiments(tmp_path / "file", *arguments, **BATCH)
 
 
 @pytest.mark.parametrize(
@@ -195,11 +201,11 @@ def test_folders_without_experiments(tmp_path, arguments):
 )
 def test_bad_numbers(arguments, tmp_path, change, message):
     with pytest.raises(hj.DefinitionError, match=message):
-        hj.store_experiments(tmp_path, *arguments, **BATCH | change)
+        hj.experiments.store_experiments(tmp_path, *arguments, **BATCH | change)
 
 
 def test_estimates_of_parts_that_do_not_fit_together(whole):
-    other = hj.ExperimentData(whole.u, whole.y, sections=32, periods=32)
+    other = hj.ExperimentData(whole.u, whole.y, n_sections=32, periods=32)
     with pytest.raises(hj.DefinitionError, match="do not belong together"):
         hj.estimate_htf([whole, other])
     with pytest.raises(hj.DefinitionError, match="no experiments"):
@@ -208,10 +214,10 @@ def test_estimates_of_parts_that_do_not_fit_together(whole):
 
 def test_parts_name_the_experiment_in_which_lines_meet():
     u = np.cos(2 * np.pi * np.arange(64) / 64 * 3)[None, :, None]
-    good = hj.ExperimentData(u, u, sections=4, periods=16)
+    good = hj.ExperimentData(u, u, n_sections=4, periods=16)
     n = np.arange(64)[None, :, None]
     both = np.cos(2 * np.pi * n / 64 * 3) + np.cos(2 * np.pi * n / 64 * 19)
-    bad = hj.ExperimentData(both, both, sections=4, periods=16)
+    bad = hj.ExperimentData(both, both, n_sections=4, periods=16)
     with pytest.raises(hj.DefinitionError, match="experiment 2: f = "):
         hj.estimate_htf([good, good, bad])
 
@@ -222,9 +228,9 @@ import hybridjax as hj
 hj.enable_x64()
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 phase = hj.ClockPhase(4)
-design = hj.single_cosine([0.25, 0.75, 1.25], 4, 4)
+design = hj.experiments.single_cosine([0.25, 0.75, 1.25], 4, 4)
 share = int(sys.argv[2]), 2
-hj.store_experiments(sys.argv[1], cycle, phase, design, "yM", chunk=1, share=share)
+hj.experiments.store_experiments(sys.argv[1], cycle, phase, design, "yM", chunk=1, share=share)
 """
 
 
@@ -235,4 +241,4 @@ def test_two_processes_at_once(tmp_path):
         for rank in (0, 1)
     ]
     assert [process.wait() for process in run] == [0, 0]
-    assert hj.StoredExperiments(tmp_path).summary() == "3/3 ok"
+    assert hj.experiments.StoredExperiments(tmp_path).summary() == "3/3 ok"

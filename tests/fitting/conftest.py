@@ -49,7 +49,7 @@ def hopper_htf(hopper_cycle):
 @pytest.fixture(scope="session")
 def seen_in_htf(hopper_cycle, hopper_htf):
     data = hj.ObservedHTF(hopper_htf, SECTIONS)
-    return hj.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
+    return hj.fitting.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
 
 
 @pytest.fixture(scope="session")
@@ -64,4 +64,6 @@ def hopper_observed(hopper_cycle):
 
 @pytest.fixture(scope="session")
 def seen_in_cycle(hopper_cycle, hopper_observed):
-    return hj.identifiability(hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle)
+    return hj.fitting.identifiability(
+        hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle
+    )

@@ -15,7 +15,7 @@ F = np.array([0.1, 0.2, 0.3])
 def records(**options):
     y = np.random.default_rng(0).normal(size=(2, 16, 1))
     return hj.ExperimentData(
-        np.zeros((2, 16, 1)), options.pop("y", y), sections=8, periods=2, **options
+        np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options
     )
 
 
@@ -54,7 +54,7 @@ def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
         (hj.ObservedSeries(records(inputs="force", outputs="yM"), SECTIONS), "force"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.identifiability(system, data, "k", guess=hopper_cycle)
+            hj.fitting.identifiability(system, data, "k", guess=hopper_cycle)
 
 
 def test_only_experiments_that_ran_well_are_used():

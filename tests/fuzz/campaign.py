@@ -9,9 +9,9 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax._core.compile import quick_jit
-from hybridjax.flow.events import start_lanes
-from hybridjax.flow.move import Settings, record
-from hybridjax.flow.target import until
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import Settings, record
+from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
 from . import scipy_loop

@@ -3,7 +3,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..periodic.conftest import hopper as hopper
+from ..linear.conftest import hopper as hopper
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +24,7 @@ def multipliers():
 @pytest.fixture(scope="session")
 def paper_data(hopper):
     """The paper's protocol on the linear model: 84 cycles from rest, the last 64 kept."""
-    return hj.simulate_experiments(hopper, hj.paper_design())
+    return hj.experiments.simulate_experiments(hopper, hj.paper_design())
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ DESIGNS = {
 
 @pytest.mark.parametrize("name", DESIGNS)
 def test_the_hopper_is_identified_exactly(name, hopper, exact):
-    data = hj.simulate_experiments(hopper, DESIGNS[name], start="periodic")
+    data = hj.experiments.simulate_experiments(hopper, DESIGNS[name], start="periodic")
     estimate = hj.estimate_htf(data)
     np.testing.assert_array_equal(estimate.f, DESIGNS[name].frequencies)
     assert estimate.harmonics == tuple(range(-16, 16))
@@ -29,7 +29,7 @@ def test_the_hopper_is_identified_exactly(name, hopper, exact):
     assert measured.sum() == 620
     scale = np.abs(exact[0]).max(axis=0)
     assert (np.abs(estimate.H[:, measured] - exact.H) / scale).max() < 1e-12
-    assert len(hj.missing_frequencies(data)) == 0
+    assert len(hj.identify.missing_frequencies(data)) == 0
 
 
 def test_the_transient_of_the_paper(hopper, paper_estimate, exact):
@@ -49,7 +49,7 @@ def test_any_system_is_identified_exactly(shape, seed):
     N = len(dims)
     top = N * periods // 2 / periods
     design = hj.multisine(N, periods, top, 1.0, seed, half_integers="two-phase", inputs=nu)
-    estimate = hj.estimate_htf(hj.simulate_experiments(model, design, start="periodic"))
+    estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
     np.testing.assert_array_equal(estimate.f, design.frequencies)
     exact = model.htf(estimate.f)
     assert np.abs(estimate.H - exact.H).max() < 1e-11 * np.abs(exact.H).max()
@@ -59,9 +59,11 @@ def test_two_inputs_may_share_an_experiment_on_different_lines(hopper):
     model = hj.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3), 1, 2))
     lines = [[0.1, 0.3], [0.1, 0.3]]
     design = hj.Design.from_lines(
-        lines, 1.0, 0.4, sections=3, periods=10, channels=[[0, 1], [1, 0]], inputs=2
+        lines, 1.0, 0.4, n_sections=3, periods=10, channels=[[0, 1], [1, 0]], inputs=2
     )
-    estimate = hj.estimate_htf(hj.simulate_experiments(model, design, start="periodic"), (-1, 0))
+    estimate = hj.estimate_htf(
+        hj.experiments.simulate_experiments(model, design, start="periodic"), (-1, 0)
+    )
     assert estimate.harmonics == (-1, 0)
     np.testing.assert_allclose(estimate.H, model.htf([0.1, 0.3], (-1, 0)).H, atol=1e-13)
 
@@ -69,11 +71,11 @@ def test_two_inputs_may_share_an_experiment_on_different_lines(hopper):
 def test_repeated_frequencies_are_averaged_by_their_power():
     """With y = g u exactly for one experiment and 3 g u for the other."""
     design = hj.Design.from_lines(
-        [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]], sections=4, periods=4
+        [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]], n_sections=4, periods=4
     )
     u = design.inputs(9)
     y = u * np.array([1.0, 3.0])[:, None, None]
-    estimate = hj.estimate_htf(hj.ExperimentData(u, y, sections=4, periods=4))
+    estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=4))
     np.testing.assert_allclose(estimate[0][0, 0, 0], (1 * 1 + 4 * 3) / (1 + 4), atol=1e-13)
     np.testing.assert_allclose(estimate[1], 0, atol=1e-13)
 
@@ -91,7 +93,7 @@ def test_failed_experiments_are_left_out(paper_data, paper_estimate):
     data = failed(paper_data, [3, 70])
     lost = np.sort(design.f[np.isin(design.experiment, [3, 70])])
     estimate = hj.estimate_htf(data)
-    np.testing.assert_array_equal(hj.missing_frequencies(data), lost)
+    np.testing.assert_array_equal(hj.identify.missing_frequencies(data), lost)
     np.testing.assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
     kept = np.isin(paper_estimate.f, estimate.f)
     np.testing.assert_array_equal(estimate.H, paper_estimate.H[:, kept])
@@ -100,14 +102,14 @@ def test_failed_experiments_are_left_out(paper_data, paper_estimate):
 
 
 def test_a_lost_phase_loses_the_frequency(hopper):
-    design = hj.single_cosine([0.25, 1.5], 32, 4, half_integers="two-phase")
-    data = hj.simulate_experiments(hopper, design, start="periodic")
+    design = hj.experiments.single_cosine([0.25, 1.5], 32, 4, half_integers="two-phase")
+    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
     half = failed(data, [2])
-    np.testing.assert_array_equal(hj.missing_frequencies(half), [1.5])
+    np.testing.assert_array_equal(hj.identify.missing_frequencies(half), [1.5])
     np.testing.assert_array_equal(hj.estimate_htf(half).f, [0.25])
 
 
-def record(*cosines, sections=8, periods=8, cycles=8):
+def record(*cosines, n_sections=8, periods=8, cycles=8):
     """One experiment per argument, a list of (f, phase); the output repeats the input."""
     n = np.arange(sections * cycles)
     u = [sum(np.cos(2 * np.pi * f * n / sections + phase) for f, phase in c) for c in cosines]
@@ -120,7 +122,7 @@ def test_half_integers_need_two_phases():
     with pytest.raises(hj.DefinitionError, match="f = 1.5 lies on a multiple of 1/2 .* one phase"):
         hj.estimate_htf(one)
     np.testing.assert_array_equal(hj.estimate_htf(one, half_integers="skip").f, [0.25])
-    np.testing.assert_array_equal(hj.missing_frequencies(one), [1.5])
+    np.testing.assert_array_equal(hj.identify.missing_frequencies(one), [1.5])
     opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
     with pytest.raises(hj.DefinitionError, match="one phase only"):
         hj.estimate_htf(opposite)
@@ -144,7 +146,7 @@ def test_half_integers_need_two_phases():
 def test_bad_inputs_are_named(message, data):
     data = record(*data)
     if "zero" in message:
-        data = hj.ExperimentData(0 * data.u, data.y, sections=8, periods=8)
+        data = hj.ExperimentData(0 * data.u, data.y, n_sections=8, periods=8)
     with pytest.raises(hj.DefinitionError, match=message):
         hj.estimate_htf(data)
 
@@ -159,6 +161,6 @@ def test_bad_options(paper_data):
 def test_inputs_must_all_be_applied():
     u = np.zeros((1, 32, 2))
     u[0, :, 0] = np.cos(np.pi / 4 * np.arange(32) / 4)
-    data = hj.ExperimentData(u, u, sections=8, periods=4)
+    data = hj.ExperimentData(u, u, n_sections=8, periods=4)
     with pytest.raises(hj.DefinitionError, match="measured from each of the 2 inputs"):
         hj.estimate_htf(data)

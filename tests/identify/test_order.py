@@ -78,11 +78,11 @@ def test_bad_requests(small):
 
 def test_aaa_finds_the_roots_of_the_multipliers(exact, multipliers):
     """All 64 poles of H_0, from twice that many coefficients."""
-    fit = hj.fit_aaa(exact)
+    fit = hj.identify.fit_aaa(exact)
     assert [c.max_error < 1e-6 for c in fit.compare(multipliers)] == [True, True]
     assert np.all(fit.residual < 1e-11)
     assert fit.outputs == ("yM", "vM") and "poles, residual" in repr(fit)
     with pytest.raises(hj.DefinitionError, match="no input 'v'"):
-        hj.fit_aaa(exact, input="v")
+        hj.identify.fit_aaa(exact, input="v")
     with pytest.raises(hj.DefinitionError, match="H_1 holds NaN"):
-        hj.fit_aaa(hj.HTF(exact.f, exact.H * np.nan, exact.harmonics, 32), 1)
+        hj.identify.fit_aaa(hj.HTF(exact.f, exact.H * np.nan, exact.harmonics, 32), 1)

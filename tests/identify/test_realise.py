@@ -15,7 +15,7 @@ F = np.linspace(0.05, 9.95, 40)
 
 
 def test_the_hopper_from_markov_parameters(hopper, multipliers):
-    model = hj.realise(hopper.impulse_response(150), inputs="u", outputs=("yM", "vM"))
+    model = hj.identify.realize(hopper.impulse_response(150), inputs="u", outputs=("yM", "vM"))
     np.testing.assert_array_equal(model.dims, MINIMAL)
     assert (
         hj.fit_multipliers(model.htf(np.linspace(0, 16, 300)), model).compare(multipliers).max_error
@@ -29,7 +29,7 @@ def test_the_hopper_from_markov_parameters(hopper, multipliers):
 
 def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     """620 frequencies up to 10 of 16 cycles per period."""
-    model = hj.realise(exact)
+    model = hj.identify.realize(exact)
     np.testing.assert_array_equal(model.dims, MINIMAL)
     np.testing.assert_allclose(model.multipliers(), multipliers, atol=1e-11)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
@@ -47,7 +47,7 @@ def test_random_systems(shape, seed):
     f = np.linspace(0.02, N / 2 - 0.05, 60)
     htf = model.htf(f)
     for source in (htf, model.impulse_response(40)):
-        found = hj.realise(source)
+        found = hj.identify.realize(source)
         assert np.all(np.asarray(found.dims) <= np.asarray(model.dims))
         assert found.htf(f).error(hj.HTF(f, htf.H, htf.harmonics, N, found.inputs,
             found.outputs)).max() < 1e-7  # fmt: skip
@@ -58,12 +58,12 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     data = record(hopper, 32 * 300, 3)
     rng = np.random.default_rng(4)
     y = data.y + 0.01 * data.y.std(axis=0) * rng.normal(size=data.y.shape)
-    fit = hj.fit_series(hj.Record(data.u, y, sections=32, outputs=("yM", "vM")), 2)
-    model = hj.realise(fit, order=2)
+    fit = hj.fit_series(hj.Record(data.u, y, n_sections=32, outputs=("yM", "vM")), 2)
+    model = hj.identify.realize(fit, order=2)
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
     assert model.htf(F).error(hopper.htf(F)).max() < 2e-3
     assert np.abs(model.multipliers()[:2] - multipliers).max() < 2e-3
-    small = hj.realise(fit, 2)
+    small = hj.identify.realize(fit, 2)
     np.testing.assert_array_equal(small.dims, 2)
 
 
@@ -75,7 +75,7 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
         exact.f, exact.H + np.sqrt(variance / 2) * error, exact.harmonics, 32,
         exact.inputs, exact.outputs, variance=variance,
     )  # fmt: skip
-    model = hj.realise(noisy, order=2)
+    model = hj.identify.realize(noisy, order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     assert np.abs(model.multipliers()[:2] - multipliers).max() < 2e-3
 
@@ -83,15 +83,15 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
 def test_bad_requests(hopper, exact):
     markov = np.asarray(hopper.impulse_response(30))
     with pytest.raises(hj.DefinitionError, match="30 lags are too few for a horizon of 20"):
-        hj.realise(markov, horizon=20)
+        hj.identify.realize(markov, horizon=20)
     with pytest.raises(hj.DefinitionError, match="horizon is at least 1"):
-        hj.realise(markov, horizon=0)
+        hj.identify.realize(markov, horizon=0)
     with pytest.raises(hj.DefinitionError, match="one for each of 32 sections"):
-        hj.realise(markov, [2, 2])
+        hj.identify.realize(markov, [2, 2])
     with pytest.raises(hj.DefinitionError, match="section 0 would have 9 dimensions"):
-        hj.realise(markov, 9, horizon=4)
+        hj.identify.realize(markov, 9, horizon=4)
     with pytest.raises(hj.DefinitionError, match="NaN or infinity"):
-        hj.realise(markov * np.nan)
+        hj.identify.realize(markov * np.nan)
     few = hj.HTF(exact.f[:3], exact.H[:, :3], exact.harmonics, 32)
     with pytest.raises(hj.DefinitionError, match="3 frequencies are too few"):
-        hj.realise(few, horizon=8)
+        hj.identify.realize(few, horizon=8)

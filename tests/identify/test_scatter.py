@@ -19,19 +19,19 @@ def model():
     return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
-def realised(model, count, repeats=1, noise=0.0, seed=0, **more):
-    design = LINES.realisations(count, seed)
-    data = hj.simulate_experiments(
+def realized(model, count, repeats=1, noise=0.0, seed=0, **more):
+    design = LINES.realizations(count, seed)
+    data = hj.experiments.simulate_experiments(
         model, design, start="periodic", discard=(repeats - 1) * P, seed=seed, **more
     )
-    return hj.add_noise(data, std=noise, seed=seed)
+    return hj.experiments.add_noise(data, std=noise, seed=seed)
 
 
 def inside(model, count, repeats, variance, runs=100, **more):
     """How often discs of 95 % hold the true value, of how many: H_0 at every third line."""
     hits = []
     for seed in range(runs):
-        data = realised(model, count, repeats, seed=seed, **more)
+        data = realized(model, count, repeats, seed=seed, **more)
         estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
         error = np.abs(estimate[0] - model.htf(estimate.f, 0)[0])
         hits.append((error <= estimate.confidence_radius()[0])[::3])
@@ -54,7 +54,7 @@ def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, varian
 
 def test_the_parts_of_the_variance(model):
     """White noise: both parts are the same; their mean is the formula of the design."""
-    data = realised(model, 40, 8, noise=0.2)
+    data = realized(model, 40, 8, noise=0.2)
     estimate = hj.estimate_htf(data, repeats=8)
     np.testing.assert_array_equal(estimate.freedom, 39)
     once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
@@ -67,9 +67,9 @@ def test_the_parts_of_the_variance(model):
 
 
 def test_distortion_is_what_noise_is_not(model):
-    """y = linear + cube of the input: realisations scatter, repeated periods do not."""
-    data = realised(model, 20, 2)
-    bent = hj.ExperimentData(data.u, data.y + 5 * data.u**3, sections=N, periods=P)
+    """y = linear + cube of the input: realizations scatter, repeated periods do not."""
+    data = realized(model, 20, 2)
+    bent = hj.ExperimentData(data.u, data.y + 5 * data.u**3, n_sections=N, periods=P)
     estimate = hj.estimate_htf(bent, (0,), repeats=2)
     assert np.all(estimate.noise_variance < 1e-25) and np.all(estimate.variance > 1e-8)
     exact = model.htf(estimate.f, 0)[0]
@@ -78,9 +78,9 @@ def test_distortion_is_what_noise_is_not(model):
 
 
 def test_sums_of_parts_are_those_of_the_whole(model):
-    data = realised(model, 4, 2, noise=0.1)
+    data = realized(model, 4, 2, noise=0.1)
     parts = [
-        hj.ExperimentData(data.u[k : k + 4], data.y[k : k + 4], sections=N, periods=P)
+        hj.ExperimentData(data.u[k : k + 4], data.y[k : k + 4], n_sections=N, periods=P)
         for k in range(0, 16, 4)
     ]
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
@@ -89,35 +89,35 @@ def test_sums_of_parts_are_those_of_the_whole(model):
 
 
 def test_without_repeats_or_realisations_nothing_is_known(model):
-    estimate = hj.estimate_htf(realised(model, 1))
+    estimate = hj.estimate_htf(realized(model, 1))
     assert estimate.variance is None and estimate.freedom is None
-    with pytest.raises(hj.DefinitionError, match="several realisations"):
+    with pytest.raises(hj.DefinitionError, match="several realizations"):
         estimate.confidence_radius()
 
 
 def test_a_failed_realisation_leaves_the_others(model):
-    data = realised(model, 2, noise=0.1)
+    data = realized(model, 2, noise=0.1)
     result = np.zeros(len(data.u), int)
     result[0] = hj.Result.BLOW_UP
-    data = hj.ExperimentData(data.u, data.y, sections=N, periods=P, result=result)
+    data = hj.ExperimentData(data.u, data.y, n_sections=N, periods=P, result=result)
     estimate = hj.estimate_htf(data)
     lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
     assert np.all(np.isinf(estimate.variance[:, lost]))
     assert np.all(np.isfinite(estimate.variance[:, ~lost]))
-    with pytest.raises(hj.DefinitionError, match="measured in one realisation only"):
+    with pytest.raises(hj.DefinitionError, match="measured in one realization only"):
         hj.estimate_htf(data, variance="total")
 
 
 def test_pairs_cancel_even_distortion(model):
-    design = LINES.realisations(3).with_negatives()
-    data = hj.simulate_experiments(model, design, start="periodic")
-    bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, sections=N, periods=P)
-    estimate = hj.estimate_htf(hj.odd_part(bent))
+    design = LINES.realizations(3).with_negatives()
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P)
+    estimate = hj.estimate_htf(hj.experiments.odd_part(bent))
     assert estimate.error(model.htf(estimate.f)).max() < 1e-12
     with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
-        hj.odd_part(realised(model, 2))
+        hj.experiments.odd_part(realized(model, 2))
     with pytest.raises(hj.DefinitionError, match="one has no partner"):
-        hj.odd_part(hj.ExperimentData(data.u[:3], data.y[:3], sections=N, periods=P))
+        hj.experiments.odd_part(hj.ExperimentData(data.u[:3], data.y[:3], n_sections=N, periods=P))
 
 
 @pytest.mark.parametrize(
@@ -133,46 +133,48 @@ def test_pairs_cancel_even_distortion(model):
 def test_variances_that_cannot_be_had(model, message, arguments):
     estimate = getattr(hj.estimate_htf, "__wrapped__", hj.estimate_htf)
     with pytest.raises(hj.DefinitionError, match=message):
-        estimate(realised(model, 1, 2), **arguments)
+        estimate(realized(model, 1, 2), **arguments)
 
 
 def test_repeated_phases_show_no_distortion(model):
-    data = realised(model, 1, noise=0.1)
+    data = realized(model, 1, noise=0.1)
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
     with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
-        hj.estimate_htf(hj.ExperimentData(*twice, sections=N, periods=P), variance="total")
+        hj.estimate_htf(hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total")
 
 
 def test_inputs_that_do_not_repeat(model):
-    data = realised(model, 1, 2)
+    data = realized(model, 1, 2)
     u = data.u * np.linspace(1, 2, data.u.shape[1])[:, None]
     with pytest.raises(hj.DefinitionError, match="the input does not repeat"):
-        hj.estimate_htf(hj.ExperimentData(u, data.y, sections=N, periods=P), repeats=2)
+        hj.estimate_htf(hj.ExperimentData(u, data.y, n_sections=N, periods=P), repeats=2)
 
 
 def test_noise_by_its_ratio(model):
-    data = realised(model, 1, 4)
-    noisy = hj.add_noise(data, snr=20, seed=3)
+    data = realized(model, 1, 4)
+    noisy = hj.experiments.add_noise(data, snr=20, seed=3)
     ratio = np.var(noisy.y - data.y, axis=(0, 1)) / np.mean(data.y**2, axis=(0, 1))
     np.testing.assert_allclose(ratio, 0.01, rtol=0.2)
     for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
         with pytest.raises(hj.DefinitionError):
-            hj.add_noise(data, **bad)
+            hj.experiments.add_noise(data, **bad)
     with pytest.raises(hj.DefinitionError, match="process_noise must be finite"):
-        realised(model, 1, process_noise=-1.0)
+        realized(model, 1, process_noise=-1.0)
 
 
 def test_coherence_is_one_but_for_noise(model):
     """Power that goes to other harmonics is explained; noise of a known ratio is not."""
-    clean = realised(model, 6)
-    np.testing.assert_allclose(hj.estimate_coherence(clean).values, 1.0, atol=1e-9)
-    noisy = hj.estimate_coherence(hj.add_noise(realised(model, 60), std=1.0), 0)
+    clean = realized(model, 6)
+    np.testing.assert_allclose(hj.identify.estimate_coherence(clean).values, 1.0, atol=1e-9)
+    noisy = hj.identify.estimate_coherence(
+        hj.experiments.add_noise(realized(model, 60), std=1.0), 0
+    )
     # White noise: |Y|^2 = N P; signal: (N P a / 2)^2 |H|^2.
     signal = (N * P * 0.1 / 2 * np.abs(model.htf(noisy.f, 0)[0][..., 0])) ** 2
     np.testing.assert_allclose(noisy.values[0], signal / (signal + N * P), atol=0.2)
     assert np.all((noisy.total > noisy.values[0].min(axis=0)) & (noisy.total < 1))
     with pytest.raises(hj.DefinitionError, match="no line was measured in several"):
-        hj.estimate_coherence(realised(model, 1))
+        hj.identify.estimate_coherence(realized(model, 1))
 
 
 @settings(max_examples=25)

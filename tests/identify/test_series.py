@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from hybridjax.identify.series.fit.layout import lay_out
+from hybridjax.identify.series.fit.regression import delayed_outputs, linearize, rescale, set_up
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.records import lay_out
-from hybridjax.identify.regression import delayed_outputs, linearise, rescale, set_up
 
 from ..periodic.conftest import blocks_at_random
 from .test_uncertainty import covered
@@ -31,7 +31,7 @@ def record(model, samples, seed=0, noise=0.0, start=0, x0=None):
     y = np.array(model.simulate(u, x0, start))
     y += noise * rng.normal(size=y.shape)
     about = dict(inputs=model.inputs, outputs=model.outputs)
-    return hj.Record(u, y, sections=model.sections, start=start, **about)
+    return hj.Record(u, y, n_sections=model.n_sections, start=start, **about)
 
 
 def test_the_hopper_is_found_exactly(hopper, multipliers):
@@ -62,7 +62,7 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
         y[rng.random(y.shape) < 0.02] = np.nan
         u[25 * N + 2, 0] = np.nan
         about = dict(inputs=model.inputs, outputs=model.outputs)
-        records.append(hj.Record(u, y, sections=N, start=start, **about))
+        records.append(hj.Record(u, y, n_sections=N, start=start, **about))
     fit = hj.fit_series(records, model)
     np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers()).real[1:], atol=1e-7)
     lags = fit.numerators.shape[1]
@@ -78,8 +78,8 @@ def test_outputs_do_not_meddle(small, alike):
     c, unit = np.array([-0.5, 0.2]), np.array([2.0, 0.1])
 
     def of(outputs):
-        problem = set_up(lay_out(hj.Record(whole.u, y[:, outputs], sections=4)), 2, 4, False)
-        return problem, linearise(problem, c), delayed_outputs(problem, 2)
+        problem = set_up(lay_out(hj.Record(whole.u, y[:, outputs], n_sections=4)), 2, 4, False)
+        return problem, linearize(problem, c), delayed_outputs(problem, 2)
 
     problem, both, delayed = of([0, 1])
     other = rescale(problem, unit)
@@ -95,7 +95,7 @@ def test_outputs_do_not_meddle(small, alike):
         for n in range(4):
             x, z = both.roots[n][i], alone.roots[n][0]
             np.testing.assert_allclose(x @ x.T, z @ z.T, atol=1e-12)
-    for a, b in zip(linearise(other, c)[:-1], both.rescale(unit)[:-1], strict=True):
+    for a, b in zip(linearize(other, c)[:-1], both.rescale(unit)[:-1], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
     np.testing.assert_allclose(
         delayed_outputs(other, 2).gram, delayed.rescale(unit).gram, rtol=1e-9
@@ -128,16 +128,16 @@ def test_process_noise_is_seen_in_the_residuals(small):
         clean = record(small, 4 * 100, seed)
         hidden = np.random.default_rng(1000 + seed).normal(size=clean.u.shape)
         y = clean.y + 0.3 * np.asarray(small.simulate(hidden))
-        fit = hj.fit_series(hj.Record(clean.u, y, sections=4), 2)
+        fit = hj.fit_series(hj.Record(clean.u, y, n_sections=4), 2)
         hits += fit.contains(true).all()
     assert covered(hits, runs)
 
 
 def test_experiments_are_used_from_their_start(hopper, multipliers):
     """The transient that a window of periods avoids is information here."""
-    data = hj.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
+    data = hj.experiments.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
     data = hj.ExperimentData(
-        data.u, data.y, sections=32, periods=40, inputs="u", outputs=("yM", "vM"),
+        data.u, data.y, n_sections=32, periods=40, inputs="u", outputs=("yM", "vM"),
         result=[0] * 19 + [hj.Result.BLOW_UP],
     )  # fmt: skip
     for start in ("free", "rest"):
@@ -149,7 +149,7 @@ def test_experiments_are_used_from_their_start(hopper, multipliers):
 def test_a_chirp_will_do(hopper, multipliers):
     n = np.arange(32 * 400)
     u = 0.02 * np.cos(np.pi * 0.6 * n**2 / n[-1])[:, None]
-    fit = hj.fit_series(hj.Record(u, hopper.simulate(u), sections=32), 2)
+    fit = hj.fit_series(hj.Record(u, hopper.simulate(u), n_sections=32), 2)
     assert fit.compare(multipliers).max_error < 1e-6
 
 
@@ -183,7 +183,7 @@ def quadratic(seed, size, cycles=300):
         z = np.append(x, force)
         x = turn[k % N] @ x + push[k % N] * force + bend[k % N] @ z @ z
     true = 0.9**N * np.exp([1j * sum(ANGLES), -1j * sum(ANGLES)])
-    return hj.Record(u, np.array(y), sections=N, drift=np.inf), true
+    return hj.Record(u, np.array(y), n_sections=N, drift=np.inf), true
 
 
 def test_distortion_of_second_order():
@@ -210,7 +210,7 @@ def test_drift_is_no_response(small):
     T = 150
     cycle = (np.arange(4 * T) // 4 + 0.5) / T
     wave = 5 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * T) % 4) + 7
-    about = dict(sections=4, inputs=plain.inputs, outputs=plain.outputs, drift=50)
+    about = dict(n_sections=4, inputs=plain.inputs, outputs=plain.outputs, drift=50)
     fits = [
         hj.fit_series(hj.Record(plain.u, y, **about), 2) for y in (plain.y, plain.y + wave[:, None])
     ]
@@ -219,7 +219,7 @@ def test_drift_is_no_response(small):
     found = hj.validate(fits[1], hj.Record(plain.u, plain.y + wave[:, None], **about))
     assert found.fit.min() > 90
     with pytest.raises(hj.DefinitionError, match="positive number of cycles"):
-        hj.Record(plain.u, plain.y, sections=4, drift=0)
+        hj.Record(plain.u, plain.y, n_sections=4, drift=0)
 
 
 def test_bad_records(small):
@@ -229,23 +229,23 @@ def test_bad_records(small):
     with pytest.raises(hj.DefinitionError, match="order >= 1"):
         hj.fit_series(good, 0)
     with pytest.raises(hj.DefinitionError, match="input u is zero"):
-        hj.fit_series(hj.Record(0 * good.u, good.y, sections=4), 2)
+        hj.fit_series(hj.Record(0 * good.u, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match="output y1 is zero or missing"):
-        hj.fit_series(hj.Record(good.u, good.y * [1, np.nan], sections=4), 2)
+        hj.fit_series(hj.Record(good.u, good.y * [1, np.nan], n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match="do not belong together"):
-        hj.fit_series([good, hj.Record(good.u, good.y, sections=5)], 2)
+        hj.fit_series([good, hj.Record(good.u, good.y, n_sections=5)], 2)
     with pytest.raises(hj.DefinitionError, match="input is NaN at every sample"):
-        hj.fit_series(hj.Record(good.u * np.nan, good.y, sections=4), 2)
+        hj.fit_series(hj.Record(good.u * np.nan, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match=r"not \(400, 1\) and \(399, 2\)"):
-        hj.Record(good.u, good.y[1:], sections=4)
+        hj.Record(good.u, good.y[1:], n_sections=4)
     with pytest.raises(hj.DefinitionError, match="start from 0 to sections - 1"):
-        hj.Record(good.u, good.y, sections=4, start=4)
+        hj.Record(good.u, good.y, n_sections=4, start=4)
     with pytest.raises(hj.DefinitionError, match="y is infinite at sample 7"):
         y = good.y.copy()
         y[7] = np.inf
-        hj.Record(good.u, y, sections=4)
+        hj.Record(good.u, y, n_sections=4)
     with pytest.raises(hj.DefinitionError, match="no experiment that ran to its end"):
         hj.fit_series(
-            hj.ExperimentData(good.u[None], good.y[None], sections=4, periods=9, result=[5]), 2
+            hj.ExperimentData(good.u[None], good.y[None], n_sections=4, periods=9, result=[5]), 2
         )
     assert "Record(400 samples from section 0; N = 4; u -> y0, y1)" == repr(good)

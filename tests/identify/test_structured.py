@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.compare import compare_multipliers
+from hybridjax.identify.multipliers.compare import compare_multipliers
 
 from ..periodic.conftest import blocks_at_random
 
@@ -27,7 +27,7 @@ def test_the_paper_protocol(paper_estimate, hopper, multipliers):
 def test_noise_of_a_tenth_of_the_output(paper_data, multipliers):
     noise = np.random.default_rng(0).normal(size=paper_data.y.shape)
     y = paper_data.y + 0.1 * np.std(paper_data.y, axis=(0, 1)) * noise
-    data = hj.ExperimentData(paper_data.u, y, sections=32, periods=64)
+    data = hj.ExperimentData(paper_data.u, y, n_sections=32, periods=64)
     fit = hj.fit_multipliers(hj.estimate_htf(data), 2)
     assert fit.compare(multipliers).max_error < 1e-3
 

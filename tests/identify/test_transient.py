@@ -22,11 +22,14 @@ def errors(model, data, harmonics=(-1, 0, 1)):
 @pytest.mark.parametrize("known", [False, True])
 def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full, known):
     """The window begins one period after the start, without and with given multipliers."""
-    for design, discard in ((full, 10), (hj.single_cosine(np.arange(1, 48, 2) / 16, 32, 16), 1)):
-        data = hj.simulate_experiments(hopper, design, discard=discard)
+    for design, discard in (
+        (full, 10),
+        (hj.experiments.single_cosine(np.arange(1, 48, 2) / 16, 32, 16), 1),
+    ):
+        data = hj.experiments.simulate_experiments(hopper, design, discard=discard)
         assert errors(hopper, data) > 1e-3
         given = hopper.multipliers() if known else None
-        fit = hj.remove_transient(data, 2, multipliers=given)
+        fit = hj.identify.remove_transient(data, 2, multipliers=given)
         assert errors(hopper, fit.data) < 1e-9
         assert np.abs(fit.multipliers - hopper.multipliers()).max() < 1e-8
         assert fit.data.u.shape[1] == data.u.shape[1] - 32
@@ -35,32 +38,32 @@ def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full, known
 
 def test_noise_is_not_mistaken_for_a_transient(hopper, full):
     """The order is found, and the estimate is as good as that of records without a transient."""
-    rest = hj.simulate_experiments(hopper, full, discard=12)
-    data = hj.add_noise(rest, snr=30, seed=1)
-    still = hj.simulate_experiments(hopper, full, start="periodic", discard=12)
-    still = hj.ExperimentData(still.u, still.y + data.y - rest.y, sections=32, periods=12)
-    fit = hj.remove_transient(data)
+    rest = hj.experiments.simulate_experiments(hopper, full, discard=12)
+    data = hj.experiments.add_noise(rest, snr=30, seed=1)
+    still = hj.experiments.simulate_experiments(hopper, full, start="periodic", discard=12)
+    still = hj.ExperimentData(still.u, still.y + data.y - rest.y, n_sections=32, periods=12)
+    fit = hj.identify.remove_transient(data)
     assert len(fit.multipliers) == 2
     assert np.abs(fit.multipliers - hopper.multipliers()).max() < 0.03
     assert errors(hopper, fit.data) < 1.2 * errors(hopper, still)
 
 
 def test_failed_experiments_stay_out(hopper, full):
-    data = hj.simulate_experiments(hopper, full, discard=10)
+    data = hj.experiments.simulate_experiments(hopper, full, discard=10)
     result, y = np.zeros(len(data.u), int), data.y.copy()
     result[2], y[2, 50:] = hj.Result.BLOW_UP, np.nan
-    data = hj.ExperimentData(data.u, y, sections=32, periods=12, result=result)
-    fit = hj.remove_transient(data, 2)
+    data = hj.ExperimentData(data.u, y, n_sections=32, periods=12, result=result)
+    fit = hj.identify.remove_transient(data, 2)
     assert np.isnan(fit.removed[2]).all() and np.isfinite(fit.removed[3]).all()
     estimate = hj.estimate_htf(fit.data, 0)
     assert np.abs(estimate[0] - hopper.htf(estimate.f, 0)[0]).max() < 1e-9
 
 
 def test_what_is_refused(hopper, full):
-    data = hj.simulate_experiments(hopper, full, discard=4)
+    data = hj.experiments.simulate_experiments(hopper, full, discard=4)
 
     def cut(n, **more):
-        return hj.ExperimentData(data.u[:, :n], data.y[:, :n], sections=32, periods=12, **more)
+        return hj.ExperimentData(data.u[:, :n], data.y[:, :n], n_sections=32, periods=12, **more)
 
     for message, data_, arguments in (
         ("must hold the window of P = 12", cut(32 * 12), dict()),
@@ -71,8 +74,8 @@ def test_what_is_refused(hopper, full):
         ("no experiment ran well", cut(32 * 14, result=np.full(len(data.u), 2)), dict()),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.remove_transient(data_, **arguments)
+            hj.identify.remove_transient(data_, **arguments)
     u = data.u.copy()
     u[1, -1] += 1e-3
     with pytest.raises(hj.DefinitionError, match="experiment 1: the input does not repeat"):
-        hj.remove_transient(hj.ExperimentData(u, data.y, sections=32, periods=12))
+        hj.identify.remove_transient(hj.ExperimentData(u, data.y, n_sections=32, periods=12))

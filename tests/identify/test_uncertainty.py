@@ -19,7 +19,7 @@ def noisy(htf, variance, rng, correlation=0.0):
 
 def with_variance(htf, H, variance, freedom=None):
     return hj.HTF(
-        htf.f, H, htf.harmonics, htf.sections, htf.inputs, htf.outputs,
+        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
         variance=variance, freedom=freedom,
     )  # fmt: skip
 
@@ -52,7 +52,7 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
     true, runs = model.multipliers(), 60
-    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
+    bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
     fits = [
         hj.fit_multipliers(
             noisy(htf, variance, np.random.default_rng(seed), correlation), 2, errors=errors
@@ -80,7 +80,9 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         fit = hj.fit_multipliers(with_variance(htf, data.H, rough, np.full(80, 2.0)), 2)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(true).error[0] ** 2 for f in (fit, raw)]
-    bound = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors[0]
+    bound = hj.identify.multiplier_bound(
+        model, with_variance(htf, htf.H, variance)
+    ).standard_errors[0]
     assert np.sqrt(square[0] / 25) < 1.2 * bound < np.sqrt(square[1] / 25)
 
 
@@ -88,7 +90,7 @@ def test_without_variances_the_misfit_tells(small):
     """One output is a hundred times as noisy, which nobody said."""
     model, htf = small
     variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
-    said = hj.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
+    said = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
     data = noisy(htf, variance, np.random.default_rng(0))
     blind = hj.fit_multipliers(with_variance(htf, data.H, None), 2)
     np.testing.assert_allclose(blind.standard_errors, said, rtol=0.3)
@@ -101,7 +103,7 @@ def pair_and_real():
     true = np.array([0.6 + 0.3j, 0.6 - 0.3j, -0.4])
     rng = np.random.default_rng(1)
     square = rng.normal(size=(3, 3))
-    return hj.MultiplierBound(true, np.poly(true).real[1:], 1e-6 * square @ square.T), rng
+    return hj.identify.MultiplierBound(true, np.poly(true).real[1:], 1e-6 * square @ square.T), rng
 
 
 def test_first_order_covariances_and_regions(pair_and_real):
@@ -127,7 +129,10 @@ def test_first_order_covariances_and_regions(pair_and_real):
         distance = estimate.distance(border)
         np.testing.assert_allclose(distance, stats.chi2.ppf(0.9, degrees), rtol=0.05)
     # The share of draws that a region around the truth holds.
-    held = [hj.MultiplierBound(true, draw, estimate.covariance).contains(true) for draw in draws]
+    held = [
+        hj.identify.MultiplierBound(true, draw, estimate.covariance).contains(true)
+        for draw in draws
+    ]
     assert np.all([covered(n, 4000) for n in np.sum(held, axis=0)])
 
 
@@ -145,7 +150,7 @@ def test_bad_requests(pair_and_real, small, variance):
     with pytest.raises(hj.DefinitionError, match="variance of H_-2 of y1 at f = 0.08.* is not"):
         hj.fit_multipliers(with_variance(htf, htf.H, wrong), 2)
     with pytest.raises(hj.DefinitionError, match="needs the variances"):
-        hj.multiplier_bound(model, htf)
+        hj.identify.multiplier_bound(model, htf)
     other = hj.HTF(htf.f, htf.H, htf.harmonics, 4, "u", ("a", "b"), variance=variance)
     with pytest.raises(hj.DefinitionError, match="different outputs"):
-        hj.multiplier_bound(model, other)
+        hj.identify.multiplier_bound(model, other)

@@ -54,7 +54,7 @@ def test_process_noise_is_correlated_in_time_only(small):
     data = record(small, 4 * 300, 0)
     hidden = np.random.default_rng(1).normal(size=data.u.shape)
     y = data.y + 0.3 * np.asarray(small.simulate(hidden))
-    found = hj.validate(small, hj.Record(data.u, y, sections=4))
+    found = hj.validate(small, hj.Record(data.u, y, n_sections=4))
     assert not found.white and found.whiteness.max() < 1e-6
 
 
@@ -63,10 +63,10 @@ def test_identified_beside_held_out_data(hopper):
     train, test = record(hopper, 32 * 250, 0), record(hopper, 32 * 80, 1)
     noisy = [
         hj.Record(r.u, r.y + 0.01 * r.y.std(axis=0) * np.random.default_rng(k).normal(
-            size=r.y.shape), sections=32, outputs=("yM", "vM"))
+            size=r.y.shape), n_sections=32, outputs=("yM", "vM"))
         for k, r in enumerate((train, test))
     ]  # fmt: skip
-    model = hj.realise(hj.fit_series(noisy[0], 2), order=2)
+    model = hj.identify.realize(hj.fit_series(noisy[0], 2), order=2)
     found = hj.validate(model, noisy[1])
     np.testing.assert_allclose(found.fit, 99.0, atol=0.4)
 
@@ -78,7 +78,7 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     plain.y[5:9, 0] = np.nan
     cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
     wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
-    about = dict(sections=4, start=1, outputs=plain.outputs, drift=50)
+    about = dict(n_sections=4, start=1, outputs=plain.outputs, drift=50)
     still, moved = (
         hj.validate(small, hj.Record(plain.u, plain.y + x, **about), start=start)
         for x in (0.0, wave[:, None] * [1.0, -2.0])
@@ -98,10 +98,10 @@ def test_amplitudes(small):
     def run(u):
         y = np.stack([np.asarray(small.simulate(x + 0.01 * x**3)) for x in u])
         result = [0] if np.abs(u).max() < 30 else [hj.Result.BLOW_UP]
-        return hj.ExperimentData(u, y, sections=4, periods=9, outputs=("y0", "y1"), result=result)
+        return hj.ExperimentData(u, y, n_sections=4, periods=9, outputs=("y0", "y1"), result=result)
 
     u = np.random.default_rng(0).normal(size=(1, 400, 1))
-    sweep = hj.amplitude_sweep(run, small, u, [0.1, 1.0, 3.0, 100.0])
+    sweep = hj.identify.amplitude_sweep(run, small, u, [0.1, 1.0, 3.0, 100.0])
     np.testing.assert_allclose(sweep.misfit[1] / sweep.misfit[0], 100, rtol=0.1)
     assert sweep.failed[-1] == 1 and np.isnan(sweep.misfit[-1]).all()
     worst = sweep.misfit[0].max()
@@ -111,7 +111,7 @@ def test_amplitudes(small):
         sweep.limit(worst / 2)
     assert repr(sweep).splitlines()[-1].split()[-1] == "1"
     with pytest.raises(hj.DefinitionError, match="positive numbers"):
-        hj.amplitude_sweep(run, small, u, [0.0, 1.0])
+        hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
 
 
 def test_bad_requests(small, hopper):
@@ -123,6 +123,6 @@ def test_bad_requests(small, hopper):
     with pytest.raises(hj.DefinitionError, match="level must lie between"):
         hj.validate(small, data, level=5.0)
     with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
-        hj.validate(small, hj.Record(data.u, data.y * [0, 1], sections=4))
+        hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))
     with pytest.raises(hj.DefinitionError, match="lags must be at least 1"):
         hj.validate(small, data, lags=0)

@@ -46,7 +46,7 @@ def test_what_is_not_conserved_is_refused(conserved, words):
 
 
 def test_the_family_along_a_parameter(running):
-    branch = hj.follow(running, "k", (18000.0, 22000.0))
+    branch = hj.continuation(running, "k", (18000.0, 22000.0))
     (flip,) = branch.points
     assert flip.kind == "flip" and branch.stable[flip.index + 1 :].all()
     runner = running.system

@@ -1,4 +1,4 @@
-"""Cycles, section maps and linearisations of many systems under `jax.vmap`."""
+"""Cycles, section maps and linearizations of many systems under `jax.vmap`."""
 
 import functools as ft
 
@@ -20,7 +20,7 @@ SECTIONS = hj.ClockPhase(4, start=APEX)
 STIFFNESS = jnp.array([[9.8, 10.0], [10.1, 10.3]])
 
 
-def analyse(lossy_cycle, k):
+def analyze(lossy_cycle, k):
     """Numbers of the lossy hopper with stiffness k: states, A, B, a section map, a mean."""
     hopper = eqx.tree_at(lambda s: s.k, lossy_cycle.system, k)
     cycle = hj.find_limit_cycle(hopper, lossy_cycle)
@@ -40,7 +40,7 @@ def analyse(lossy_cycle, k):
 @pytest.mark.slow
 def test_many_systems_side_by_side(lossy_cycle):
     """Nested maps over systems equal a loop over them."""
-    one = ft.partial(analyse, lossy_cycle)
+    one = ft.partial(analyze, lossy_cycle)
     loop = compiled(one)
     mapped = compiled(jax.vmap(jax.vmap(one)))(STIFFNESS)
     for index in np.ndindex(*STIFFNESS.shape):
@@ -53,7 +53,7 @@ def test_many_systems_side_by_side(lossy_cycle):
 @pytest.mark.slow
 def test_gradients_of_many_systems_side_by_side(lossy_cycle):
     def size(k):
-        found = analyse(lossy_cycle, k)
+        found = analyze(lossy_cycle, k)
         return jnp.sum(found["monodromy"] ** 2) + jnp.sum(found["arrival"] ** 2)
 
     k = STIFFNESS[0]

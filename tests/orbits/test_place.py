@@ -125,8 +125,8 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
     [
         (lambda: hj.ClockPhase(0), "a whole number of sections, at least 1; got 0"),
         (lambda: hj.ClockPhase(2.5), "a whole number of sections, at least 1; got 2.5"),
-        (lambda: hj.Sections([]), "a whole number of sections, at least 1; got 0"),
-        (lambda: hj.Sections(["x"]), "takes Crossing and AtEvent objects, not str"),
+        (lambda: hj.SectionList([]), "a whole number of sections, at least 1; got 0"),
+        (lambda: hj.SectionList(["x"]), "takes Crossing and AtEvent objects, not str"),
     ],
 )
 def test_bad_families(define, message):

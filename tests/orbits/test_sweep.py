@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.orbits import tiles
+from hybridjax.orbits.sweep import batches
 
 
 ONES = np.ones(2)
@@ -72,7 +72,7 @@ def test_without_a_clock_and_in_waves(wheel):
 def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
     """And one that is not small, or guessed from nothing, is not taken."""
     steps = []
-    first_step = tiles.Tiles._first_step
+    first_step = batches.Tiles._first_step
 
     def watched(self, rows, start, period, jacobian):
         end, after = first_step(self, rows, start, period, jacobian)
@@ -83,7 +83,7 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
             )
         return end, after
 
-    monkeypatch.setattr(tiles.Tiles, "_first_step", watched)
+    monkeypatch.setattr(batches.Tiles, "_first_step", watched)
     slopes = np.linspace(0.08, 0.1, 11)
     found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
     rows, before, after = map(np.concatenate, zip(*steps, strict=True))
@@ -106,7 +106,7 @@ def test_programs_in_threads_factorise_nothing(wheel):
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
     start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.start, wheel.period))
     start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
-    for programs in (tiles.QUICK, tiles.FULL):
+    for programs in (batches.QUICK, batches.FULL):
         arguments = systems, wheel, start, period, wheel.settings, jnp.array(True)
         lowered = programs.turn.lower(*arguments)
         assert "lapack" not in lowered.as_text()

@@ -3,7 +3,7 @@ from matplotlib import pyplot
 
 import hybridjax as hj
 
-from ..periodic.conftest import hopper as hopper
+from ..linear.conftest import hopper as hopper
 
 
 @pytest.fixture(autouse=True)
@@ -15,7 +15,9 @@ def figures_are_closed():
 @pytest.fixture(scope="session")
 def estimate(hopper):
     design = hj.multisine(periods=16, f_max=4.0)
-    return hj.estimate_htf(hj.simulate_experiments(hopper, design, start="periodic"), (-1, 0, 1))
+    return hj.estimate_htf(
+        hj.experiments.simulate_experiments(hopper, design, start="periodic"), (-1, 0, 1)
+    )
 
 
 @pytest.fixture(scope="session")

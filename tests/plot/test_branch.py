@@ -7,7 +7,7 @@ import hybridjax as hj
 @pytest.fixture(scope="module")
 def branch():
     """The juggler's, from its fold to beyond its flip."""
-    return hj.follow(hj.find_limit_cycle(hj.models.PaddleJuggler()), "A", (0.12, 0.35))
+    return hj.continuation(hj.find_limit_cycle(hj.models.PaddleJuggler()), "A", (0.12, 0.35))
 
 
 def test_stable_cycles_have_full_lines(branch):

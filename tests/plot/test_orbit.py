@@ -4,7 +4,7 @@ import pytest
 import hybridjax as hj
 
 
-def labelled(ax):
+def labeled(ax):
     return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
 
 
@@ -16,12 +16,12 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
         hopper_cycle, sections=placed_kinematic, perturbed=perturbed, labels={"yM": "$y_M$ (m)"}
     )
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y_M$ (m)", "vM")
-    lines = labelled(ax)
+    lines = labeled(ax)
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
     names = [t.get_text() for t in ax.texts]
     assert names == ["liftoff", "touchdown", *map(str, range(0, 32, 4))]
 
-    # Bars lie on their sections: rays from the centre of the kinematic phase, in equal angles.
+    # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.
     bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]
     r = (bars - [1.9, 0.0]) / [0.3, 1.9]
     angle = np.unwrap(np.angle(r[..., 0] + 1j * r[..., 1]), axis=0)
@@ -33,7 +33,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
 def test_chart_colours_meet_at_the_events(hopper_cycle):
     ax = hj.plot.cycle(hopper_cycle)
     liftoff = hopper_cycle.trajectory().events[0].before
-    lines = labelled(ax)
+    lines = labeled(ax)
     np.testing.assert_allclose(lines["flight"].get_xydata()[0], [liftoff["yM"], liftoff["vM"]])
     assert lines["flight"].get_color() != lines["stance"].get_color()
 
@@ -49,7 +49,7 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     placed = hj.place_sections(vanderpol_cycle, hj.ClockPhase(6))
     ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed, numbers=0)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x") and not ax.texts
-    bars = labelled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
+    bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
     np.testing.assert_allclose(bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9)
 
 

@@ -8,7 +8,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 import hybridjax as hj
 
 
-def labelled(ax):
+def labeled(ax):
     """Lines by label, without the helpers that matplotlib or the axes hide."""
     return {line.get_label(): line for line in ax.get_lines() if line.get_label()[0] != "_"}
 
@@ -22,7 +22,7 @@ def texts(ax):
 
 def test_magnitude_draws_the_values(estimate, exact):
     ax = hj.plot.magnitude(estimate, exact, output="vM")
-    lines = labelled(ax)
+    lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
     np.testing.assert_array_equal(drawn.get_xdata(), estimate.f)
@@ -42,7 +42,7 @@ def test_exact_lies_under_the_estimate_in_any_order(estimate, exact):
 
 
 def test_only_exact(exact):
-    assert "exact" in labelled(hj.plot.magnitude(exact))
+    assert "exact" in labeled(hj.plot.magnitude(exact))
     hj.plot.bode(exact)
 
 
@@ -62,7 +62,7 @@ def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
 def test_bode_with_fits(estimate, exact, rational, structured):
     figure = hj.plot.bode(estimate, exact, fits=[rational, structured])
     upper, lower = figure.axes
-    assert list(labelled(upper)) == ["yM", "vM", "rational fit", "structured fit", "exact"]
+    assert list(labeled(upper)) == ["yM", "vM", "rational fit", "structured fit", "exact"]
     assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
@@ -74,7 +74,7 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 
 def test_bode_of_another_harmonic_and_one_output(estimate, structured, rational):
     figure = hj.plot.bode(estimate, fits=structured, harmonic=-1, outputs="vM")
-    assert list(labelled(figure.axes[0])) == ["vM", "structured fit"]
+    assert list(labeled(figure.axes[0])) == ["vM", "structured fit"]
     with pytest.raises(hj.DefinitionError, match="the rational fit is of H_0, not of H_1"):
         hj.plot.bode(estimate, fits=rational, harmonic=1)
 
@@ -122,7 +122,7 @@ def test_bad_input_of_transfer_functions(estimate, hopper):
 
 def test_multipliers(hopper, rational, structured):
     ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured})
-    lines = labelled(ax)
+    lines = labeled(ax)
     assert [name.split(":")[0] for name in lines] == ["exact", "2p1z, yM", "2p1z, vM", "structured"]
     z = hopper.multipliers()
     np.testing.assert_array_equal(lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1))
@@ -140,7 +140,7 @@ def test_multipliers_outside_the_disc_and_without_estimates():
     ax = hj.plot.multipliers([3.0, 0.5])
     assert ax.get_xlim()[1] > 3 and not ax.child_axes
     ax = hj.plot.multipliers([1.5], {"same": [1.5]})
-    assert "= 0" in list(labelled(ax))[1]
+    assert "= 0" in list(labeled(ax))[1]
 
 
 @pytest.mark.parametrize("bad", [[], ["a"]])
@@ -154,7 +154,7 @@ def test_poles_and_zeros(rational):
     figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved})
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
-        poles = labelled(ax)["poles, isochron"].get_xydata()
+        poles = labeled(ax)["poles, isochron"].get_xydata()
         np.testing.assert_array_equal(poles[:, 1], rational.poles[i].imag)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
@@ -166,7 +166,9 @@ def test_poles_and_zeros(rational):
 
 
 def test_experiment(hopper):
-    data = hj.simulate_experiments(hopper, hj.multisine(periods=4, f_max=2.0), discard=2)
+    data = hj.experiments.simulate_experiments(
+        hopper, hj.multisine(periods=4, f_max=2.0), discard=2
+    )
     figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"})
     assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ $y_M$", r"$\delta$ vM"]
     y = figure.axes[2].get_lines()[0]
@@ -181,7 +183,7 @@ def test_failed_experiment():
     y = np.ones((1, 8, 1))
     y[0, 5:] = np.nan
     data = hj.ExperimentData(
-        np.zeros((1, 8, 1)), y, sections=2, periods=2, result=[hj.Result.GRAZING], failed_at=[5]
+        np.zeros((1, 8, 1)), y, n_sections=2, periods=2, result=[hj.Result.GRAZING], failed_at=[5]
     )
     figure = hj.plot.experiment(data)
     assert "grazing" in figure.axes[0].get_title()
@@ -214,7 +216,7 @@ def test_global_settings_stay(estimate):
 def test_bands_hold_the_values(estimate):
     """Where there is a variance; the phase is drawn where it is known."""
     sure = hj.HTF(
-        estimate.f, estimate.H, estimate.harmonics, estimate.sections, estimate.inputs,
+        estimate.f, estimate.H, estimate.harmonics, estimate.n_sections, estimate.inputs,
         estimate.outputs, variance=np.full(estimate.H.shape, 1e-6),
     )  # fmt: skip
     assert not hj.plot.magnitude(estimate).collections

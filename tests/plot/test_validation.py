@@ -9,7 +9,7 @@ def found(hopper):
     u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
     y = y + 0.1 * y.std(axis=0) * np.random.default_rng(1).normal(size=y.shape)
-    return hj.validate(hopper, hj.Record(u, y, sections=32, outputs=("yM", "vM")))
+    return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
 
 
 def test_validation_draws_signals_and_correlations(found):
@@ -27,7 +27,7 @@ def test_validation_draws_signals_and_correlations(found):
 
 
 def test_amplitude_marks_the_limit():
-    sweep = hj.AmplitudeSweep(
+    sweep = hj.identify.AmplitudeSweep(
         np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
         ("u",), ("y",),
     )  # fmt: skip
@@ -40,7 +40,7 @@ def test_amplitude_marks_the_limit():
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers()
     c = np.poly(true).real[1:]
-    estimate = hj.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
+    estimate = hj.identify.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
     ax = hj.plot.multipliers(hopper, {"fit": estimate})
     (inset,) = ax.child_axes
     drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]

@@ -11,13 +11,13 @@ MULTIPLIER = np.exp(-2 * DECAY)
 @pytest.fixture(scope="session")
 def hopper_recording(hopper_cycle):
     """200 strides of the paper's hopper under a random force, without noise."""
-    force = hj.random_force(200, 64, 8, rms=0.02, seed=0)
-    return hj.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1)
+    force = hj.testing.random_force(200, 64, 8, rms=0.02, seed=0)
+    return hj.testing.simulate_recording(hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1)
 
 
 @pytest.fixture(scope="session")
 def angle():
-    return hj.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+    return hj.recordings.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def rhythm():
     z' = (2 pi i + a (1 - |z|^2)) z + f by Runge-Kutta's method, f linear between samples. It turns
     with the clock of a drive: its angle is pulled towards 2 pi t at the same rate.
     """
-    force = hj.random_force(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
+    force = hj.testing.random_force(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
     steps = 2
     h = 1 / RATE / steps
     fine = np.interp(np.arange(2 * steps * len(force)) * h / 2, np.arange(len(force)) / RATE, force)

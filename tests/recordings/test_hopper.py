@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.spoil import spoil
+from hybridjax.testing.dirt import spoil
 
 
 def test_five_lines(hopper_recording, hopper_cycle, angle):
-    data = hj.section_data(hopper_recording, angle, inputs="u", outputs=("yM", "vM"), sections=16)
+    data = hj.recordings.section_data(
+        hopper_recording, angle, inputs="u", outputs=("yM", "vM"), n_sections=16
+    )
     fit = hj.fit_series(data.records, order=2)
     assert fit.compare(hopper_cycle.multipliers).max_error < 2e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
     assert "199.94 cycles" in repr(data)
-    said = hj.advise(data, fit).warnings
+    said = hj.recordings.advise(data, fit).warnings
     assert any(w.startswith("Outputs: where sections are crossed, yM and vM") for w in said)
 
 
@@ -21,19 +23,19 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     """At the sections of an angle of the two outputs, these are one number."""
     noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
-    apex = hj.CrossingPhase("vM", "falling")
-    data = [hj.section_data(noisy, phase, **options) for phase in (angle, apex)]
+    apex = hj.recordings.CrossingPhase("vM", "falling")
+    data = [hj.recordings.section_data(noisy, phase, **options) for phase in (angle, apex)]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
-    assert not any(w.startswith("Outputs") for w in hj.advise(data[1], fits[1]).warnings)
+    assert not any(w.startswith("Outputs") for w in hj.recordings.advise(data[1], fits[1]).warnings)
 
 
 def test_dirt(hopper_recording, hopper_cycle, angle):
     dirty = spoil(
         hopper_recording, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(80.3, 90.7)
     )
-    data = hj.section_data(dirty, angle, inputs="u", outputs=("yM", "vM"), sections=16)
+    data = hj.recordings.section_data(dirty, angle, inputs="u", outputs=("yM", "vM"), n_sections=16)
     fit = hj.fit_series(data.records, order=2)
     assert len(data.records) == 2
     assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
@@ -44,9 +46,11 @@ def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
     """Everything goes slower and slower: multipliers stay what they are, and phase says by how
     much."""
     slower = spoil(hopper_recording, ("yM", "vM"), noise=1e-4, stretch=0.05)
-    phase = hj.estimate_phase(slower, angle)
+    phase = hj.recordings.estimate_phase(slower, angle)
     assert phase.drift * phase.cycles == pytest.approx(0.05, rel=0.1)
-    data = hj.section_data(slower, phase, inputs="u", outputs=("yM", "vM"), sections=16)
+    data = hj.recordings.section_data(
+        slower, phase, inputs="u", outputs=("yM", "vM"), n_sections=16
+    )
     fit = hj.fit_series(data.records, order=2)
     assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
@@ -58,12 +62,17 @@ def test_van_der_pol_without_a_clock():
     period = float(cycle.period)
     rate = 64 / period
     force = np.stack(
-        [hj.random_force(100 * period, rate, 2 / period, rms=0.02, seed=k) for k in (0, 1)]
+        [hj.testing.random_force(100 * period, rate, 2 / period, rms=0.02, seed=k) for k in (0, 1)]
     )
-    made = hj.simulate_recording(cycle, force, ("x", "v"), rate=rate, steps=1)
+    made = hj.testing.simulate_recording(cycle, force, ("x", "v"), rate=rate, steps=1)
     noisy = spoil(made, ("x", "v"), noise=1e-4)
-    data = hj.section_data(
-        noisy, hj.AnglePhase("x", "v"), inputs="u", outputs=("x", "v"), sections=8, time="duration"
+    data = hj.recordings.section_data(
+        noisy,
+        hj.recordings.AnglePhase("x", "v"),
+        inputs="u",
+        outputs=("x", "v"),
+        n_sections=8,
+        time="duration",
     )
     fit = hj.fit_series(data.records, order=1)
     assert fit.compare(cycle.multipliers[:1]).max_error < 5e-3
@@ -76,12 +85,19 @@ def test_compass_gait_by_events():
     cycle = hj.find_limit_cycle(hj.models.CompassGait(), section=hj.AtEvent("heelstrike"))
     period, outputs = float(cycle.period), ("n", "s", "vn", "vs")
     rate = 200 / period
-    force = [hj.random_force(100 * period, rate, 8 / period, rms=0.05, seed=k) for k in range(5)]
-    made = hj.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
+    force = [
+        hj.testing.random_force(100 * period, rate, 8 / period, rms=0.05, seed=k) for k in range(5)
+    ]
+    made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
     noisy = spoil(made, outputs, noise=1e-4)
     marked = noisy.mark("middle", "s", direction="falling", bandwidth=20 / period)
-    data = hj.section_data(
-        marked, hj.EventPhase("middle"), inputs="u", outputs=outputs, sections=16, time="duration"
+    data = hj.recordings.section_data(
+        marked,
+        hj.recordings.EventPhase("middle"),
+        inputs="u",
+        outputs=outputs,
+        n_sections=16,
+        time="duration",
     )
     fit = hj.fit_series(data.records, order=2, overhang=32)
     assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2
@@ -90,11 +106,11 @@ def test_compass_gait_by_events():
 
 @pytest.mark.slow
 def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
-    """Against the exact linearisation, averaged over the push."""
+    """Against the exact linearization, averaged over the push."""
     options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
-    data = hj.section_data(hopper_recording, angle, **options)
+    data = hj.recordings.section_data(hopper_recording, angle, **options)
     fit = hj.fit_series(data.records, order=2)
-    found = hj.impulse_responses(fit, data, cycles=2, width=0.08)
+    found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
     sections = hj.KinematicPhase(
         16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
         start=hj.Crossing("vM", "falling"),
@@ -114,14 +130,16 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
 def test_order_and_advice(hopper_recording, angle):
     noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-3)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
-    data = hj.section_data(noisy, angle, **options)
+    data = hj.recordings.section_data(noisy, angle, **options)
     fit = hj.fit_series(data.records, order=2)
-    advice = hj.advise(data, fit)
-    assert hj.choose_order(data) == 2
+    advice = hj.recordings.advise(data, fit)
+    assert hj.recordings.choose_order(data) == 2
     assert any("plain regression (ARX) would give" in w for w in advice.warnings)
     assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
     assert (np.diff(advice.expected[:, 0]) <= 0).all()
-    too_many = hj.advise(data, hj.fit_series(data.records, order=3, check=False)).warnings
+    too_many = hj.recordings.advise(
+        data, hj.fit_series(data.records, order=3, check=False)
+    ).warnings
     order = "Order: the data do not carry 3 multipliers"
     assert any(w.startswith(order) for w in too_many)
     assert not any(w.startswith("Order") for w in advice.warnings)
@@ -131,6 +149,6 @@ def test_order_and_advice(hopper_recording, angle):
         {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
             ("yM", "vM"), noisy.trials[0].values[:, 1:].T, strict=True))},
     )  # fmt: skip
-    poor = hj.section_data(slow, angle, **options)
-    said = hj.advise(poor, hj.fit_series(poor.records, order=2, check=False)).warnings
+    poor = hj.recordings.section_data(slow, angle, **options)
+    said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, check=False)).warnings
     assert any(w.startswith("Narrow excitation") for w in said)

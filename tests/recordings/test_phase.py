@@ -9,7 +9,7 @@ import hybridjax as hj
 from hybridjax.recordings.smoothing import means, spline
 
 
-CIRCLE = hj.AnglePhase("x", "v")
+CIRCLE = hj.recordings.AnglePhase("x", "v")
 
 
 def whole(phase, winding=0):
@@ -18,7 +18,7 @@ def whole(phase, winding=0):
 
 
 def test_the_angle_of_a_circle_is_time(wave):
-    phase = hj.estimate_phase(wave, CIRCLE)
+    phase = hj.recordings.estimate_phase(wave, CIRCLE)
     assert phase.period == pytest.approx(1.0, abs=1e-6)
     assert phase.cycles >= 18 and phase.jitter < 1e-3 and phase.backwards == 0
     inner = whole(phase)[1:-1]
@@ -35,7 +35,7 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     x = 3 + 2 * np.cos(2 * np.pi * t) + 2 * noise * rng.normal(size=t.size)
     v = 5 * sense * np.sin(2 * np.pi * t) + 5 * noise * rng.normal(size=t.size)
     x[(t > 5.2) & (t < 7.1)] = np.nan
-    phase = hj.estimate_phase(hj.Recording(t, {"x": x, "v": v}), CIRCLE)
+    phase = hj.recordings.estimate_phase(hj.Recording(t, {"x": x, "v": v}), CIRCLE)
     assert [len(s) for s in phase.stretches] == [2]
     for k in (0, 1):
         found = whole(phase, k)
@@ -45,17 +45,17 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
 
 
 def test_a_function_and_a_start(wave):
-    other = hj.estimate_phase(wave, lambda t, signals: 2 * np.pi * t + 1.0)
+    other = hj.recordings.estimate_phase(wave, lambda t, signals: 2 * np.pi * t + 1.0)
     np.testing.assert_allclose(np.diff(whole(other)), 1.0, atol=1e-9)
-    late = hj.estimate_phase(wave, hj.AnglePhase("x", "v", start=-np.pi / 2))
+    late = hj.recordings.estimate_phase(wave, hj.recordings.AnglePhase("x", "v", start=-np.pi / 2))
     np.testing.assert_allclose(whole(late) % 1, 0.25, atol=2e-4)
 
 
 def test_in_real_time(wave):
-    phase = hj.estimate_phase(wave, CIRCLE, causal=True)
+    phase = hj.recordings.estimate_phase(wave, CIRCLE, causal=True)
     late = whole(phase)[2:-1]
     assert np.abs(late - np.round(late)).max() < 1e-3
-    tracker = hj.PhaseTracker((0.0, 0.0), (1.0, 1.0), -1.0)
+    tracker = hj.recordings.PhaseTracker((0.0, 0.0), (1.0, 1.0), -1.0)
     t, (x, v) = wave.trials[0].time, wave.trials[0].values[:, 1:].T
     found = [tracker.update(*row) for row in zip(t, x, v, strict=True)]
     assert (np.diff(found) >= 0).all() and found[-1] == pytest.approx(20.0, abs=1e-3)
@@ -63,7 +63,7 @@ def test_in_real_time(wave):
     with pytest.raises(hj.DefinitionError, match="time must grow"):
         tracker.update(t[-1], 1.0, 0.0)
     with pytest.raises(hj.DefinitionError, match="rate other than 0"):
-        hj.PhaseTracker((0, 0), (1, 1), 0.0)
+        hj.recordings.PhaseTracker((0, 0), (1, 1), 0.0)
 
 
 @pytest.mark.parametrize("causal", [False, True])
@@ -73,7 +73,9 @@ def test_events_missed_and_doubled(wave, causal):
     recording = hj.Recording(
         wave.trials[0].time, {"x": wave.trials[0].values[:, 0]}, events={"strike": events}
     )
-    phase = hj.estimate_phase(recording, hj.EventPhase("strike"), causal=causal)
+    phase = hj.recordings.estimate_phase(
+        recording, hj.recordings.EventPhase("strike"), causal=causal
+    )
     assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
     assert phase.lead == (0 if causal else 1)
     w = phase.stretches[0][0]
@@ -91,7 +93,7 @@ def test_irregular_events(seed, jitter, causal):
     missed, doubled = 10 + rng.permutation(20)[0], 40 + rng.permutation(10)[0]
     events = np.sort(np.append(np.delete(t, missed), t[doubled] + 0.1))
     recording = hj.Recording(np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events})
-    phase = hj.estimate_phase(recording, hj.EventPhase("e"), causal=causal)
+    phase = hj.recordings.estimate_phase(recording, hj.recordings.EventPhase("e"), causal=causal)
     assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
     assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
     for w in phase.stretches[0]:
@@ -115,21 +117,24 @@ def test_what_is_no_phase(wave):
     t = wave.trials[0].time
     still = hj.Recording(t, {"x": np.cos(t) + 5, "v": np.sin(t) + 5, "c": 0 * t})
     for definition, message in [
-        (hj.AnglePhase("x", "v", center=(0, 0), scale=(1, 1)), "the phase does not wind"),
-        (hj.AnglePhase("x", "c"), "needs a c that varies"),
-        (hj.AnglePhase("x", "q"), "no signal 'q'"),
-        (hj.EventPhase("strike"), "no event 'strike'; its events are: none"),
-        (hj.CrossingPhase("x", "falling", 3.0), "x never crosses 3, falling"),
+        (
+            hj.recordings.AnglePhase("x", "v", center=(0, 0), scale=(1, 1)),
+            "the phase does not wind",
+        ),
+        (hj.recordings.AnglePhase("x", "c"), "needs a c that varies"),
+        (hj.recordings.AnglePhase("x", "q"), "no signal 'q'"),
+        (hj.recordings.EventPhase("strike"), "no event 'strike'; its events are: none"),
+        (hj.recordings.CrossingPhase("x", "falling", 3.0), "x never crosses 3, falling"),
         (lambda t, s: t[1:], "returned the shape"),
         (lambda t, s: 0 * t, "the phase does not wind"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.estimate_phase(still, definition)
+            hj.recordings.estimate_phase(still, definition)
     one = hj.Recording(
         t[:180], {"x": np.cos(2 * np.pi * t[:180]), "v": np.sin(2 * np.pi * t[:180])}
     )
     with pytest.raises(hj.DefinitionError, match="does not wind: 1.8 turns"):
-        hj.estimate_phase(one, CIRCLE)
+        hj.recordings.estimate_phase(one, CIRCLE)
 
 
 @settings(max_examples=15)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 import hybridjax as hj
-from hybridjax._core.errors import FileFormatError
+from hybridjax.errors import FileFormatError
 from hybridjax.recordings.read import read_columns
 
 
@@ -140,10 +140,10 @@ def test_other_bad_files(tmp_path):
     with pytest.raises(hj.DefinitionError, match="ends in '.xls'"):
         hj.read_recording(tmp_path / "x.xls")
     (tmp_path / "x.npz").write_text("not")
-    with pytest.raises(hj.FileFormatError, match="not an NPZ file"):
+    with pytest.raises(hj.errors.FileFormatError, match="not an NPZ file"):
         hj.read_recording(tmp_path / "x.npz")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(hj.FileFormatError, match="not a text file"):
+    with pytest.raises(hj.errors.FileFormatError, match="not a text file"):
         hj.read_recording(tmp_path / "b.csv")
     with pytest.raises(hj.DefinitionError, match="no file to read"):
         hj.read_recording()

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.cli import main
-from hybridjax.recordings.spoil import spoil
+from hybridjax.apps.cli import main
+from hybridjax.testing.dirt import spoil
 
 from .conftest import MULTIPLIER
 
 
-CIRCLE = hj.AnglePhase("x", "v", center=(0, 0), scale=(1, 1))
+CIRCLE = hj.recordings.AnglePhase("x", "v", center=(0, 0), scale=(1, 1))
 
 
 def sample(recording, phase=CIRCLE, **options):
     options = {"inputs": "f", "outputs": ("x", "v"), "sections": 8} | options
-    return hj.section_data(recording, phase, **options)
+    return hj.recordings.section_data(recording, phase, **options)
 
 
 def test_a_circle(wave):
@@ -57,8 +57,8 @@ def test_slow_drift_is_taken_out(wave):
     drifting = dict(zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True))
     recording = hj.Recording(t, drifting)
     assert sample(recording).rms()[1][0] > 0.1
-    rough = hj.estimate_phase(recording, CIRCLE)
-    flat = hj.without_drift(recording, rough, ("f", "x", "v"), 4)
+    rough = hj.recordings.estimate_phase(recording, CIRCLE)
+    flat = hj.recordings.without_drift(recording, rough, ("f", "x", "v"), 4)
     assert sample(flat).rms()[1][0] < 0.02
     assert sample(flat).records[0].drift == np.inf and sample(flat, drift=9).records[0].drift == 9
     for phase, cycles, message in [
@@ -66,7 +66,7 @@ def test_slow_drift_is_taken_out(wave):
         (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.without_drift(wave, phase, "x", cycles)
+            hj.recordings.without_drift(wave, phase, "x", cycles)
 
 
 def test_times_of_crossings(wave):
@@ -86,18 +86,18 @@ def test_bad_arguments(wave):
 
 
 def test_designs_as_tables(tmp_path, wave):
-    design = hj.multisine(sections=8, periods=16, f_max=2.0)
-    hj.write_design(tmp_path / "phase.csv", design, cycles=19)
-    table = hj.read_design(tmp_path / "phase.csv")
+    design = hj.multisine(n_sections=8, periods=16, f_max=2.0)
+    hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
+    table = hj.recordings.read_design(tmp_path / "phase.csv")
     np.testing.assert_allclose(table["u"], design.inputs(19)[:, :, 0], atol=1e-9)
-    hj.write_design(tmp_path / "time.csv", design, period=0.5, rate=160)
-    with pytest.raises(hj.FileFormatError, match="no table by phase"):
-        hj.read_design(tmp_path / "time.csv")
+    hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5, rate=160)
+    with pytest.raises(hj.errors.FileFormatError, match="no table by phase"):
+        hj.recordings.read_design(tmp_path / "time.csv")
     with pytest.raises(hj.DefinitionError, match="both the period and the rate"):
-        hj.write_design(tmp_path / "time.csv", design, period=0.5)
+        hj.recordings.write_design(tmp_path / "time.csv", design, period=0.5)
     # Applied at the phases of the recording, and found again in its section data.
-    phase = hj.estimate_phase(wave, CIRCLE)
-    told = hj.add_command(wave, phase, {"u": table["u"][:1]}, 8)
+    phase = hj.recordings.estimate_phase(wave, CIRCLE)
+    told = hj.recordings.add_command(wave, phase, {"u": table["u"][:1]}, 8)
     data = sample(told, phase, inputs="u", sampled="middle")
     u = data.records[0].u[:, 0] + data.cycle_inputs[:, 0][
         (data.records[0].start + np.arange(len(data.records[0].u))) % 8
@@ -105,9 +105,9 @@ def test_designs_as_tables(tmp_path, wave):
     first = -data.records[0].start % 8
     np.testing.assert_allclose(u[first : first + 150], table["u"][0, :150], atol=1e-9)
     with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):
-        hj.add_command(wave, phase, table, 8)
+        hj.recordings.add_command(wave, phase, table, 8)
     experiments = data.experiments(periods=16)
-    assert experiments.u.shape[1] % 8 == 0 and experiments.sections == 8
+    assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
 
 
 @pytest.fixture(scope="module")

@@ -153,7 +153,7 @@ def test_states_that_a_chart_does_not_carry_have_values_there():
 def test_single_precision_is_refused():
     with jax.enable_x64(False):
         early = hj.models.VerticalHopper()
-        with pytest.raises(hj.PrecisionError, match="enable_x64"):
+        with pytest.raises(hj.errors.PrecisionError, match="enable_x64"):
             hj.simulate(early, "stance", (2.0, 1.9), 1.0)
-    with pytest.raises(hj.PrecisionError, match="`m` is float32"):
+    with pytest.raises(hj.errors.PrecisionError, match="`m` is float32"):
         hj.find_limit_cycle(early)

@@ -1,0 +1,181 @@
+"""What `reproduce` says of its results: numbers, the paper's observations, a table."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from .. import __version__
+from ..orbits.cycle import LimitCycle
+
+
+OUTPUTS = ("yM", "vM")
+
+
+def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> dict:
+    """Every number of the table, ready for JSON."""
+    true = cycle.multipliers
+    summary = {
+        "version": __version__,
+        "protocol": dataclasses.asdict(protocol),
+        "limit_cycle": {
+            "period": float(cycle.period),
+            "residual": float(cycle.residual),
+            "multipliers": _complex(true),
+        },
+        "families": {},
+    }
+    for name, family in families.items():
+        biases = [c.max_error for c in family.rational_exact.compare(true)]
+        errors = family.estimate.harmonic_errors(family.ldtp.htf(family.estimate.f))
+        at = {m: k for k, m in enumerate(family.estimate.harmonics)}
+        summary["families"][name] = {
+            "experiments": family.data.summary(),
+            "multipliers_from_linearisation": _complex(family.ldtp.multipliers()),
+            "multipliers_fit_structured": _complex(family.structured.multipliers),
+            "multipliers_fit_structured_error": family.structured.compare(true).max_error,
+            "multipliers_fit_2p1z": {
+                output: {
+                    "form": f"{family.rational.form}, {family.rational.weighting} weights",
+                    "multipliers": _complex(family.rational.multipliers[k]),
+                    "error": family.rational.compare(true)[k].max_error,
+                    "error_of_the_same_fit_to_the_exact_htf": biases[k],
+                    "poles": _complex(family.rational.poles[k]),
+                    "zeros": _complex(family.rational.zeros[k]),
+                }
+                for k, output in enumerate(OUTPUTS)
+            },
+            "htf_error_of_max_H_0": {
+                output: {f"H_{m}": float(errors[at[m], k]) for m in (-2, -1, 0, 1, 2) if m in at}
+                for k, output in enumerate(OUTPUTS)
+            },
+            "largest_htf_error_of_max_H_0": {
+                output: float(np.max(errors[:, k])) for k, output in enumerate(OUTPUTS)
+            },
+        }
+    summary["observations"] = _observations(families)
+    return summary
+
+
+def _observations(families: Mapping[str, Any]) -> list[dict]:
+    """The paper's observations (Secs. VI-C1 to C3), each with what is measured here."""
+    found = []
+
+    def note(claim, holds, measured):
+        found.append({"claim": claim, "holds": bool(holds), "measured": measured})
+
+    def top(family, m):
+        return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
+
+    if len(families) == 2:
+        iso, kin = families["isochron"], families["kinematic"]
+        ratio = top(iso, 0) / top(kin, 0)
+        note(
+            "the gain of H_0 is doubled with isochrons",
+            np.all((ratio > 1.6) & (ratio < 2.5)),
+            f"max|H_0| isochron / kinematic: {_pairs(ratio)}",
+        )
+        a, b = iso.rational, kin.rational
+        moved = np.max(np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles)), axis=1)
+        note(
+            "the choice of phase leaves the poles where they are",
+            np.all(moved < 1e-3),
+            f"distance of the fitted poles in z: {_pairs(moved)}",
+        )
+        moved = np.max(np.abs(a.zeros - b.zeros), axis=1)
+        note(
+            "the choice of phase moves the zeros",
+            np.any(moved > 1e-2),
+            f"distance of the fitted zeros in z: {_pairs(moved)}",
+        )
+    for name, family in families.items():
+        f = np.asarray(family.exact.f)
+        size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
+        peaks = [f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))]
+        peaks = [p[(p > 1.5) & (p < 2.5)] for p in peaks]
+        places = [", ".join(f"{x:.3g}" for x in p) or "none" for p in peaks]
+        note(
+            f"{name}: bumps of H_0 around f = 2",
+            any(len(p) for p in peaks),
+            "local maxima of |H_0| for f in (1.5, 2.5): "
+            + "; ".join(
+                f"{where} ({output})" for output, where in zip(OUTPUTS, places, strict=True)
+            ),
+        )
+        power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
+        order = np.abs(np.array(family.estimate.harmonics))
+        within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
+        second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)
+        note(
+            f"{name}: |H_m| is negligible for |m| >= 2",
+            np.all(second < 0.1),
+            f"max|H_+-2| / max|H_0|: {_pairs(second)}; share of the energy "
+            f"in |m| <= 1: {_pairs(within[0])}, in |m| <= 2: {_pairs(within[1])}",
+        )
+        close = [c.max_error for c in family.rational.compare(family.ldtp.multipliers())]
+        note(
+            f"{name}: eigenvalues from the fits are right up to the third significant digit",
+            max(close) < 5e-3,
+            f"|error|: {_pairs(close)} (form {family.rational.form}, "
+            f"{family.rational.weighting} weights)",
+        )
+    exact = next(iter(families.values())).ldtp.multipliers()
+    note(
+        "the multipliers are 0.25 +- 0.70i",
+        np.all(np.abs(exact - (0.25 + np.array([0.7j, -0.7j]))) < 1e-2) if len(exact) == 2 else 0,
+        f"{', '.join(f'{z:.6f}' for z in exact)}: with the paper's parameters the real part is "
+        "negative, the printed sign was lost",
+    )
+    return found
+
+
+def table(summary: dict) -> str:
+    """The summary as text."""
+    true = [_number(z) for z in summary["limit_cycle"]["multipliers"]]
+    rows = ["", "Floquet multipliers", f"  {'':38}{'lambda':>28}  |error|"]
+
+    def row(label, z, error):
+        rows.append(f"  {label:38}{z:>28.9f}  {error:.1e}")
+
+    def nearest(values):
+        return min(values, key=lambda z: abs(z - true[0]))
+
+    rows.append(f"  {'Jacobian of the return map':38}{true[0]:>28.9f}")
+    for name, family in summary["families"].items():
+        z = nearest(_number(v) for v in family["multipliers_from_linearisation"])
+        row(f"product of A[n], {name}", z, abs(z - true[0]))
+        for output, fit in family["multipliers_fit_2p1z"].items():
+            z = nearest(_number(v) for v in fit["multipliers"])
+            row(f"2 poles 1 zero, {name}, {output}", z, fit["error"])
+            bias = fit["error_of_the_same_fit_to_the_exact_htf"]
+            rows.append(f"  {'    the same fit to the exact H_0':38}{'':28}  {bias:.1e}")
+        z = nearest(_number(v) for v in family["multipliers_fit_structured"])
+        row(f"structured, {name}", z, family["multipliers_fit_structured_error"])
+    rows += ["", "Largest error of the estimated HTF, relative to max|H_0| of the output"]
+    for name, family in summary["families"].items():
+        for output, errors in family["htf_error_of_max_H_0"].items():
+            rows.append(
+                f"  {name:10} {output:4} " + "  ".join(f"{m}: {e:.1e}" for m, e in errors.items())
+            )
+    rows += ["", "Observations of the paper"]
+    for item in summary["observations"]:
+        rows.append(f"  [{'yes' if item['holds'] else 'no ':3}] {item['claim']}")
+        rows.append(f"        {item['measured']}")
+    seconds = summary["seconds"]
+    slow = ", ".join(f"{k} {v:.1f}" for k, v in seconds.items() if k != "total" and v > 0.5)
+    rows += ["", f"Time: {seconds['total']:.1f} s ({slow})", ""]
+    return "\n".join(rows)
+
+
+def _complex(values) -> list[list[float]]:
+    return [[float(z.real), float(z.imag)] for z in np.asarray(values).ravel()]
+
+
+def _number(pair) -> complex:
+    return complex(*pair)
+
+
+def _pairs(values) -> str:
+    return ", ".join(f"{v:.3g} ({name})" for name, v in zip(OUTPUTS, values, strict=True))

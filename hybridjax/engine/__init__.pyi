@@ -1,0 +1,1 @@
+from .trajectory import Event as Event

@@ -1,0 +1,73 @@
+"""Where a piece of flow ends: at a time, at the zero of a level function, or at an event."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._core.per_lane import PerLane
+from .._core.results import Result
+from ..systems.structure import Structure
+
+
+class AbstractLevels(eqx.Module):
+    """Level functions of state-based sections, by section index."""
+
+    @abc.abstractmethod
+    def present(self, s: Structure, a: int) -> bool:
+        """Whether any of the sections can be crossed in chart a."""
+
+    @abc.abstractmethod
+    def level(self, s: Structure, a: int, i, t, q):
+        """Level of section i at a single state of chart a; it falls through zero at the section.
+
+        1 for a section that cannot be crossed in chart a.
+        """
+
+
+class Target(eqx.Module):
+    """The ends of a piece of flow, one per lane. Section and event may be the same for all, as
+    arrays of one."""
+
+    time: Float[Array, " L"]
+    """End at this time; infinity if the end is not at a known time."""
+    index: Int[Array, " #L"]
+    """End at the section of this index, if `levels` is given."""
+    event: Int[Array, " #L"]
+    """End right after the transition of this index; -1 for none."""
+    limit: Float[Array, " L"]
+    """Give up at this time."""
+    order: tuple[int, ...] | None = eqx.field(static=True)
+    """Transitions expected on one turn of the limit cycle, counted from the first event after
+    the start; `None` if any order will do."""
+    levels: AbstractLevels | PerLane | None
+    missed: Result = eqx.field(static=True)
+    """The code of a lane that does not arrive."""
+
+
+def toward(
+    time: Float[Array, " L"],
+    event: int,
+    limit: Float[Array, " L"] | Float[Array, ""],
+    index: int = 0,
+) -> Target:
+    """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
+    level that is filled in later), giving up at `limit`."""
+    L = time.shape[0]
+    later = jnp.nextafter(jax.lax.stop_gradient(time), jnp.inf)
+    return Target(
+        time,
+        jnp.full(L, index, jnp.int32),
+        jnp.full(L, event, jnp.int32),
+        jnp.where(jnp.isfinite(time), later, limit),
+        None,
+        None,
+        Result.SECTION_MISSED,
+    )
+
+
+def until(time: Float[Array, " L"]) -> Target:
+    """The target of lanes that flow to given times."""
+    return toward(time, -1, time)

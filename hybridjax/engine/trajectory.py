@@ -1,0 +1,246 @@
+"""Single trajectories with their events, dense enough to plot."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int
+
+from .._core.compile import quick_jit
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..errors import ComputationError, DefinitionError
+from ..systems.structure import Structure, check_system
+from ..systems.system import Driven, Guess, HybridSystem
+from .events import start_lanes
+from .hermite import interpolate
+from .move import Settings, record
+from .stride import initial_step
+from .tape import IDLE
+from .target import until
+from .watch import slopes
+
+
+# Rows of a tape that is filled in one compiled call.
+_ROWS = 512
+
+
+class Event(NamedTuple):
+    """One event of a trajectory."""
+
+    time: float
+    name: str
+    source: str
+    target: str
+    before: dict[str, float]
+    """State before the reset, by name."""
+    after: dict[str, float]
+    """State after the reset, by name."""
+
+
+class Trajectory(eqx.Module):
+    """A hybrid trajectory: steps, events, and interpolation between steps.
+
+    **Fields:** `t`, the ends of the steps; `chart`, the chart after each; `before` and `after`,
+    the states at each before and after an event's reset; `slope_before`, `slope_after`, their
+    time derivatives; `event`, the transition that fired there or -1; `result`, what became of it.
+    """
+
+    system: HybridSystem
+    t: Float[np.ndarray, " n"]
+    chart: Int[np.ndarray, " n"]
+    before: Float[np.ndarray, "n d"]
+    after: Float[np.ndarray, "n d"]
+    slope_before: Float[np.ndarray, "n d"]
+    slope_after: Float[np.ndarray, "n d"]
+    event: Int[np.ndarray, " n"]
+    result: Result = eqx.field(static=True)
+
+    @property
+    def events(self) -> list[Event]:
+        """The events in order of time."""
+        s = Structure(self.system)
+        found = []
+        for k in np.flatnonzero(self.event >= 0):
+            tr = s.transitions[self.event[k]]
+            a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+            before = dict(zip(s.charts[a].states, self.before[k].tolist(), strict=False))
+            after = dict(zip(s.charts[b].states, self.after[k].tolist(), strict=False))
+            found.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
+        return found
+
+    def dense(self, per_step: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (p,), charts (p,) and states (p, d), with `per_step` points in every step.
+
+        Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
+        the same time.
+        """
+        h = np.diff(self.t)[:, None]
+        x = np.linspace(0.0, 1.0, per_step + 1)[None, :]
+        q0, q1 = self.after[:-1, None], self.before[1:, None]
+        d0, d1 = self.slope_after[:-1, None], self.slope_before[1:, None]
+        q = interpolate(x[..., None], h[..., None], q0, q1, d0, d1)
+        t = self.t[:-1, None] + h * x
+        chart = np.broadcast_to(self.chart[:-1, None], t.shape)
+        keep = np.ones(t.shape, bool)
+        keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
+        return t[keep], chart[keep], q[keep]
+
+    def __call__(self, *names: str, per_step: int = 8) -> tuple[np.ndarray, ...]:
+        """Times and the named states or outputs (at zero input), dense enough to plot.
+
+        Values are NaN in charts where they are not defined.
+        """
+        t, chart, q = self.dense(per_step)
+        return (t, *_evaluate(self.system, names, t, chart, q))
+
+
+def simulate(
+    system: HybridSystem,
+    chart: str,
+    state: ArrayLike | Sequence[ArrayLike],
+    duration: ArrayLike,
+    *,
+    time: ArrayLike = 0.0,
+    input: Callable[[Any], Any] | ArrayLike | Sequence[ArrayLike] | None = None,
+    settings: Settings | None = None,
+    max_steps: int = 100_000,
+    throw: bool = True,
+) -> Trajectory:
+    """Follow one trajectory through any number of events.
+
+    **Arguments:**
+
+    - `chart`, `state`, `time`: where it starts. A guard that is zero there is not an event.
+    - `duration`: how long it lasts, in the system's unit of time.
+    - `input`: a constant input (nu,), or a function of time that returns one. Zero by default.
+    - `max_steps`: bound on the number of steps, rounded up to a multiple of 512.
+    - `throw`: raise if the trajectory ends early; otherwise its `result` says why it did.
+
+    **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
+    and the step limit, if `throw`.
+    """
+    require_x64(system)
+    check_system(system)
+    s = Structure(system)
+    a = s.chart_index(chart)
+    start = Guess(chart, state, time)
+    if start.state.shape != (s.dims[a],):
+        raise DefinitionError(
+            f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
+            f"shape ({s.dims[a]},); it has {start.state.shape}."
+        )
+    if not np.all(np.isfinite(start.state)) or not np.isfinite(start.time):
+        raise DefinitionError(f"the start of a trajectory must be finite; got {start.state}.")
+    if not (np.isfinite(duration) and duration > 0):
+        raise DefinitionError(f"the duration must be positive and finite; got {duration}.")
+    settings = Settings() if settings is None else settings
+    u = jnp.asarray(_constant_input(s, input), float)[:, None]
+    if callable(input):
+        system = Driven(system, input)
+
+    end = start.time + duration
+    span = jnp.asarray(duration, float)
+    lanes, h = _start(system, start.time[None], a, start.state, u, span, settings)
+    rows = [(lanes.t, lanes.q, lanes.q, lanes.chart, jnp.full(1, -1))]
+    steps = 0
+    while True:
+        moved, tape = _piece(system, lanes, u, end, settings, h)
+        tape = jax.tree_util.tree_map(np.asarray, tape)
+        used = tape.code[:, 0] != IDLE
+        rows.append(
+            (tape.t[used], tape.before[used, :, 0].T, tape.after[used, :, 0].T)
+            + (tape.chart[used, 0], tape.code[used, 0])
+        )
+        lanes, h, steps = moved.lanes, moved.h, steps + _ROWS
+        result = Result(int(moved.result[0]))
+        if result != Result.STEP_LIMIT or steps >= max_steps:
+            break
+    t, before, after, charts, event = (
+        np.concatenate([np.asarray(x[k]).reshape(shape) for x in rows], axis=-1)
+        for k, shape in ((0, -1), (1, (s.d, -1)), (2, (s.d, -1)), (3, -1), (4, -1))
+    )
+    source = np.concatenate([charts[:1], charts[:-1]])
+    trajectory = Trajectory(
+        system,
+        t,
+        charts,
+        before.T,
+        after.T,
+        _slopes(system, t, source, before, u).T,
+        _slopes(system, t, charts, after, u).T,
+        event,
+        result,
+    )
+    if throw and result != Result.OK:
+        raise ComputationError(
+            f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "
+            f"{result.message}. Use `throw=False` to look at it."
+        )
+    return trajectory
+
+
+def _constant_input(s: Structure, input) -> np.ndarray:
+    """The constant part of an input, after a look at its shape; zero for a function of time."""
+    if callable(input):
+        shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), jnp.zeros(())).shape
+    else:
+        value = np.asarray(0.0 if input is None else input, float)
+        shape = value.shape
+    if shape not in ((), (s.nu,)):
+        raise DefinitionError(
+            f"the input has shape {shape}, but {type(s.system).__name__} has the {s.nu} inputs "
+            f"({', '.join(s.system.inputs)}): give one number for each."
+        )
+    if callable(input):
+        return np.zeros(s.nu)
+    if not np.all(np.isfinite(value)):
+        raise DefinitionError(f"the input must be finite; got {value}.")
+    return np.broadcast_to(value, (s.nu,))
+
+
+@quick_jit
+def _start(system, t, a, state, u, span, settings):
+    s = Structure(system)
+    q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
+    lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q)
+    return lanes, initial_step(s, lanes, u, span[None], settings.rtol)
+
+
+@quick_jit
+def _piece(system, lanes, u, end, settings, h):
+    settings = dataclasses.replace(settings, max_steps=_ROWS)
+    return record(system, lanes, u, until(end[None]), settings, h)
+
+
+def _slopes(system, t, chart, q, u) -> np.ndarray:
+    """Fields at states (d, n). Filled up to whole pieces, so that few lengths are compiled."""
+    n = t.shape[0]
+    t, chart, q = (
+        np.concatenate([x, np.repeat(x[..., -1:], -n % _ROWS, -1)], -1) for x in (t, chart, q)
+    )
+    return np.asarray(_fields(system, t, chart, q, u))[:, :n]
+
+
+@quick_jit
+def _fields(system, t, chart, q, u):
+    s = Structure(system)
+    return slopes(s, t, chart, q, jnp.broadcast_to(u, (s.nu, t.shape[0])))
+
+
+def _evaluate(system, names, t, chart, q):
+    """Outputs (p,) each at points of trajectories, NaN where not defined."""
+    s = Structure(system)
+    outputs = s.resolve_outputs(names)
+    values = np.full((len(names), t.shape[0]), np.nan)
+    for a in range(len(s.charts)):
+        here = chart == a
+        if here.any():
+            z = jax.vmap(lambda t, q, a=a: outputs(a, t, q, jnp.zeros(s.nu)))
+            values[:, here] = z(t[here], q[here, : s.dims[a]]).T
+    return values

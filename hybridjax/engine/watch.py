@@ -1,0 +1,158 @@
+"""The functions whose zeros end a move: guards, and the level function of the target section."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.per_lane import shared
+from ..systems.structure import Structure
+from .lanes import for_each_chart, only
+from .solver.step import LaneField, short_step
+from .target import Target
+
+
+class Watch(NamedTuple):
+    """Watched functions at a point, signed so that they fall at their event: one row for each
+    transition, and a last one for the target's level. Rows that mean nothing in a lane's chart
+    have value 1 and rate 0."""
+
+    value: Float[Array, "W L"]
+    rate: Float[Array, "W L"]
+
+
+def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
+    """Field of chart a over lanes."""
+    field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u), name=("field", a))
+    return lambda t, q: field(t, q, u)
+
+
+def slopes(s: Structure, t, chart, q, u) -> Float[Array, "d L"]:
+    """The field at every lane."""
+
+    def work(a, here, out):
+        n = s.dims[a]
+        f = chart_field(s, a, only(here, u))(only(here, t), only(here, q[:n]))
+        return out.at[:n].set(jnp.where(here, f, out[:n]))
+
+    return for_each_chart(s, chart, jnp.ones(t.shape, bool), work, jnp.zeros_like(q))
+
+
+def watched(s: Structure, a: int, target: Target) -> list[int]:
+    """Rows of the watched functions of chart a: its guards, and the target's level."""
+    level = target.levels is not None and shared(target.levels).present(s, a)
+    return s.guards(a) + [len(s.transitions)] * level
+
+
+def values(s: Structure, a: int, target: Target, t, q, u, index, f) -> Watch:
+    """Chart a's watched functions over lanes, in the order of `watched`; f is the field there."""
+
+    guards = s.guards(a)
+    level = len(watched(s, a, target)) > len(guards)
+
+    def one(s, levels, t, q, u, i, f):
+        def all_of_them(t, q):
+            rows = [s.guard(g, t, q, u) for g in guards]
+            return jnp.stack(rows + ([levels.level(s, a, i, t, q)] if level else []))
+
+        return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
+
+    return Watch(*s.by_lane(one, target.levels, name=("watch", a))(t, q, u, index, f))
+
+
+def watch(
+    s: Structure,
+    t: Float[Array, " L"],
+    chart: Int[Array, " L"],
+    q: Float[Array, "d L"],
+    u: Float[Array, "nu L"],
+    target: Target,
+    mask: Bool[Array, " L"],
+) -> Watch:
+    """All watched functions at the lanes of `mask`."""
+
+    def work(a, here, out):
+        rows = watched(s, a, target)
+        if not rows:
+            return out
+        n = s.dims[a]
+        point = only(here, t), only(here, q[:n])
+        uu, index = only(here, u), only(here, target.index)
+        f = chart_field(s, a, uu)(*point)
+        return write(out, rows, here, values(s, a, target, *point, uu, index, f))
+
+    return for_each_chart(s, chart, mask, work, nothing(s, t.shape[0]))
+
+
+def nothing(s: Structure, L: int) -> Watch:
+    """A `Watch` whose rows mean nothing."""
+    shape = (len(s.transitions) + 1, L)
+    return Watch(jnp.ones(shape), jnp.zeros(shape))
+
+
+def take(seen: Watch, rows: list[int]) -> Watch:
+    """Some rows of a `Watch`."""
+    return Watch(*(jnp.stack([x[row] for row in rows]) for x in seen))
+
+
+def write(out: Watch, rows: list[int], here: Bool[Array, " L"], new: Watch) -> Watch:
+    """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
+    place = {row: k for k, row in enumerate(rows)}
+    return Watch(
+        *(
+            jnp.stack(
+                [jnp.where(here, y[place[r]], x[r]) if r in place else x[r] for r in range(len(x))]
+            )
+            for x, y in zip(out, new, strict=True)
+        )
+    )
+
+
+def pick(x: Float[Array, "R L"], rows: Sequence[int], which: Int[Array, " L"]):
+    """Each lane's entry in the row of its function `which`; 0 where that is not among `rows`.
+
+    (A chain of selections: unlike a sum or a gather, XLA computes it together with its users.)
+    """
+    out = jnp.zeros_like(x[0])
+    for k, row in enumerate(rows):
+        out = jnp.where(which == row, x[k], out)
+    return out
+
+
+class Settled(NamedTuple):
+    """Lanes moved onto the zero of the function that they cross."""
+
+    past: Float[Array, " L"]
+    """Time from the start to the zero."""
+    q: Float[Array, "n L"]
+    f: Float[Array, "n L"]
+    """The field there."""
+    last: Float[Array, " L"]
+    """The part of `past` that the second of two corrections added."""
+    error: Float[Array, "n L"]
+    """A bound on the error of the first correction: the distance between two methods."""
+
+
+def settle(s: Structure, a: int, target: Target, t, q, f, u, index, which, first=None) -> Settled:
+    """Two corrections onto the zero of watched function `which` (-1: stay), in chart a.
+
+    f is the field at (t, q). The first correction is a short step of known length, or if `first`
+    is not given, of Newton's; the second is a Newton step. From the crossing itself (up to
+    rounding) they change nothing, but carry the derivatives of the crossing's time and state
+    exactly, to second order: this is the saltation formula.
+    """
+    field = chart_field(s, a, u)
+    rows = watched(s, a, target)
+
+    def newton(t, q, f):
+        value, rate = values(s, a, target, t, q, u, index, f)
+        value, rate = pick(value, rows, which), pick(rate, rows, which)
+        return -value / jnp.where(rate == 0, 1.0, rate)
+
+    first = newton(t, q, f) if first is None else first
+    q, error = short_step(field, t, q, f, first)
+    f = field(t + first, q)
+    last = newton(t + first, q, f)
+    return Settled(first + last, q + last * f, f, last, error)

@@ -1,0 +1,349 @@
+"""Multisine designs: which cosines, with which phases, in which experiment."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..._core.arguments import names
+from ...errors import DefinitionError
+from .partition import check_sharing, is_real, meets_itself, regular
+
+
+Number = int | float
+Numbers = Sequence[Number] | np.ndarray
+
+
+class Design(eqx.Module):
+    """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
+
+    Experiment s applies, at section n counted from its start,
+    `u[n] = sum_k a_k cos(2 pi j_k n / (N P) + phi_k)` over its own cosines k, so that
+    `f_k = j_k / P` is in cycles per period of the limit cycle and all signals repeat after P
+    periods. The amplitude is `a` (the paper divides it by pi). Every design that exists obeys
+    the rules of Sec. V (see `check`); the functions `multisine`, `paper_design` and
+    `single_cosine` make the usual ones, `Design.from_lines` any other.
+
+    **Fields:** one entry per cosine in the flat arrays, all on the host.
+
+    - `experiment`: the experiment it belongs to, 0..experiments-1, ascending.
+    - `line`: j, so that f = j / periods.
+    - `channel`: index of the input it is applied to.
+    - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
+    - `n_sections`: N. `periods`: P. `experiments`: their number S. `input_names`.
+    - `highest_harmonic`: M, beyond which harmonics are taken as zero, or None for no assumption.
+    """
+
+    experiment: Int[np.ndarray, " K"]
+    line: Int[np.ndarray, " K"]
+    channel: Int[np.ndarray, " K"]
+    amplitude: Float[np.ndarray, " K"]
+    phase: Float[np.ndarray, " K"]
+    n_sections: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    experiments: int = eqx.field(static=True)
+    input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
+    highest_harmonic: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        self.check()
+
+    @classmethod
+    def from_lines(
+        cls,
+        frequencies: Sequence[Numbers],
+        amplitudes: Number | Sequence[Numbers] = 0.01,
+        phases: Number | Sequence[Numbers] = 0.0,
+        *,
+        n_sections: int = 32,
+        periods: int = 64,
+        channels: int | Sequence[Sequence[int] | np.ndarray] = 0,
+        inputs: int | str | Sequence[str] = 1,
+    ) -> "Design":
+        """A design from your own cosines.
+
+        **Arguments:**
+
+        - `frequencies`: for each experiment, its frequencies in cycles per period.
+        - `amplitudes`, `phases` (rad), `channels` (index of the input): one number for all
+          cosines, or for each experiment one number per frequency.
+        - `n_sections`: N. `periods`: P; every frequency must be a multiple of 1/P.
+        - `inputs`: the number of inputs, or their names.
+
+        **Raises:** `DefinitionError` as `check` does, or for lists that do not fit together.
+        """
+        sizes = [np.size(f) for f in frequencies]
+        if len(sizes) == 0 or min(sizes) == 0:
+            raise DefinitionError("every experiment of a design needs at least one frequency.")
+
+        def flat(name, values, dtype):
+            if np.isscalar(values):
+                return np.full(sum(sizes), values, dtype)
+            if [np.size(v) for v in values] != sizes:
+                raise DefinitionError(
+                    f"`{name}` must be one number or have as many entries as `frequencies` in "
+                    f"each of the {len(sizes)} experiments."
+                )
+            return np.concatenate([np.ravel(v) for v in values]).astype(dtype)
+
+        lines = to_lines(flat("frequencies", frequencies, float), periods)
+        experiment = np.repeat(np.arange(len(sizes)), sizes)
+        order = np.lexsort((lines, experiment))
+        return cls(
+            experiment=experiment[order],
+            line=lines[order],
+            channel=flat("channels", channels, int)[order],
+            amplitude=flat("amplitudes", amplitudes, float)[order],
+            phase=flat("phases", phases, float)[order],
+            n_sections=n_sections,
+            periods=periods,
+            experiments=len(sizes),
+            input_names=input_names(inputs),
+        )
+
+    def check(self) -> None:
+        """Check the rules under which the HTFs follow from the experiments uniquely (Sec. V).
+
+        - every f lies in [0, N/2], amplitudes are positive, phases finite;
+        - in one experiment no two frequencies differ by, or add up to, an integer (with
+          `highest_harmonic` M: an integer up to 2 M, counted around the circle of N);
+        - a frequency that excites several inputs together does so in as many experiments, with
+          phases that tell them apart;
+        - a frequency on a multiple of 1/2 (eq. 16) is excited in two experiments at least, with
+          different phases; 0 and N/2 need only one phase, but not one with cos(phase) = 0.
+
+        **Raises:** `DefinitionError` that names the experiment and the frequencies.
+        """
+        P, N = self.periods, self.n_sections
+        if N < 1 or P < 1:
+            raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
+        empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
+        if len(empty) or len(self.experiment) == 0:
+            raise DefinitionError("every experiment of a design needs at least one frequency.")
+        self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
+        good = np.isfinite(self.amplitude) & (self.amplitude > 0)
+        self._refuse(~good, "has an amplitude that is not a positive number")
+        self._refuse(~np.isfinite(self.phase), "has a phase that is not finite")
+        nu = len(self.input_names)
+        outside = (self.channel < 0) | (self.channel >= nu)
+        self._refuse(outside, f"is applied to an input that is not one of the {nu}")
+        highest = None if self.highest_harmonic is None else 2 * self.highest_harmonic
+        # Several inputs may share a line, but none may have it twice.
+        entry = np.stack([self.experiment, self.line, self.channel], axis=1)
+        _, again = np.unique(entry, axis=0, return_counts=True)
+        if (again > 1).any():
+            check_sharing(self.experiment, self.line, P)
+        pair = np.unique(entry[:, :2], axis=0)
+        check_sharing(pair[:, 0], pair[:, 1], P, n_sections=N, highest=highest)
+        self._check_together(len(pair))
+
+        u = self.amplitude * np.exp(1j * self.phase)
+        _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
+        power, square = np.bincount(group, np.abs(u) ** 2), u**2
+        alike = np.hypot(np.bincount(group, square.real), np.bincount(group, square.imag)) / power
+        self._refuse(
+            (meets_itself(self.line, P, N, highest) & (alike > 1 - 1e-6)[group]),
+            "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
+            "experiments with phases 90 degrees apart (half_integers='two-phase' does so), or "
+            "leave it out (half_integers='skip')",
+        )
+        self._refuse(
+            is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < 1e-3),
+            "is zero at every section with this phase: give it the phase 0",
+        )
+
+    def _check_together(self, pairs: int) -> None:
+        """Lines that excite several inputs in one experiment: whether these can be told apart."""
+        if pairs == len(self.line):
+            return
+        nu = len(self.input_names)
+        lines, place = np.unique(self.line, return_inverse=True)
+        U = np.zeros((len(lines), self.experiments, nu), complex)
+        U[place, self.experiment, self.channel] = self.amplitude * np.exp(1j * self.phase)
+        gram = np.einsum("kei,kej->kij", U.conj(), U)
+        self._refuse(
+            ~regular(gram)[place] & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
+            "excites several inputs together, and its experiments cannot tell them apart: excite "
+            "it in as many experiments as inputs, with turned phases (excite='orthogonal')",
+        )
+
+    def _refuse(self, wrong: np.ndarray, reason: str) -> None:
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            f = self.line[first] / self.periods
+            raise DefinitionError(f"experiment {self.experiment[first]}: f = {f:.10g} {reason}.")
+
+    @property
+    def f(self) -> Float[np.ndarray, " K"]:
+        """Frequency of each cosine, cycles per period."""
+        return self.line / self.periods
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, " F"]:
+        """All frequencies that the design measures, ascending, each once."""
+        return np.unique(self.line) / self.periods
+
+    def inputs(
+        self, cycles: int | None = None, experiments: slice | None = None
+    ) -> Float[np.ndarray, "S n nu"]:
+        """The signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
+
+        They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
+        have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
+        (which is why estimates divide by the spectrum of the window itself).
+
+        **Arguments:** `experiments`, consecutive ones, e.g. `slice(0, 100)`; by default all.
+        """
+        cycles = self.periods if cycles is None else cycles
+        if cycles < 1:
+            raise DefinitionError(f"cycles must be at least 1, not {cycles}.")
+        first, last, step = (experiments or slice(None)).indices(self.experiments)
+        if step != 1 or last <= first:
+            raise DefinitionError(f"{experiments} holds no consecutive experiments.")
+        some = slice(*np.searchsorted(self.experiment, (first, last)))
+        experiment, line, channel = self.experiment[some], self.line[some], self.channel[some]
+        length = self.n_sections * self.periods
+        spectrum = np.zeros((last - first, length // 2 + 1, len(self.input_names)), complex)
+        value = 0.5 * length * self.amplitude[some] * np.exp(1j * self.phase[some])
+        value = np.where(is_real(line, self.periods, self.n_sections), 2 * value.real, value)
+        spectrum[experiment - first, line, channel] = value
+        one = np.fft.irfft(spectrum, n=length, axis=1)
+        index = np.arange(cycles * self.n_sections) % length
+        return one[:, index]
+
+    def scaled(self, rms: Number) -> "Design":
+        """The same with amplitudes multiplied so that every signal has this rms value.
+
+        Each experiment and input by itself, over one window; the proportions within stay.
+        """
+        if not rms > 0:
+            raise DefinitionError(f"rms must be a positive number, not {rms}.")
+        now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
+        return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
+
+    def realizations(self, count: int, seed: int = 0) -> "Design":
+        """The design `count` times over, each time with new random phases.
+
+        Their responses scatter by noise and by distortion, so that the variance of an estimate can
+        be told. Cosines of one line and input turn by the same random angle in all experiments of
+        a realization, which keeps differences of 90 degrees and orthogonal experiments as they are.
+
+        **Returns:** a design with `count` times the experiments, one realization after the other.
+        """
+        if count < 1:
+            raise DefinitionError(f"count is the number of realizations, not {count}.")
+        rng = np.random.default_rng(seed)
+        pair = self.line * len(self.input_names) + self.channel
+        pairs, place = np.unique(pair, return_inverse=True)
+        turns = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
+        real = is_real(pairs // len(self.input_names), self.periods, self.n_sections)
+        turns = np.where(real, np.pi * (turns > np.pi), turns)
+        phase = (self.phase + turns[:, place]) % (2 * np.pi)
+        shift = np.arange(count)[:, None] * self.experiments
+        return self._times(count, phase, self.experiment + shift)
+
+    def with_negatives(self) -> "Design":
+        """Every experiment followed by the same with the sign changed.
+
+        In half the difference of their responses (`odd_part`) all even-order distortion cancels.
+        """
+        phase = np.stack([self.phase, (self.phase + np.pi) % (2 * np.pi)])
+        return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))
+
+    def _times(self, count: int, phase, experiment) -> "Design":
+        """The cosines repeated, with other phases, in other experiments."""
+        phase, experiment = phase.ravel(), experiment.ravel()
+        order = np.lexsort((np.tile(self.line, count), experiment))
+        each = {
+            n: np.tile(getattr(self, n), count)[order] for n in ("line", "channel", "amplitude")
+        }
+        return dataclasses.replace(
+            self,
+            experiment=experiment[order],
+            phase=phase[order],
+            experiments=count * self.experiments,
+            **each,
+        )
+
+    def expected_variance(self, noise: Number = 1.0, repeats: int = 1) -> Float[np.ndarray, "F nu"]:
+        """The variance of every H_m at `frequencies` under white noise of this std on the output.
+
+        `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
+        """
+        lines, place = np.unique(self.line, return_inverse=True)
+        power = np.zeros((len(lines), len(self.input_names)))
+        real = np.where(
+            is_real(self.line, self.periods, self.n_sections), 2 * np.cos(self.phase), 1
+        )
+        np.add.at(power, (place, self.channel), (self.amplitude * real) ** 2)
+        samples = self.n_sections * self.periods * repeats
+        with np.errstate(divide="ignore"):
+            return 4 * noise**2 / (samples * power)
+
+    def cycles(self, discard: int = 20) -> int:
+        """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
+        return self.experiments * (self.periods + discard)
+
+    def crest_factors(self) -> Float[np.ndarray, " S"]:
+        """max |u| / rms(u) in each experiment (over its inputs, the largest)."""
+        u = self.inputs()
+        rms = np.sqrt(np.mean(u**2, axis=1))
+        peak = np.abs(u).max(axis=1)
+        return np.max(np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1)
+
+    def __repr__(self) -> str:
+        f, sizes = self.frequencies, np.bincount(self.experiment)
+        crest, per = self.crest_factors(), self.expected_variance()
+        per, M = per[np.isfinite(per)], self.highest_harmonic
+        rows = [
+            f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
+            f"{self.n_sections} sections, inputs {', '.join(self.input_names)})",
+            f"  frequencies  {len(f)}, {_span(f)} cycles per period in steps of 1/{self.periods}",
+            f"  each         {_count(_span(sizes), 'cosine')} of amplitude {_span(self.amplitude)}"
+            f", crest factor {_span(crest)}",
+            f"  cost         {self.cycles(0)} cycles, without those discarded",
+            f"  noise        of std s in an output gives H_m a std of {_span(np.sqrt(per))} s",
+        ]
+        if M is not None:
+            rows.append(f"  assumes      H_m = 0 for |m| > {M}")
+        return "\n".join(rows)
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = f"{float(np.min(values)):.4g}", f"{float(np.max(values)):.4g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _count(number: int | str, noun: str) -> str:
+    return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
+
+
+def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """Frequencies as integers j with f = j / periods.
+
+    **Raises:** `DefinitionError` for a frequency that is not a multiple of 1/periods.
+    """
+    if periods < 1:
+        raise DefinitionError(f"periods must be at least 1, not {periods}.")
+    exact = np.asarray(frequencies, float) * periods
+    lines = np.rint(exact)
+    wrong = ~(np.abs(exact - lines) < 1e-6)
+    if wrong.any():
+        f = float(np.asarray(frequencies)[np.argmax(wrong)])
+        raise DefinitionError(
+            f"f = {f:.10g} is not a multiple of 1/{periods}, so its cosine does not fit into "
+            f"periods = {periods}; move it or choose another number of periods."
+        )
+    return lines.astype(int)
+
+
+def input_names(inputs: int | str | Sequence[str]) -> tuple[str, ...]:
+    """Names from names, or from a number: `u`, or `u0`, `u1`, ..."""
+    if isinstance(inputs, int):
+        if inputs < 1:
+            raise DefinitionError(f"a design needs at least one input, not {inputs}.")
+        return names("inputs", None, inputs)
+    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    return names("inputs", inputs, len(inputs))

@@ -1,0 +1,274 @@
+"""Which cosines may share an experiment, and how few experiments suffice.
+
+A cosine at the frequency `f` (cycles per period) makes a periodic system of N sections answer at
+`f + l` and, through its negative half, at `-f + l` for all integers l. So (Ankarali & Cowan,
+Sec. V-B) two cosines may share an experiment unless their difference or their sum is an integer.
+On the grid `f = j / P` that is one comparison: with `r = j mod P`, the *class* of a line is
+`min(r, P - r)`, and two lines disturb each other exactly if their classes are equal.
+Lines of one class need one experiment each, lines of different classes never meet; so the size
+of the largest class is the exact minimum of experiments, and every greater number works too.
+
+Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Complex, Int
+
+from ...errors import DefinitionError
+
+
+def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """`min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between two."""
+    rest = line % periods
+    return np.minimum(rest, periods - rest)
+
+
+def is_half_integer(line: Int[np.ndarray, " K"], periods: int) -> Bool[np.ndarray, " K"]:
+    """Whether f is a multiple of 1/2: the cosine then meets its own mirror image (eq. 16)."""
+    return (2 * line) % periods == 0
+
+
+def is_real(line: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Bool[np.ndarray, " K"]:
+    """Whether f is 0 or N/2, where `cos(w n + phi)` is a real factor times a fixed sequence."""
+    return (line == 0) | (2 * line == n_sections * periods)
+
+
+def needs_two_phases(
+    line: Int[np.ndarray, " K"], periods: int, n_sections: int
+) -> Bool[np.ndarray, " K"]:
+    """Multiples of 1/2 other than 0 and N/2: identified from two phases only."""
+    return is_half_integer(line, periods) & ~is_real(line, periods, n_sections)
+
+
+def meets_itself(
+    line: Int[np.ndarray, " K"], periods: int, n_sections: int, highest: int | None = None
+) -> Bool[np.ndarray, " K"]:
+    """Lines that need two phases, where harmonics beyond `highest` are taken as zero."""
+    meets = needs_two_phases(line, periods, n_sections)
+    if highest is not None:
+        meets &= _around(2 * line, periods, n_sections) <= highest
+    return meets
+
+
+def _around(lines: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Int[np.ndarray, " K"]:
+    """The harmonic that leads over this distance: in periods, around the circle of N."""
+    turns = (lines // periods) % n_sections
+    return np.minimum(turns, n_sections - turns)
+
+
+def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
+    """Whether normal equations can be solved, whatever the sizes of the unknowns."""
+    size = np.sqrt(np.einsum("kii->ki", gram).real)
+    there = size.min(axis=1) > 1e-6 * size.max(axis=1)
+    size = np.where(there[:, None], size, 1.0)
+    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
+    return there & (least > 1e-6)
+
+
+def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
+    """The exact minimum of experiments for these lines (repeated ones count as often)."""
+    return int(np.bincount(line_class(line, periods)).max())
+
+
+def assign(
+    line: Int[np.ndarray, " K"], periods: int, experiments: int, rng: np.random.Generator
+) -> Int[np.ndarray, " K"]:
+    """Random partition that obeys the rules: the experiment, 0..experiments-1, of each line.
+
+    Class after class, in random order, is spread over the experiments that are the least full
+    at that moment (ties at random), so sizes differ by at most one. Needs
+    `experiments >= fewest_experiments(line, periods)`, and then never fails.
+    """
+    classes = line_class(line, periods)
+    load = np.zeros(experiments, int)
+    experiment = np.empty(len(line), int)
+    for c in rng.permutation(np.unique(classes)):
+        members = rng.permutation(np.flatnonzero(classes == c))
+        least_full = np.lexsort((rng.random(experiments), load))[: len(members)]
+        experiment[members] = least_full
+        load[least_full] += 1
+    return experiment
+
+
+def assign_apart(
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    n_sections: int,
+    highest: int,
+    rng: np.random.Generator,
+    experiments: int | None = None,
+) -> Int[np.ndarray, " K"]:
+    """A partition in which no harmonic up to `2 highest` leads from one line to another.
+
+    All lines of a class are integers k apart, if f = c + k and -f = c + k are both brought to the
+    form c + k. Lines with the same remainder of k modulo S share an experiment: then they are S or
+    more apart, also around the circle of N where that is so for the given S. Without `experiments`
+    the smallest such S from `2 highest + 1` on is taken.
+
+    **Raises:** `DefinitionError` for a number of experiments that does not do.
+    """
+    rest = line % periods
+    cell = np.where(2 * rest < periods, line // periods, -(line // periods) - 1)
+    classes = line_class(line, periods)
+    fewest = fewest_experiments(line, periods)
+    least = 2 * highest + 1
+    _, place = np.unique(classes, return_inverse=True)
+    for S in range(least, fewest) if experiments is None else [experiments]:
+        offsets = rng.integers(0, S, place.max() + 1)
+        experiment = (cell + offsets[place]) % S
+        try:
+            check_sharing(experiment, line, periods, n_sections=n_sections, highest=2 * highest)
+        except DefinitionError:
+            continue
+        return experiment
+    if experiments is None or experiments >= fewest:
+        return assign(line, periods, experiments or fewest, rng)
+    raise DefinitionError(
+        f"{experiments} experiments are too few for harmonics up to {highest}: lines of one "
+        f"experiment would be closer than {least} cycles per period (around the circle of N = "
+        f"{n_sections}); take at least {least}, or leave the number open."
+    )
+
+
+def two_adic(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
+    """The power of two that divides j (at most that of P): 0 for odd lines."""
+    power = np.zeros(len(line), int)
+    step = 2
+    while periods % step == 0:
+        power += line % step == 0
+        step *= 2
+    return power
+
+
+def second_order_hits(classes: Int[np.ndarray, " k"], periods: int) -> int:
+    """How often a product of two lines of one experiment falls on a line of the same experiment.
+
+    A quadratic distortion answers two lines of classes a and b at a + b and a - b (plus integers),
+    so it spoils the lines of those classes.
+    """
+    products = _products(periods)
+    return _hits([int(c) for c in classes], products)
+
+
+def avoid_second_order(
+    experiment: Int[np.ndarray, " K"],
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    rng: np.random.Generator,
+    rounds: int = 200_000,
+) -> Int[np.ndarray, " K"]:
+    """The partition after random swaps, such that no second-order product of an experiment falls
+    on one of its own lines. Sizes stay as they are.
+
+    Simulated annealing on the number of `second_order_hits`. For N = 32, P = 64, f up to 10 and
+    80 experiments about 30 000 swaps suffice.
+
+    **Raises:** `DefinitionError` if no such partition was found.
+    """
+    classes = line_class(line, periods).tolist()
+    products = _products(periods)
+    members = [np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)]
+    held = [[classes[i] for i in m] for m in members]
+    hits = [_hits(c, products) for c in held]
+    draws = iter(())
+    for k in range(rounds):
+        if k % 4096 == 0:
+            bad = [e for e, n in enumerate(hits) if n]
+            draws = iter(rng.random((4096, 5)).tolist())
+        if not bad:
+            break
+        x = next(draws)
+        e, f = bad[int(x[0] * len(bad))], int(x[1] * len(members))
+        if hits[e] == 0:
+            bad = [e for e, n in enumerate(hits) if n]
+            continue
+        i, j = int(x[2] * len(members[e])), int(x[3] * len(members[f]))
+        a, b = held[e][i], held[f][j]
+        if e == f or b in held[e] or a in held[f]:
+            continue
+        new_e, new_f = held[e].copy(), held[f].copy()
+        new_e[i], new_f[j] = b, a
+        hits_e, hits_f = _hits(new_e, products), _hits(new_f, products)
+        worse = hits_e + hits_f - hits[e] - hits[f]
+        heat = 0.5 * max(1 - 2 * k / rounds, 0.0) + 1e-3
+        if worse <= 0 or x[4] < np.exp(-worse / heat):
+            members[e][i], members[f][j] = members[f][j], members[e][i]
+            held[e], held[f], hits[e], hits[f] = new_e, new_f, hits_e, hits_f
+            if hits_f and f not in bad:
+                bad.append(f)
+    if any(hits):
+        raise DefinitionError(
+            f"no division into {len(members)} experiments was found in which second-order products "
+            f"miss the lines of their own experiment ({sum(hits)} still hit): take more "
+            "experiments, or second_order='ignore'."
+        )
+    out = np.empty_like(experiment)
+    for e, m in enumerate(members):
+        out[m] = e
+    return out
+
+
+def _products(periods: int) -> list[list[int]]:
+    """For each pair of classes, a bit mask of the classes of its second-order products."""
+    top = periods // 2 + 1
+
+    def fold(x):
+        return min(x % periods, -x % periods)
+
+    return [[(1 << fold(a + b)) | (1 << fold(a - b)) for b in range(top)] for a in range(top)]
+
+
+def _hits(classes: list[int], products: list[list[int]]) -> int:
+    own = 0
+    for c in classes:
+        own |= 1 << c
+    return sum(
+        (products[a][b] & own).bit_count() for i, a in enumerate(classes) for b in classes[i:]
+    )
+
+
+def check_sharing(
+    experiment: Int[np.ndarray, " K"],
+    line: Int[np.ndarray, " K"],
+    periods: int,
+    hint: Callable[[int], str] = lambda experiment: "",
+    n_sections: int = 0,
+    highest: int | None = None,
+) -> None:
+    """Check that no two lines of one experiment have the same class; or, where harmonics beyond
+    `highest` are taken as zero, that no such harmonic leads from one to the other.
+
+    **Raises:** `DefinitionError` that names the experiment and the first pair; the text of
+    `hint(experiment)` is added to it.
+    """
+    classes = line_class(line, periods)
+    order = np.lexsort((line, classes, experiment))
+    e, c, j = experiment[order], classes[order], line[order]
+    for step in range(1, len(e)):
+        same = (e[step:] == e[:-step]) & (c[step:] == c[:-step])
+        if not same.any():
+            return
+        low, high = j[:-step], j[step:]
+        clash = same
+        if highest is not None:
+            apart = np.where((high - low) % periods == 0, high - low, high + low)
+            clash = same & (_around(apart, periods, n_sections) <= highest)
+        if clash.any():
+            first = int(np.argmax(clash))
+            _refuse(int(low[first]), int(high[first]), int(e[first]), periods, hint)
+
+
+def _refuse(low: int, high: int, number: int, periods: int, hint: Callable[[int], str]) -> None:
+    a, b = low / periods, high / periods
+    if low == high:
+        reason = f"f = {a:.10g} is excited twice"
+    elif (high - low) % periods == 0:
+        reason = f"f = {a:.10g} and {b:.10g} differ by an integer"
+    else:
+        reason = f"f = {a:.10g} and {b:.10g} add up to an integer"
+    raise DefinitionError(
+        f"experiment {number}: {reason}, so their responses fall on the same frequencies; "
+        f"move one of them to another experiment{hint(number)}."
+    )

@@ -1,0 +1,82 @@
+"""What may be done to recorded experiments before an estimate: noise added, pairs combined."""
+
+import equinox as eqx
+import numpy as np
+
+from .._core.results import Result
+from ..errors import DefinitionError
+from .data import ExperimentData
+
+
+Number = int | float
+
+
+def add_noise(
+    data: ExperimentData,
+    *,
+    std: Number | np.ndarray | None = None,
+    snr: Number | None = None,
+    seed: int = 0,
+) -> ExperimentData:
+    """White measurement noise added to all outputs of all samples.
+
+    **Arguments:**
+
+    - `std`: its standard deviation, one number or one for each output; or
+    - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
+      all samples and good experiments) and of the noise, in dB, for each output.
+
+    **Raises:** `DefinitionError` unless exactly one of them is given, or for negative ones.
+    """
+    if (std is None) == (snr is None):
+        raise DefinitionError("add_noise needs either `std` or `snr`.")
+    if snr is not None:
+        if not data.ok.any():
+            raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
+        std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
+    std = np.broadcast_to(np.asarray(std, float), (data.y.shape[2],))
+    if not (np.isfinite(std) & (std >= 0)).all():
+        raise DefinitionError(f"std of noise must be finite and not negative, but is {std}.")
+    noise = np.random.default_rng(seed).normal(size=data.y.shape) * std
+    return eqx.tree_at(lambda d: d.y, data, data.y + noise)
+
+
+def odd_part(data: ExperimentData) -> ExperimentData:
+    """Half the difference of each pair of experiments with opposite inputs.
+
+    Even-order distortion is the same for u and -u and cancels; so do offsets, such as an error of
+    the limit cycle. A pair with a failed member counts as failed.
+
+    **Arguments:** `data` of a design `with_negatives()`: experiments 2k and 2k + 1 are a pair.
+
+    **Raises:** `DefinitionError` for experiments that are no such pairs.
+    """
+    plus, minus = data.u[::2], data.u[1::2]
+    if len(data.u) % 2:
+        raise DefinitionError(f"{len(data.u)} experiments are not pairs: one has no partner.")
+    sum_ = np.abs(plus + minus).max(axis=(1, 2))
+    apart = ~(sum_ <= 1e-9 * np.maximum(np.abs(plus).max(axis=(1, 2)), 1e-300))
+    if apart.any():
+        k = 2 * int(np.argmax(apart))
+        raise DefinitionError(
+            f"experiments {k} and {k + 1} are no pair: their inputs are not opposite "
+            "(`Design.with_negatives` makes pairs)."
+        )
+    first, second = data.result[::2], data.result[1::2]
+    broken = first != Result.OK
+    result = np.where(broken, first, second)
+    failed_at = np.where(broken, data.failed_at[::2], data.failed_at[1::2])
+    error = None if data.error is None else np.maximum(data.error[::2], data.error[1::2])
+    return ExperimentData(
+        plus,
+        (data.y[::2] - data.y[1::2]) / 2,
+        n_sections=data.n_sections,
+        periods=data.periods,
+        inputs=data.inputs,
+        outputs=data.outputs,
+        result=result,
+        failed_at=failed_at,
+        error=error,
+        cycle_outputs=data.cycle_outputs,
+        family=data.family,
+    )

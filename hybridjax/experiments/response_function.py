@@ -1,0 +1,103 @@
+"""The response to inputs as a function that can be differentiated."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.precision import require_x64
+from ..engine.move import Settings
+from ..errors import DefinitionError
+from ..maps.place import as_placed
+from ..maps.placed import PlacedSections
+from ..orbits.cycle import LimitCycle
+from ..systems.output import Output
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+from .plan import Plan, plan_flow
+from .respond import Response, respond
+
+
+# Steps between two sections that a derivative remembers, and for a whole period.
+_STEPS, _STEPS_IN_ALL = 32, 1024
+
+
+class ResponseFunction(eqx.Module):
+    """From inputs held between sections to outputs at the sections; see `response_function`.
+
+    **Fields:** `placed`, the sections; `plan` and `settings`, how to step between them; `outputs`.
+    """
+
+    placed: PlacedSections
+    plan: Plan
+    settings: Settings
+    outputs: tuple[str | Output, ...]
+
+    def __call__(
+        self,
+        u: Float[ArrayLike, "S n nu"],
+        start: Float[Array, "m S"] | None = None,
+        system: HybridSystem | None = None,
+    ) -> Response:
+        """**Arguments:** `u`, held from sample to sample, with n a multiple of the N sections;
+        `start`, times and states (padded with zeros) on section 0, by default the cycle's;
+        `system`, one with other parameters: the sections stay where they are.
+
+        **Returns:** a `Response`: outputs `y` (S, n, ny) (not deviations), `result` (S,) codes,
+        `failed_at` (S,), and estimates `error` (S,). Nothing is raised for experiments that fail.
+        """
+        u = jnp.asarray(u, float)
+        N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
+        if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
+            raise DefinitionError(
+                f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple "
+                f"of the {N} sections; got {u.shape}."
+            )
+        placed = self.placed
+        if system is not None:
+            placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
+        if start is None:
+            lanes = placed.lanes
+            first = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
+            start = jnp.broadcast_to(first, (len(first), len(u)))
+        return respond(placed, self.plan, start, u, self.outputs, self.settings)
+
+
+def response_function(
+    cycle: LimitCycle,
+    sections,
+    outputs: Sequence[str | Output] | str | Output,
+    *,
+    accuracy: float = 1e-9,
+    scale: Mapping[str, float] | None = None,
+) -> ResponseFunction:
+    """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.
+
+    ```python
+    response = hj.response_function(cycle, sections, ("yM", "vM"))
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(system):
+        return jnp.sum((response(u, system=system).y - measured) ** 2)
+    ```
+
+    It has exact derivatives with respect to inputs, start and parameters, in both modes. Reverse
+    mode stores the states at the sections and computes what lies between them again, so that its
+    memory grows by a few hundred bytes for each sample. Outputs of an experiment are NaN after it
+    failed: leave it out by `result` before a mean is taken.
+
+    **Arguments:** as for `run_experiments`. The cycle may be unstable, where experiments are short.
+
+    **Raises:** `DefinitionError` for outputs, sections or an accuracy that do not exist.
+    """
+    placed = as_placed(cycle, sections)
+    require_x64(cycle)
+    z = Structure(cycle.system).resolve_outputs(outputs)
+    plan, settings, _ = plan_flow(placed, accuracy, scale)
+    steps = max(_STEPS, _STEPS_IN_ALL // placed.n_sections)
+    settings = dataclasses.replace(settings, max_steps=steps)
+    return ResponseFunction(placed, plan, settings, tuple(z.items))

@@ -1,0 +1,254 @@
+"""Experiments on disk, chunk by chunk: many more than memory holds, by any number of processes.
+
+A folder of experiments holds a file `experiments.json`, which says what they are, and one file for
+each chunk, an `ExperimentData` as `save` writes it. A chunk appears complete or not at all.
+"""
+
+import hashlib
+import json
+import os
+import uuid
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from tqdm import tqdm
+
+from ..errors import DefinitionError, FileFormatError
+from ..io import load, save
+from ..orbits.cycle import LimitCycle
+from ..systems.output import Output
+from .campaign import Campaign, chunks, prepare
+from .data import ExperimentData, summary
+from .design.design import Design
+from .run import CHUNK
+
+
+_MANIFEST = "experiments.json"
+_FORMAT = "hybridjax experiments 1"
+# Cycles found on different machines are the same up to this, relative to their size.
+_SAME = 1e-7
+
+
+def store_experiments(
+    folder: str | os.PathLike,
+    cycle: LimitCycle,
+    sections,
+    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    outputs: Sequence[str | Output] | str | Output,
+    *,
+    chunk: int = CHUNK,
+    share: tuple[int, int] = (0, 1),
+    batch: int | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+    **options,
+) -> "StoredExperiments":
+    """Run experiments and write them to a folder, in memory that does not depend on their number.
+
+    Chunks that are there already are not run again: after an interruption, make the same call.
+
+    **Arguments:** as for `run_experiments`, and
+
+    - `folder`: is created where needed. It holds the experiments of one call only.
+    - `chunk`: the number of experiments in one file.
+    - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`).
+    - `share`: `(rank, size)` of this process where several, perhaps on several machines, make the
+        same call on the same folder: it runs the chunks rank, rank + size, ...
+
+    **Returns:** `StoredExperiments`.
+
+    **Raises:** `DefinitionError` if the folder holds experiments on another system, cycle, family
+    or design, or cannot be written; `FileFormatError` for a chunk that is damaged; and as
+    `run_experiments`.
+    """
+    rank, size = share
+    if not 0 <= rank < size:
+        raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
+    about = dict(chunk=chunk, batch=batch, workers=workers)
+    campaign = prepare(cycle, sections, design, outputs, **about, **options)
+    parts = chunks(campaign.count, chunk)
+    folder = Path(folder)
+    _open(folder, _describe(campaign, chunk))
+    stored = StoredExperiments(folder)
+    missing = [k for k in stored.missing() if k % size == rank]
+    for k in tqdm(missing, "chunks", disable=not progress):
+        save(stored.path(k), campaign.run(parts[k]))
+    return stored
+
+
+class StoredExperiments:
+    """Experiments in a folder that `store_experiments` fills.
+
+    Iterating over them reads chunk after chunk as `ExperimentData`, so that
+    `estimate_htf(StoredExperiments(folder))` needs memory for one chunk only.
+    """
+
+    def __init__(self, folder: str | os.PathLike):
+        """**Arguments:** `folder`.
+
+        **Raises:** `DefinitionError` if `folder` holds no experiments, or chunks of others.
+        """
+        self.folder = Path(folder)
+        about = _read(self.folder)
+        if about is None:
+            raise DefinitionError(f"'{folder}' holds no experiments: there is no {_MANIFEST}.")
+        self._id = _identity(about)
+        self.experiments: int = about["experiments"]
+        self.chunk: int = about["chunk"]
+        self.n_sections: int = about["sections"]
+        known = {self.path(k).name for k in range(len(self))}
+        other = sorted(p.name for p in self.folder.glob("[!.]*.npz") if p.name not in known)
+        if other:
+            raise DefinitionError(
+                f"'{self.folder / other[0]}' does not belong to the experiments that "
+                f"'{_MANIFEST}' describes: take it out of the folder."
+            )
+
+    def __len__(self) -> int:
+        """The number of chunks, whether they are there or not."""
+        return -(-self.experiments // self.chunk)
+
+    def path(self, k: int) -> Path:
+        """The file of chunk k, which holds the experiments from `k * chunk` on."""
+        return self.folder / f"{k:06d}-{self._id}.npz"
+
+    def missing(self) -> list[int]:
+        """The chunks that are not there yet.
+
+        **Raises:** `FileFormatError` for a chunk that is damaged.
+        """
+        gone = []
+        for k in range(len(self)):
+            if not self.path(k).exists():
+                gone.append(k)
+            elif not zipfile.is_zipfile(self.path(k)):
+                raise FileFormatError(
+                    f"'{self.path(k)}' is damaged: delete it, and it will be run again."
+                )
+        return gone
+
+    def __iter__(self) -> Iterator[ExperimentData]:
+        """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing."""
+        self._complete()
+        for k in range(len(self)):
+            yield load(self.path(k))
+
+    def summary(self, limit: int = 5) -> str:
+        """As `ExperimentData.summary`, of all experiments."""
+        self._complete()
+        codes = []
+        for k in range(len(self)):
+            with np.load(self.path(k)) as file:
+                codes.append((file["result"], file["failed_at"]))
+        return summary(*map(np.concatenate, zip(*codes, strict=True)), self.n_sections, limit)
+
+    def _complete(self) -> None:
+        gone = self.missing()
+        if gone:
+            raise DefinitionError(
+                f"{len(gone)} of {len(self)} chunks in '{self.folder}' are missing, the first is "
+                f"{gone[0]}: call `store_experiments` as before to run them."
+            )
+
+    def __repr__(self) -> str:
+        ready = len(self) - len(self.missing())
+        return (
+            f"StoredExperiments('{self.folder}': {self.experiments} experiments, {ready} of "
+            f"{len(self)} chunks)"
+        )
+
+
+def _open(folder: Path, about: dict[str, Any]) -> None:
+    """Make the folder, or check that it was made for the same experiments."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (there := _read(folder)) is None:
+            temporary = folder / f".{_MANIFEST}.{uuid.uuid4().hex}"
+            temporary.write_text(json.dumps(about, indent=1))
+            os.replace(temporary, folder / _MANIFEST)
+            there = _read(folder)
+    except OSError as error:
+        raise DefinitionError(f"cannot write to '{folder}': {error.strerror}.") from error
+    assert there is not None
+    for name, value in about.items():
+        if name == "cycle":
+            mine, theirs = np.asarray(value), np.asarray(there.get(name))
+            same = mine.shape == theirs.shape and bool(
+                np.allclose(mine, theirs, rtol=_SAME, atol=_SAME * np.abs(mine).max())
+            )
+        else:
+            same = there.get(name) == value
+        if not same:
+            raise DefinitionError(
+                f"'{folder}' holds other experiments (its `{name}` is not the same): give these "
+                "a folder of their own."
+            )
+
+
+def _read(folder: Path) -> dict[str, Any] | None:
+    path = folder / _MANIFEST
+    try:
+        about = json.loads(path.read_text())
+        if about["format"] != _FORMAT:
+            raise KeyError
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise FileFormatError(f"'{path}' is damaged, or of another version.") from error
+    return about
+
+
+def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
+    """What makes these experiments what they are."""
+    placed = campaign.placed
+    system, lanes = placed.cycle.system, placed.lanes
+    if isinstance(campaign.source, Design):
+        design = eqx.partition(campaign.source, eqx.is_array)
+        inputs = _digest([*jax.tree_util.tree_leaves(design[0]), repr(design[1].input_names)])
+    else:
+        inputs = _digest([campaign.source])
+    return {
+        "format": _FORMAT,
+        "experiments": campaign.count,
+        "chunk": chunk,
+        "cycles": campaign.cycles,
+        "periods": campaign.periods,
+        "sections": placed.n_sections,
+        "start": "cycle" if campaign.model is None else "periodic",
+        "inputs": list(system.inputs),
+        "outputs": list(campaign.outputs.names),
+        "system": type(system).__qualname__,
+        "family": placed.family.label,
+        "parameters": _digest(jax.tree_util.tree_leaves((system, placed.family))),
+        "accuracy": campaign.accuracy,
+        "precision": campaign.precision,
+        "design": inputs,
+        "cycle": np.concatenate(
+            [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, campaign.scales)]
+        ).tolist(),
+    }
+
+
+def _identity(about: dict[str, Any]) -> str:
+    """A short name of the experiments, for their files."""
+    return _digest([json.dumps(about, sort_keys=True)])[:8]
+
+
+def _digest(things: Sequence[Any]) -> str:
+    """A hash of arrays, numbers and texts, a part of them at a time."""
+    sha = hashlib.sha256()
+    for x in things:
+        if isinstance(x, str):
+            sha.update(x.encode())
+        elif eqx.is_array_like(x) or isinstance(x, np.ndarray):
+            array = np.atleast_1d(np.asarray(x))
+            sha.update(f"{array.dtype}{array.shape}".encode())
+            for k in range(0, len(array), 1024):
+                sha.update(np.ascontiguousarray(array[k : k + 1024]).tobytes())
+    return sha.hexdigest()

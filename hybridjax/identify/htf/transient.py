@@ -1,0 +1,216 @@
+r"""Transients taken out of records whose start could not be chosen.
+
+Seen once a period, at one section, the response to an input of P periods is a sum of the few
+sinusoids $e^{2 \pi i c p / P}$, c the classes that are excited, and what is left of the start dies
+out like $\sum_i a_i \lambda_i^p$. The multipliers $\lambda$ are the same at every section, in every
+output and every experiment (after the first period, in which the part of the state with zero
+multipliers is gone). So all amplitudes are linear unknowns that can be projected out, and the d
+multipliers alone are left to be found (variable projection: Golub and Pereyra 1973).
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
+
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...experiments.design.partition import line_class
+
+
+_MOST = 4  # the largest order that is tried
+
+
+class TransientFit(eqx.Module):
+    """Records without their transients.
+
+    **Fields:**
+
+    - `data`: the records from period `skip` on, less the transient.
+    - `multipliers` (d,): of the decay, by decreasing modulus. A by-product: fits to all of the
+      data know them better.
+    - `removed` (S, ny): rms of what was taken away in the window, per experiment and output; NaN
+      where an experiment failed.
+    """
+
+    data: ExperimentData
+    multipliers: Complex[np.ndarray, " d"]
+    removed: Float[np.ndarray, "S ny"]
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
+        removed = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
+        return f"TransientFit(multipliers {shown}; removed rms up to {removed}; {self.data!r})"
+
+
+def remove_transient(
+    data: ExperimentData,
+    order: int | None = None,
+    *,
+    multipliers: Complex[np.ndarray, " d"] | None = None,
+    skip: int = 1,
+) -> TransientFit:
+    """Fit the decay of whatever the experiments started with, and subtract it.
+
+    Needs no model. The input has the period P over all of the record, which is longer than P
+    periods, by `skip` at least. If it is longer by several (20, say), everything that repeats after
+    P periods is told from the decay, distortion included, and any design will do. With fewer, only
+    the response at lines that are excited is, so that a design is needed that leaves out half of
+    them (`multisine(lines="odd")`).
+
+    **Arguments:**
+
+    - `order`: d, the number of non-zero multipliers; by default the one of 1 to 4 with the
+      shortest description (Rissanen 1978).
+    - `multipliers`: where they are known already, conjugates in pairs.
+    - `skip`: periods at the start in which zero multipliers die; they are cut off.
+
+    **Returns:** `TransientFit`; `estimate_htf(fit.data)` goes on from there.
+
+    **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
+    and if no experiment ran well.
+    """
+    N, P = data.n_sections, data.periods
+    S, n, ny = data.y.shape
+    cycles = n // N - skip
+    if skip < 0:
+        raise DefinitionError(f"skip is a number of periods, not {skip}.")
+    if order is not None and not 1 <= order <= cycles // 2:
+        raise DefinitionError(f"order is the number of multipliers, at least 1, not {order}.")
+    if cycles < P:
+        raise DefinitionError(
+            f"the record has {n // N} cycles, but to remove a transient it must hold the "
+            f"window of P = {P} and the {skip} skipped ones before it: record some more."
+        )
+    if not data.ok.any():
+        raise DefinitionError(f"no experiment ran well: {data.summary()}.")
+    _require_periodic(data)
+    known = None if multipliers is None else _polynomial(multipliers)
+    if known is not None:
+        order = len(known)
+
+    size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
+    scaled = data.y / np.where(size > 0, size, 1.0)
+    y = scaled.reshape(S, -1, N * ny)[:, skip:]
+    good = np.flatnonzero(data.ok).tolist()
+    everything = cycles - P >= 2 * (order or _MOST)
+    free = [_free(data, s, cycles, everything) for s in ([good[0]] if everything else good)]
+    free = free * len(good) if everything else free
+    left = [Q @ y[s] for Q, s in zip(free, good, strict=True)]
+    least = min(len(Q) for Q in free)
+    if least <= (order or 1):
+        raise DefinitionError(
+            f"{cycles} cycles with {cycles - least} lines per section leave nothing to tell the "
+            "transient from the response: record more cycles, or excite half of the lines "
+            "(`multisine(lines='odd')`)."
+        )
+    if known is None:
+        tried = range(1, min(_MOST, least - 1) + 1) if order is None else [order]
+        blocks = _compressed(free, left, everything)
+        count = sum(z.size for z in left)
+        fits = [_fit(blocks, _start(y[good], free, d), count, N * ny * len(good)) for d in tried]
+        known = min(fits, key=lambda fit: fit[0])[1]
+
+    basis = _decays(known, cycles)
+    clean, removed = data.y[:, skip * N :].copy(), np.full((S, ny), np.nan)
+    for Q, z, s in zip(free, left, good, strict=True):
+        transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
+        transient = transient.reshape(-1, ny) * size
+        clean[s] -= transient
+        removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
+    roots = np.roots(np.r_[1.0, known])
+    roots = roots[np.lexsort((-roots.imag, -np.abs(roots)))].astype(complex)
+    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
+    data = eqx.tree_at(
+        lambda d: (d.u, d.y, d.failed_at), data, (data.u[:, skip * N :], clean, failed_at)
+    )
+    return TransientFit(data, roots, removed)
+
+
+def _require_periodic(data: ExperimentData) -> None:
+    length = data.n_sections * data.periods
+    u = data.u[data.ok]
+    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    worst = int(np.argmax(change))
+    if change[worst] > 1e-6 * np.abs(u[worst]).max():
+        raise DefinitionError(
+            f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
+            f"{data.periods} periods over all of the record, so that response and transient cannot "
+            "be told apart."
+        )
+
+
+def _polynomial(multipliers) -> Float[np.ndarray, " d"]:
+    c = np.poly(np.asarray(multipliers))[1:]
+    if np.abs(np.imag(c)).max(initial=0) > 1e-9 or len(c) == 0:
+        raise DefinitionError(f"multipliers must be real or in conjugate pairs: {multipliers}.")
+    return np.real(c)
+
+
+def _free(data: ExperimentData, s: int, cycles: int, everything: bool):
+    """Rows that are orthogonal to all responses, over the periods at one section."""
+    P = data.periods
+    if everything:
+        classes = np.arange(P // 2 + 1)
+    else:
+        size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
+        classes = line_class(np.flatnonzero(size > 1e-6 * size.max()), P)
+        classes = np.unique(np.r_[0, classes])
+    angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
+    inner = (classes > 0) & (2 * classes < P)
+    signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
+    if signals.shape[1] >= cycles:
+        return np.zeros((0, cycles))
+    return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+
+
+def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
+    """Solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`: a basis."""
+    d = len(c)
+    v = np.zeros((cycles, d))
+    v[:d] = np.eye(d)
+    for p in range(d, cycles):
+        v[p] = -c @ v[p - d : p][::-1]
+    return v
+
+
+def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
+    """`y` obeys the equation of the decay but for sinusoids: linear least squares."""
+    normal, right = np.zeros((d, d)), np.zeros(d)
+    cycles = y.shape[1]
+    for Q, record in zip(free, y, strict=True):
+        # The same sinusoids, d periods fewer.
+        signals = np.linalg.svd(Q, full_matrices=True)[2][len(Q) :].T[d:]
+        keep = np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+        lags = np.stack([keep @ record[d - i : cycles - i] for i in range(d + 1)])
+        normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
+        right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
+    return np.linalg.lstsq(normal, right, rcond=None)[0]
+
+
+def _compressed(free, left, everything: bool):
+    """Pairs (Q, z) with as few columns as rows; what is left over stays as large."""
+    if everything:
+        free, left = free[:1], [np.concatenate(left, axis=1)]
+
+    def fewer(z):
+        return z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T
+
+    return [(Q, fewer(z)) for Q, z in zip(free, left, strict=True)]
+
+
+def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
+    """Length of the description, and the coefficients."""
+    cycles = blocks[0][0].shape[1]
+
+    def residual(c):
+        basis, out = _decays(c, cycles), []
+        for Q, z in blocks:
+            q = np.linalg.qr(Q @ basis)[0]
+            out.append((z - q @ (q.T @ z)).ravel())
+        return np.concatenate(out)
+
+    found = least_squares(residual, start, x_scale=np.maximum(np.abs(start), 0.1))
+    parameters = len(start) * (series + 1)
+    mean = max(2 * found.cost, 1e-300) / count
+    return count * np.log(mean) + parameters * np.log(count), found.x

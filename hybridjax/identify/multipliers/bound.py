@@ -1,0 +1,71 @@
+"""How well multipliers can be estimated at all."""
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ...errors import DefinitionError
+from ...linear.htf import HTF
+from ...linear.ldtp import LDTP
+from .estimate import MultiplierEstimate
+from .projection import evaluate, groups_of
+from .weights import check_freedom, check_values, weights_of
+
+
+class MultiplierBound(MultiplierEstimate):
+    """The true multipliers, with the smallest covariance that an unbiased estimate can have.
+
+    **Fields:** as of every estimate of multipliers: `multipliers` (d,), `coefficients` (d,) of
+    their polynomial and their `covariance` (d, d). `standard_errors` are bounds of rms errors.
+    """
+
+    multipliers: Complex[np.ndarray, " d"]
+    coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+
+    @property
+    def covariance_freedom(self) -> float:
+        return np.inf
+
+    def __repr__(self) -> str:
+        return f"MultiplierBound({self.show_multipliers()})"
+
+
+def multiplier_bound(model: LDTP, htf: HTF, overhang: int | None = None) -> MultiplierBound:
+    r"""The Cramer-Rao bound of the multipliers of a known model.
+
+    For independent, circular, normal errors of the HTFs, with all numerators unknown: the inverse
+    of $J^T J$ at the truth, where J is the derivative of the HTFs in units of their standard
+    deviations, less what numerators can imitate. It says before an experiment what the
+    experiment can show at best.
+
+    **Arguments:**
+
+    - `model`: the truth. `htf`: its frequencies, harmonics and `variance` count, H does not.
+    - `overhang`: degree of the numerators beyond d N; None means N.
+
+    **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
+    few frequencies to find the multipliers at all.
+    """
+    for name in ("sections", "inputs", "outputs"):
+        if getattr(model, name) != getattr(htf, name):
+            raise DefinitionError(
+                f"model and HTFs have different {name}: {getattr(model, name)} and "
+                f"{getattr(htf, name)}."
+            )
+    if htf.variance is None:
+        raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
+    exact = model.htf(htf.f, htf.harmonics)
+    exact = HTF(
+        htf.f, exact.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
+        variance=htf.variance,
+    )  # fmt: skip
+    multipliers = model.multipliers()
+    d, N = len(multipliers), model.n_sections
+    unknowns = d * N + (N if overhang is None else overhang) + 1
+    check_freedom(exact, d, unknowns)
+    c = np.poly(multipliers).real[1:]
+    information = np.zeros((d, d))
+    for group in groups_of(exact, weights_of(exact, check_values(exact)), unknowns):
+        jacobian = evaluate(group, c).jacobian.reshape(d, -1)
+        information += jacobian @ jacobian.T
+    return MultiplierBound(multipliers, c, np.linalg.inv(information))

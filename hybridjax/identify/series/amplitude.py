@@ -1,0 +1,100 @@
+"""Up to which amplitude a linear model holds."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...linear.ldtp import LDTP
+from .layout import Piece
+from .validation import check_model, simulate_piece
+
+
+class AmplitudeSweep(eqx.Module):
+    """How a linear model fails as inputs grow. Printing it gives a table.
+
+    **Fields:** `amplitudes` (A,): factors of the input; `rms` (A, nu): of the inputs; `misfit`
+    (A, ny): rms of the difference from the model relative to the rms of the output, NaN where no
+    experiment ran to its end; `failed` (A,): experiments that did not.
+    """
+
+    amplitudes: Float[np.ndarray, " A"]
+    rms: Float[np.ndarray, "A nu"]
+    misfit: Float[np.ndarray, "A ny"]
+    failed: Float[np.ndarray, " A"]
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def limit(self, misfit: float) -> float:
+        """The amplitude up to which no output misfits more, between those tried by log-log lines.
+
+        **Raises:** `DefinitionError` if the smallest amplitude tried misfits more.
+        """
+        worst = np.where(np.isnan(self.misfit), np.inf, self.misfit).max(axis=1)
+        beyond = np.flatnonzero(worst > misfit)
+        if len(beyond) == 0:
+            return float(self.amplitudes[-1])
+        k = beyond[0]
+        if k == 0:
+            raise DefinitionError(
+                f"the smallest amplitude tried has a misfit of {worst[0]:.2g} already: try smaller "
+                "ones, or allow more."
+            )
+        if np.isinf(worst[k]) or worst[k - 1] == 0:
+            return float(self.amplitudes[k - 1])
+        x, y = np.log(self.amplitudes[k - 1 : k + 1]), np.log(worst[k - 1 : k + 1])
+        return float(np.exp(np.interp(np.log(misfit), y, x)))
+
+    def __repr__(self) -> str:
+        head = "".join(f"  {name:>10}" for name in self.outputs)
+        rows = [f"{'amplitude':>10}  {'rms input':>10}{head}  failed"]
+        for a, u, misfit, failed in zip(
+            self.amplitudes, self.rms, self.misfit, self.failed, strict=True
+        ):
+            values = "".join(f"  {x:10.2e}" for x in misfit)
+            rows.append(f"{a:10.4g}  {np.max(u):10.2e}{values}  {int(failed):6d}")
+        return "\n".join(rows)
+
+
+def amplitude_sweep(
+    run: Callable[[Float[np.ndarray, "S n nu"]], ExperimentData],
+    model: LDTP,
+    u: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    amplitudes: Sequence[float] | np.ndarray,
+    *,
+    start: Literal["free", "rest"] = "rest",
+) -> AmplitudeSweep:
+    """Apply an input at several amplitudes and compare with the linear model's response.
+
+    **Arguments:**
+
+    - `run`: makes experiments from inputs (S, n, nu): a simulation, e.g.
+      `lambda u: hj.run_experiments(cycle, sections, u, outputs)`, or a laboratory.
+    - `model`: the linear one. `u`: inputs at amplitude 1. `amplitudes`: positive factors.
+    - `start`: as in `validate`; by default experiments start on the limit cycle.
+
+    **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
+    """
+    amplitudes = np.sort(np.asarray(amplitudes, float))
+    if amplitudes.ndim != 1 or not (np.isfinite(amplitudes) & (amplitudes > 0)).all():
+        raise DefinitionError(f"amplitudes must be positive numbers, not {amplitudes}.")
+    misfit, rms, failed = [], [], []
+    for a in amplitudes:
+        data = run(a * np.asarray(u))
+        check_model(model, data.n_sections, data.inputs, data.outputs)
+        failed.append(float((~data.ok).sum()))
+        rms.append(np.sqrt(np.mean(data.u**2, axis=(0, 1))))
+        square = np.zeros((2, len(data.outputs)))
+        for s in np.flatnonzero(data.ok):
+            piece = Piece(0, data.u[s], data.y[s])
+            error = piece.y - simulate_piece(model, piece, start == "free")
+            square += [(error**2).sum(axis=0), (piece.y**2).sum(axis=0)]
+        with np.errstate(invalid="ignore"):
+            misfit.append(np.sqrt(square[0] / square[1]))
+    return AmplitudeSweep(
+        amplitudes, np.array(rms), np.array(misfit), np.array(failed), model.inputs, model.outputs
+    )

@@ -1,0 +1,81 @@
+"""The exact harmonic transfer functions of an LDTP system, as one compiled computation."""
+
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from ..errors import DefinitionError
+from .time_response import monodromy
+
+
+def all_harmonics(n_sections: int) -> tuple[int, ...]:
+    """The `N` harmonics that are distinct, ascending.
+
+    `-N/2 .. N/2-1` for even `N`, `-(N-1)/2 .. (N-1)/2` for odd `N`.
+    """
+    return tuple(range(-(n_sections // 2), (n_sections + 1) // 2))
+
+
+def check_harmonics(harmonics: int | Iterable | None, n_sections: int) -> tuple[int, ...]:
+    """`harmonics` as an ascending tuple; `None` means all of them.
+
+    **Raises:** `DefinitionError` for harmonics that are out of range, repeated or no integers.
+    """
+    known = all_harmonics(n_sections)
+    if harmonics is None:
+        return known
+    try:
+        wanted = sorted(harmonics) if isinstance(harmonics, Iterable) else [harmonics]
+        integers = tuple(int(m) for m in wanted)
+        whole = all(i == m for i, m in zip(integers, wanted, strict=True))
+    except (TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise DefinitionError(f"`harmonics` must be integers, but is {harmonics!r}.")
+    outside = [m for m in integers if m not in known]
+    if outside:
+        raise DefinitionError(
+            f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "
+            f"{known[0]} to {known[-1]}."
+        )
+    if len(set(integers)) < len(integers) or not integers:
+        raise DefinitionError(f"`harmonics` must be distinct and at least one: {integers}.")
+    return integers
+
+
+@jax.jit
+def harmonic_transfer(
+    A: Float[Array, "N d d"],
+    B: Float[Array, "N d nu"],
+    C: Float[Array, "N ny d"],
+    D: Float[Array, "N ny nu"],
+    f: Float[Array, " F"],
+) -> Complex[Array, "N F ny nu"]:
+    r"""All harmonic transfer functions at the input frequencies `f` (cycles per period).
+
+    With $z = e^{2 \pi i f / N}$, an input $u[n] = z^n$ has the response $x[n] = X_n$ where
+
+    $v_0 = 0, \quad v_{n+1} = A[n] v_n + B[n] z^n, \quad X_0 = (z^N I - \Phi)^{-1} v_N, \quad
+    X_{n+1} = A[n] X_n + B[n] z^n,$
+
+    $G[n] = z^{-n} C[n] X_n + D[n]$ is periodic, and $H_m$ is its Fourier coefficient $m$.
+
+    **Returns:** `H` with harmonic `m` at index `m mod N` (the order of the FFT).
+    """
+    n_sections, d, _ = A.shape
+    identity = jnp.eye(d, dtype=A.dtype)
+    z = jnp.exp(2j * jnp.pi / n_sections * jnp.arange(n_sections)[:, None] * f)
+    z_N = jnp.exp(2j * jnp.pi * f)
+
+    def advance(X, section):
+        A, B, z = section
+        return A @ X + z[:, None, None] * B, X
+
+    start = jnp.zeros((f.size, d, B.shape[-1]), z.dtype)
+    forced, _ = jax.lax.scan(advance, start, (A, B, z))
+    start = jnp.linalg.solve(z_N[:, None, None] * identity - monodromy(A), forced)
+    _, X = jax.lax.scan(advance, start, (A, B, z))
+    G = C[:, None] @ X / z[:, :, None, None] + D[:, None]
+    return jnp.fft.fft(G, axis=0) / n_sections

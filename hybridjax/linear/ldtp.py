@@ -1,0 +1,368 @@
+"""Linear discrete-time periodic systems whose state dimension may vary over the period."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float, Int
+
+from .._core.arguments import names, real_array, require_finite
+from .._core.precision import require_x64
+from .._core.tracing import is_traced
+from ..errors import DefinitionError
+from . import time_response
+from .frequency_response import check_harmonics, harmonic_transfer
+from .htf import HTF
+from .multipliers import product_eigenvalues, product_rank
+
+
+_RTOL = 1e-12  # singular values of a factor below this part of its largest one are zero
+_RESONANCE = 1e-8  # closer than this to a multiplier, z^N leaves less than half of the digits
+
+
+class LDTP(eqx.Module):
+    r"""A linear discrete-time periodic system of period $N$ sections.
+
+    $$x[n+1] = A[n]\,x[n] + B[n]\,u[n], \qquad y[n] = C[n]\,x[n] + D[n]\,u[n]$$
+
+    The dimension of $x[n]$ may vary with $n$. The arrays are padded with zeros to the largest
+    dimension: the valid block of `A[n]` is `[:dims[(n+1) % N], :dims[n]]`, and with zero padding
+    all algebra may use the whole arrays. Every method works under `jit`, `vmap` and derivatives,
+    except `multipliers` and `rank`, which work on the host.
+
+    **Arguments:**
+
+    - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
+    - `D` (N, ny, nu): feed-through; `None` means zero.
+    - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
+    - `inputs`, `outputs`: names; by default `u`, `y`, or `u0, u1, ...` where there are several.
+    - `coordinates`: names of the coordinates at each section, for documentation.
+
+    **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
+    outside the valid blocks, for NaN and infinity; `PrecisionError` for single precision.
+    """
+
+    A: Float[Array, "N d d"]
+    B: Float[Array, "N d nu"]
+    C: Float[Array, "N ny d"]
+    D: Float[Array, "N ny nu"]
+    dims: Int[Array, " N"]
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    coordinates: tuple[tuple[str, ...], ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        A: Any,
+        B: Any,
+        C: Any,
+        D: Any = None,
+        dims: Any = None,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        coordinates: Sequence[Sequence[str]] | None = None,
+    ):
+        A, B, C = (real_array(*pair, ndim=3) for pair in (("A", A), ("B", B), ("C", C)))
+        n_sections, d = A.shape[:2]
+        ny, nu = C.shape[1], B.shape[2]
+        D = jnp.zeros((n_sections, ny, nu)) if D is None else real_array("D", D, ndim=3)
+        expected = {
+            "A": (A, (n_sections, d, d)),
+            "B": (B, (n_sections, d, nu)),
+            "C": (C, (n_sections, ny, d)),
+            "D": (D, (n_sections, ny, nu)),
+        }
+        for name, (array, shape) in expected.items():
+            if array.shape != shape or 0 in shape:
+                raise DefinitionError(
+                    f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
+                    f"C {C.shape} it should be {shape}, without empty axes."
+                )
+            require_finite(name, array)
+        require_x64({"A": A, "B": B, "C": C, "D": D})
+        if coordinates is not None:
+            coordinates = tuple(map(tuple, coordinates))
+            if len(coordinates) != n_sections:
+                raise DefinitionError(
+                    f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
+                )
+        self.A, self.B, self.C, self.D = A, B, C, D
+        self.dims = _dimensions(dims, n_sections, d)
+        self.inputs = names("inputs", inputs, nu)
+        self.outputs = names("outputs", outputs, ny)
+        self.coordinates = coordinates
+        _check_padding(self)
+
+    @classmethod
+    def from_blocks(
+        cls,
+        A: Sequence[ArrayLike],
+        B: Sequence[ArrayLike],
+        C: Sequence[ArrayLike],
+        D: Sequence[ArrayLike] | None = None,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        coordinates: Sequence[Sequence[str]] | None = None,
+    ) -> "LDTP":
+        """An LDTP from matrices that each have their own dimensions.
+
+        **Arguments:** one matrix per section: `A[n]` is `(d[n+1], d[n])`, `B[n]` `(d[n+1], nu)`,
+        `C[n]` `(ny, d[n])`, `D[n]` `(ny, nu)`; the others as in the constructor.
+
+        **Raises:** `DefinitionError`, naming the matrix that does not fit.
+        """
+        n_sections = len(A)
+        for name, given in (("B", B), ("C", C), ("D", D)):
+            if given is not None and len(given) != n_sections or n_sections == 0:
+                raise DefinitionError(
+                    f"`A` has {n_sections} matrices, `{name}` {len(given or ())}."
+                )
+        blocks = {
+            name: [real_array(f"{name}[{n}]", block, ndim=2) for n, block in enumerate(given)]
+            for name, given in (("A", A), ("B", B), ("C", C), ("D", D))
+            if given is not None
+        }
+        dims = [block.shape[1] for block in blocks["A"]]
+        d, ny, nu = max(dims), blocks["C"][0].shape[0], blocks["B"][0].shape[1]
+        padded = {}
+        for name, full in (("A", (d, d)), ("B", (d, nu)), ("C", (ny, d)), ("D", (ny, nu))):
+            for n, block in enumerate(blocks.get(name, ())):
+                rows = dims[(n + 1) % n_sections] if name in "AB" else ny
+                columns = dims[n] if name in "AC" else nu
+                if block.shape != (rows, columns):
+                    raise DefinitionError(
+                        f"`{name}[{n}]` has shape {block.shape}, but x[{n}] has {dims[n]} and "
+                        f"x[{(n + 1) % n_sections}] {dims[(n + 1) % n_sections]} coordinates, with "
+                        f"{nu} inputs and {ny} outputs: it should be {(rows, columns)}."
+                    )
+            if name in blocks:
+                padded[name] = jnp.stack(
+                    [
+                        jnp.pad(b, [(0, p - q) for p, q in zip(full, b.shape, strict=True)])
+                        for b in blocks[name]
+                    ]
+                )
+        return cls(**padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates)
+
+    @property
+    def n_sections(self) -> int:
+        """The number of sections in one period, `N`."""
+        return self.A.shape[0]
+
+    def __repr__(self) -> str:
+        dims = "traced" if is_traced(self.dims) else _summary(np.asarray(self.dims))
+        return (
+            f"LDTP({self.n_sections} sections, dimension {dims}, inputs "
+            f"({', '.join(self.inputs)}), outputs ({', '.join(self.outputs)}))"
+        )
+
+    def states(
+        self, u: ArrayLike, x0: ArrayLike | None = None, start: int = 0
+    ) -> Float[Array, "time d"]:
+        """The states that an input leads to.
+
+        **Arguments:** `u` (n, nu), the input from section `start` on; `x0`, the state there,
+        either padded (d,) or with its true dimension; by default zero.
+
+        **Returns:** (n + 1, d), padded with zeros, `x0` first.
+        """
+        u, x0 = self._input(u), self._state(x0, start)
+        return time_response.states(self.A, self.B, u, x0, self._sections_from(start, u))
+
+    def simulate(
+        self, u: ArrayLike, x0: ArrayLike | None = None, start: int = 0
+    ) -> Float[Array, "time ny"]:
+        """The outputs (n, ny) that an input leads to; arguments as in `states`."""
+        u = self._input(u)
+        x = self.states(u, x0, start)[:-1]
+        return time_response.outputs(self.C, self.D, u, x, self._sections_from(start, u))
+
+    def impulse_response(self, n_lags: int) -> Float[Array, "N lags ny nu"]:
+        """The time-periodic impulse response (Markov parameters).
+
+        **Arguments:** `n_lags`, the number of lags `r = 0 .. n_lags - 1`.
+
+        **Returns:** at `[n, r]` the response at section `n` to a unit input `r` sections earlier:
+        `D[n]` for `r = 0`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]`.
+        """
+        if n_lags < 1:
+            raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
+        return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
+
+    def htf(self, f: Any, harmonics: int | Iterable | None = None) -> HTF:
+        """The exact harmonic transfer functions.
+
+        **Arguments:**
+
+        - `f` (F,): input frequencies in cycles per period.
+        - `harmonics`: which ones; `None` means all `N`.
+
+        **Raises:** `DefinitionError` if a harmonic does not exist, or a multiplier lies within
+        `1e-8` of $e^{2 \\pi i f}$, where the response is unbounded. (Inside `jit` and other
+        transformations values are not known, and the result there is infinite or meaningless.)
+        """
+        harmonics = check_harmonics(harmonics, self.n_sections)
+        f = jnp.atleast_1d(f) if np.ndim(f) == 0 else f
+        f = real_array("f", f, ndim=1)
+        require_finite("f", f)
+        require_x64(self)
+        self._refuse_resonance(f)
+        H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
+        chosen = np.asarray(harmonics) % self.n_sections
+        return HTF(f, H[chosen], harmonics, self.n_sections, self.inputs, self.outputs, "exact")
+
+    def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
+        """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""
+        return time_response.monodromy(jnp.roll(self.A, -section, axis=0))
+
+    def characteristic_polynomial(self) -> Float[Array, " coefficients"]:
+        r"""Coefficients $1, c_1, \ldots, c_d$ of $\det(\lambda I - \Phi)$, highest power first.
+
+        The same at every section, smooth also where multipliers meet, and differentiable, unlike
+        `multipliers`. It forms the product of the factors, and coefficients beyond the number of
+        non-zero multipliers are zero up to rounding.
+        """
+        return time_response.characteristic_polynomial(self.monodromy())
+
+    def multipliers(self, rtol: float = _RTOL) -> Complex[np.ndarray, " r"]:
+        """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
+
+        Their product is never formed, so that multipliers far below `1e-16` of the largest keep
+        their digits. Zeros are not found by size: they are counted from the dimensions and the
+        ranks of the factors.
+
+        **Arguments:** `rtol`: singular values of a factor below `rtol` times its largest one
+        count as zero.
+
+        **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
+        """
+        return product_eigenvalues(self._blocks("multipliers"), rtol)
+
+    def rank(self, section: int = 0, rtol: float = _RTOL) -> int:
+        """Rank of the monodromy matrix at a section, from the ranks of the factors (host side).
+
+        **Arguments:** `rtol` as in `multipliers`.
+        """
+        blocks = self._blocks("rank")
+        first = section % self.n_sections
+        return product_rank([*blocks[first:], *blocks[:first]], rtol)
+
+    def periodic_state(self, u: ArrayLike, periods: int) -> Float[Array, " d"]:
+        r"""The state at section 0 from which the response to a repeated input is periodic.
+
+        $x_0 = (I - \Phi^P)^{-1} x_f$, with $x_f$ the state that `u` reaches from rest.
+
+        **Arguments:** `u` (P N, nu), repeated for ever; `periods`, `P`.
+
+        **Raises:** `DefinitionError` if `u` has another length, or a multiplier is a `P`-th root
+        of one within `1e-8`: then no such state exists.
+        """
+        u = self._input(u)
+        if periods < 1 or u.shape[0] != periods * self.n_sections:
+            raise DefinitionError(
+                f"`u` has {u.shape[0]} samples, but {periods} periods of {self.n_sections} "
+                f"sections are {periods * self.n_sections}."
+            )
+        self._refuse_resonance(np.arange(periods) / periods)
+        by_period = u.reshape(periods, self.n_sections, -1)
+        return time_response.periodic_state(self.A, self.B, by_period)
+
+    def _sections_from(self, start, u):
+        return (start + jnp.arange(u.shape[0])) % self.n_sections
+
+    def _input(self, u):
+        u = real_array("u", u, ndim=2)
+        if u.shape[1] != len(self.inputs):
+            raise DefinitionError(
+                f"`u` has {u.shape[1]} columns, but the inputs are ({', '.join(self.inputs)})."
+            )
+        return u
+
+    def _state(self, x0, start):
+        d = self.A.shape[-1]
+        if x0 is None:
+            return jnp.zeros(d)
+        x0 = real_array("x0", x0, ndim=1)
+        true = d if is_traced(self.dims) else int(np.asarray(self.dims)[start % self.n_sections])
+        if x0.shape[0] not in (d, true):
+            raise DefinitionError(
+                f"`x0` has {x0.shape[0]} entries, but section {start % self.n_sections} has {true} "
+                f"coordinates ({d} with padding)."
+            )
+        return jnp.pad(x0, (0, d - x0.shape[0]))
+
+    def _blocks(self, method):
+        """The factors without padding, as numpy arrays."""
+        if is_traced(self.A, self.dims):
+            raise DefinitionError(
+                f"`{method}` works on the host, not inside jit, vmap or derivatives: call it "
+                "outside, or use `characteristic_polynomial` or `monodromy` there."
+            )
+        if self.A.ndim != 3:
+            raise DefinitionError(f"`{method}` takes one LDTP at a time, not a batch of them.")
+        A, dims = np.asarray(self.A), np.asarray(self.dims)
+        return [factor[:rows, :columns] for factor, rows, columns in zip(
+            A, np.roll(dims, -1), dims, strict=True
+        )]  # fmt: skip
+
+    def _refuse_resonance(self, f):
+        if is_traced(self.A, self.dims, f):
+            return
+        multipliers, f = self.multipliers(), np.asarray(f)
+        distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
+        if distance.size and distance.min() < _RESONANCE:
+            line, index = np.unravel_index(np.argmin(distance), distance.shape)
+            why = "Leave this frequency out."
+            if abs(multipliers[index] - 1) < _RESONANCE:
+                why = (
+                    "A multiplier of exactly 1 stems from a conserved quantity, or from an "
+                    "autonomous system that is sampled at fixed times, where nothing brings its "
+                    "phase back: use sections that depend on the state, or leave whole f out."
+                )
+            raise DefinitionError(
+                f"The response at f = {f[line]:g} cycles per period is unbounded: the multiplier "
+                f"{multipliers[index]:.9g} lies on the unit circle there (z^N I - Phi is "
+                f"singular). {why}"
+            )
+
+
+def _dimensions(dims, n_sections, d):
+    if dims is None:
+        return jnp.full(n_sections, d)
+    dims = dims if isinstance(dims, jax.Array) else np.asarray(dims)
+    if dims.shape != (n_sections,) or not np.issubdtype(dims.dtype, np.integer):
+        raise DefinitionError(f"`dims` must hold {n_sections} integers, one per section.")
+    if not is_traced(dims):
+        dims = np.asarray(dims)
+        if np.any((dims < 1) | (dims > d)):
+            raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
+    return jnp.asarray(dims)
+
+
+def _check_padding(ldtp):
+    if is_traced(ldtp.A, ldtp.B, ldtp.C, ldtp.dims):
+        return
+    dims = np.asarray(ldtp.dims)
+    padding = np.arange(ldtp.A.shape[-1]) >= dims[:, None]
+    after = np.roll(padding, -1, axis=0)
+    outside = {
+        "A": (ldtp.A, after[:, :, None] | padding[:, None, :]),
+        "B": (ldtp.B, after[:, :, None]),
+        "C": (ldtp.C, padding[:, None, :]),
+    }
+    for name, (array, mask) in outside.items():
+        bad = np.argwhere((np.asarray(array) != 0) & mask)
+        if len(bad):
+            raise DefinitionError(
+                f"`{name}[{bad[0][0]}]` has entries outside its valid block (`dims` is {dims}); "
+                "they must be zero."
+            )
+
+
+def _summary(dims):
+    low, high = dims.min(), dims.max()
+    return f"{low}" if low == high else f"{low} to {high}"

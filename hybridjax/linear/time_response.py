@@ -1,0 +1,93 @@
+"""Time-domain computations with padded LDTP matrices, each compiled once per shape."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+@jax.jit
+def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
+    """The product `A[N-1] ... A[0]`."""
+    identity = jnp.eye(A.shape[-1], dtype=A.dtype)
+    return jax.lax.scan(lambda product, factor: (factor @ product, None), identity, A)[0]
+
+
+@jax.jit
+def states(
+    A: Float[Array, "N d d"],
+    B: Float[Array, "N d nu"],
+    u: Float[Array, "n nu"],
+    x0: Float[Array, " d"],
+    n_sections: Int[Array, " n"],
+) -> Float[Array, "time d"]:
+    """`x0` and the states after each input; `n_sections`, where each input acts."""
+
+    def advance(x, step):
+        n, u = step
+        x = A[n] @ x + B[n] @ u
+        return x, x
+
+    _, later = jax.lax.scan(advance, x0, (n_sections, u))
+    return jnp.concatenate([x0[None], later])
+
+
+@jax.jit
+def outputs(
+    C: Float[Array, "N ny d"],
+    D: Float[Array, "N ny nu"],
+    u: Float[Array, "n nu"],
+    x: Float[Array, "n d"],
+    n_sections: Int[Array, " n"],
+) -> Float[Array, "n ny"]:
+    """`C x + D u` at each section."""
+    return jnp.einsum("nij,nj->ni", C[n_sections], x) + jnp.einsum("nij,nj->ni", D[n_sections], u)
+
+
+@functools.partial(jax.jit, static_argnames="n_lags")
+def impulse_response(
+    A: Float[Array, "N d d"],
+    B: Float[Array, "N d nu"],
+    C: Float[Array, "N ny d"],
+    D: Float[Array, "N ny nu"],
+    n_lags: int,
+) -> Float[Array, "N lags ny nu"]:
+    """`D[n]`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]` at `[n, r]`, for all sections at once."""
+
+    def advance(x, _):
+        return jnp.roll(A @ x, 1, axis=0), C @ x
+
+    _, later = jax.lax.scan(advance, jnp.roll(B, 1, axis=0), length=n_lags - 1)
+    return jnp.concatenate([D[None], later]).swapaxes(0, 1)
+
+
+@jax.jit
+def periodic_state(
+    A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "P N nu"]
+) -> Float[Array, " d"]:
+    r"""The start of the response with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
+
+    Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
+    part of an unstable system would drown the stable one.
+    """
+    periods, n_sections, _ = u.shape
+    rest = jnp.zeros(A.shape[-1])
+    w = jax.vmap(lambda u: states(A, B, u, rest, jnp.arange(n_sections))[-1])(u)
+    z_N = jnp.exp(2j * jnp.pi * jnp.arange(periods) / periods)
+    lifted = z_N[:, None, None] * jnp.eye(A.shape[-1]) - monodromy(A)
+    x = jnp.linalg.solve(lifted, jnp.fft.fft(w, axis=0)[..., None])
+    return jnp.mean(x[..., 0], axis=0).real
+
+
+@jax.jit
+def characteristic_polynomial(matrix: Float[Array, "d d"]) -> Float[Array, " coefficients"]:
+    """Coefficients of det(x I - matrix), highest power first (Faddeev-LeVerrier recursion)."""
+    d = matrix.shape[0]
+    identity = jnp.eye(d)
+    coefficients, adjugate = [jnp.ones(())], identity
+    for k in range(1, d + 1):
+        step = matrix @ adjugate
+        coefficients.append(-jnp.trace(step) / k)
+        adjugate = step + coefficients[-1] * identity
+    return jnp.stack(coefficients)

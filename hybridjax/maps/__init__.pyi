@@ -1,0 +1,1 @@
+from .section_map import Arrival as Arrival, SectionMap as SectionMap

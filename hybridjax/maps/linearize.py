@@ -1,0 +1,118 @@
+"""From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.compile import quick_jit
+from .._core.per_lane import by_lane
+from .._core.results import Result
+from .._core.tracing import is_traced
+from ..engine.jacobian import tape_jacobian
+from ..engine.lanes import for_each_chart, only
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from ..orbits.cycle import LimitCycle
+from ..systems.output import Output
+from ..systems.structure import Structure
+from .place import as_placed
+from .placed import PlacedSections
+
+
+def linearize(
+    cycle: LimitCycle,
+    sections,
+    outputs: Sequence[str | Output] | str | Output | None = None,
+    inputs: Sequence[str] | str | None = None,
+) -> LDTP:
+    """The linear discrete-time periodic system between consecutive sections, eqs. (5) and (6).
+
+    A[n] and B[n] map deviations at section n, and the input held until section n+1, to deviations
+    at section n+1; exact, through all events in between, also where the interval's end depends
+    on the state. C[n] and D[n] give the outputs' deviations at section n.
+
+    The coordinates on a section are deviations of the chart's states; on a state-based section of
+    a clocked system the time of crossing comes first. On a section given by a level function, the
+    coordinate that the flow changes fastest across it is left out. `ldtp.coordinates` names them.
+
+    **Arguments:** `sections`, a family or `PlacedSections`; `outputs`, names or `Output`s, by
+    default all states that every chart defines; `inputs`, by default all.
+
+    **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
+    lies, or an input that does not exist; `ComputationError` as `place_sections`.
+    """
+    placed = as_placed(cycle, sections)
+    s = Structure(cycle.system)
+    traced = is_traced(placed)
+    if outputs is None:
+        outputs = [
+            n for n in s.state_names()
+            if all(s.state_function(n, a) is not None for a in range(len(s.charts)))
+        ]  # fmt: skip
+    z = s.resolve_outputs(outputs)
+    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
+        z.require(int(a))
+    names = cycle.system.inputs if inputs is None else _as_tuple(inputs)
+    for name in names:
+        if name not in cycle.system.inputs:
+            raise DefinitionError(
+                f"there is no input '{name}'; inputs are {', '.join(cycle.system.inputs)}."
+            )
+    columns = np.array([cycle.system.inputs.index(n) for n in names], int)
+    A, B = _section_jacobians(placed)
+    C, D = _output_jacobians(placed, tuple(z.items))
+    d = s.d + 1
+    if not traced:
+        A, B, C, D = jax.device_get((A, B, C, D))
+        d = int(np.max(np.asarray(placed.dims)))
+    return LDTP(
+        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
+        inputs=tuple(names), outputs=z.names,
+        coordinates=None if traced else placed.coordinates(),
+    )  # fmt: skip
+
+
+def _as_tuple(names):
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+@quick_jit
+def _section_jacobians(placed: PlacedSections):
+    """A (N, c, c) and B (N, c, nu), padded; NaN where the flow failed."""
+    n = 1 + placed.lanes.q.shape[0]
+    following, _, target = placed.onwards()
+    jacobian, _ = tape_jacobian(placed.cycle.system, placed.lanes, target, placed.tape)
+    jacobian = jnp.where((placed.result == Result.OK)[:, None, None], jacobian, jnp.nan)
+    embed, select = placed.frames()
+    after = select[following]
+    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+
+
+@quick_jit
+def _output_jacobians(placed: PlacedSections, outputs):
+    """C (N, ny, c) and D (N, ny, nu), padded."""
+    s, lanes = Structure(placed.cycle.system), placed.lanes
+    z = s.resolve_outputs(outputs)
+    n, ny = 1 + s.d, len(outputs)
+
+    def work(a, here, out):
+        if not z.defined(a):
+            return out
+        d = s.dims[a]
+
+        def jacobian(t, q):
+            J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
+            t, q, u = J(t, q, jnp.zeros(s.nu))
+            return jnp.concatenate([t[:, None], q, jnp.zeros((ny, s.d - d)), u], axis=1)
+
+        J = by_lane(jacobian)(only(here, lanes.t), only(here, lanes.q[:d]))
+        return jnp.where(here, J, out)
+
+    everywhere = jnp.ones(placed.n_sections, bool)
+    J = for_each_chart(
+        s, lanes.chart, everywhere, work, jnp.zeros((ny, n + s.nu, placed.n_sections))
+    )
+    J = jnp.moveaxis(J, -1, 0)
+    return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]

@@ -1,0 +1,112 @@
+"""The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
+
+import operator
+from typing import NamedTuple, SupportsIndex
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._core.compile import quick_jit
+from .._core.results import Result, update_result
+from .._core.tracing import is_traced
+from ..engine.move import move
+from ..errors import ComputationError, DefinitionError
+from ..orbits.cycle import LimitCycle
+from ..systems.structure import Structure
+from .place import as_placed
+from .placed import PlacedSections
+
+
+class Arrival(NamedTuple):
+    """Where a section map arrives. Times and states are NaN if it does not, and so are their
+    derivatives."""
+
+    t: Float[Array, ""]
+    """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""
+    q: Float[Array, " n"]
+    """State in the chart in which the cycle crosses section j."""
+    result: Int[Array, ""]
+    """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's."""
+
+
+class SectionMap(eqx.Module):
+    """P_{i->j}: from a state on section i, under a constant input, to section j.
+
+    Call it with `q` (n_i,), a state near section i of the cycle, `u` (nu,), zero by default, and
+    `t`, the time there (by default the cycle's). It returns an `Arrival` and can be
+    differentiated, jitted and vmapped. Made under a JAX transformation, where charts are not
+    known, it takes and returns states that are padded with zeros to the largest chart's dimension.
+
+    **Raises** (outside of JAX transformations): `ComputationError` if section j is not reached,
+    or is reached in another chart than the cycle's.
+    """
+
+    placed: PlacedSections
+    i: int = eqx.field(static=True)
+    j: int = eqx.field(static=True)
+    dims: tuple[int, int] = eqx.field(static=True)
+    """Dimensions n_i and n_j."""
+
+    @property
+    def fixed_point(self) -> Float[Array, " n"]:
+        """The cycle's state at section i."""
+        return self.placed.lanes.q[: self.dims[0], self.i]
+
+    def __call__(self, q, u=None, t=None) -> Arrival:
+        q = jnp.asarray(q, float)
+        if q.shape != self.fixed_point.shape:
+            raise DefinitionError(
+                f"the map starts on {self.placed.family.describe(self.i)}, where the state has "
+                f"shape {self.fixed_point.shape}; got {q.shape}."
+            )
+        nu = len(self.placed.cycle.system.inputs)
+        u = jnp.broadcast_to(jnp.asarray(0.0 if u is None else u, float), (nu,))
+        t = self.placed.lanes.t[self.i] if t is None else jnp.asarray(t, float)
+        arrival = _map(self.placed, self.i, self.j, q, u, t)
+        if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
+            raise ComputationError(
+                f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
+                f"{code.message}."
+            )
+        return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
+
+
+def section_map(cycle: LimitCycle, sections, i: SupportsIndex, j: SupportsIndex) -> SectionMap:
+    """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
+
+    For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
+    range; `ComputationError` as `place_sections`.
+    """
+    placed = as_placed(cycle, sections)
+    i, j = operator.index(i), operator.index(j)
+    for k in (i, j):
+        if not 0 <= k < placed.n_sections:
+            raise DefinitionError(
+                f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
+            )
+    s, chart = Structure(cycle.system), placed.lanes.chart
+    dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
+    return SectionMap(placed, i, j, dims)
+
+
+@quick_jit
+def _map(placed, i, j, q, u, t) -> Arrival:
+    system = placed.cycle.system
+    s = Structure(system)
+    pick = slice(i, i + 1)
+    lanes = placed.lanes
+    q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
+    start = eqx.tree_at(
+        lambda x: (x.t, x.q, x.chart, x.armed, x.events, x.pace),
+        lanes,
+        (t[None], q, lanes.chart[pick], lanes.armed[:, pick], lanes.events[pick],
+         lanes.pace[:, pick]),
+    )  # fmt: skip
+    target = placed.target(jnp.array([j]), t[None], jnp.array([1 if j <= i else 0]))
+    moved = move(system, start, u[:, None], target, placed.cycle.settings)
+    end = moved.lanes
+    result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
+    keep = jnp.where(result == Result.OK, 1.0, jnp.nan)  # a factor makes derivatives NaN, too
+    return Arrival((keep * end.t)[0], (keep * end.q)[:, 0], result[0])

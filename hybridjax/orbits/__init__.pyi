@@ -1,0 +1,1 @@
+from .branches.branch import BranchEnd as BranchEnd, BranchPoint as BranchPoint

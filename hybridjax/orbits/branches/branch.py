@@ -1,0 +1,109 @@
+"""A branch of limit cycles along a parameter, and the points at which its stability changes."""
+
+import operator
+from typing import NamedTuple, SupportsIndex
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from ..._core.memo import remembered
+from ..._core.results import Result
+from ...errors import DefinitionError
+from ..cycle import LimitCycle
+from ..sweep.limit_cycles import LimitCycles
+
+
+KINDS = ("fold", "branch point", "flip", "Neimark-Sacker")
+
+
+class BranchPoint(NamedTuple):
+    """Where a multiplier of a branch lies on the unit circle."""
+
+    kind: str
+    """"fold" (a multiplier +1: the branch turns back), "branch point" (+1: another branch crosses),
+    "flip" (-1: a cycle of twice the period begins) or "Neimark-Sacker" (a complex pair)."""
+    index: int
+    """Its row in the branch."""
+    value: float
+    """Of the parameter."""
+    multipliers: Complex[np.ndarray, " r"]
+    """The critical ones among them lie on the unit circle to rounding."""
+
+
+class BranchEnd(NamedTuple):
+    """Why a branch ends where it does."""
+
+    value: float
+    """Of the parameter."""
+    result: Result
+    """`Result.OK` where the values end."""
+    message: str
+
+
+class Branch(eqx.Module):
+    """Limit cycles along one parameter, in the order in which the branch meets them.
+
+    **Fields:**
+
+    - `parameter`: its name. `values` (K,): of it.
+    - `cycles`: the K cycles; `branch[k]` is one of them, with its system.
+    - `points`: where multipliers cross the unit circle, each a row of the branch of its own.
+    - `ends`: why the branch begins and ends where it does.
+    """
+
+    parameter: str = eqx.field(static=True)
+    values: Float[np.ndarray, " K"]
+    cycles: LimitCycles
+    points: tuple[BranchPoint, ...]
+    ends: tuple[BranchEnd, BranchEnd]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, k: SupportsIndex) -> LimitCycle:
+        return self.cycles[operator.index(k)]
+
+    def find(self, kind: str) -> tuple[BranchPoint, ...]:
+        """The points of a kind: "fold", "branch point", "flip" or "Neimark-Sacker".
+
+        **Raises:** `DefinitionError` for another kind.
+        """
+        if kind not in KINDS:
+            raise DefinitionError(f"there is no kind '{kind}' of points; kinds are {KINDS}.")
+        return tuple(p for p in self.points if p.kind == kind)
+
+    @remembered
+    def multipliers(self) -> Complex[np.ndarray, "K r"]:
+        """Floquet multipliers of every cycle, the largest first, filled up with zeros."""
+        rows = [self[k].multipliers for k in range(len(self))]
+        out = np.zeros((len(rows), max(map(len, rows))), complex)
+        for row, values in zip(out, rows, strict=True):
+            row[: len(values)] = values
+        return out
+
+    @remembered
+    def stable(self) -> Bool[np.ndarray, " K"]:
+        """Which cycles are stable. At a marked point itself this is left to rounding."""
+        return np.array([self[k].stable for k in range(len(self))])
+
+    def largest(self, output: str) -> Float[np.ndarray, " K"]:
+        """The largest value of a state or output on each cycle, as accurate as a plot needs.
+
+        **Raises:** `DefinitionError` for a name that does not exist.
+        """
+        return np.array([np.nanmax(self[k].trajectory()(output)[1]) for k in range(len(self))])
+
+    def summary(self) -> str:
+        """One line for each marked point and each end."""
+        lines = [f"from {self.parameter} = {self.ends[0].value:.9g}: {self.ends[0].message}"]
+        for p in self.points:
+            on = p.multipliers[np.abs(np.abs(p.multipliers) - 1) < 1e-6]
+            at = ", ".join(f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in on)
+            lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
+        lines.append(f"to {self.parameter} = {self.ends[1].value:.9g}: {self.ends[1].message}")
+        return "\n  ".join(lines)
+
+    def __repr__(self):
+        name = type(self.cycles.systems).__name__
+        return f"Branch({name} along {self.parameter}: {len(self)} cycles)\n  {self.summary()}"

@@ -1,0 +1,151 @@
+"""Where the search for a limit cycle begins: from a guess to a state on the section."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._core.compile import quick_jit
+from .._core.results import Result
+from ..engine.events import start_lanes
+from ..engine.move import move
+from ..engine.target import Target, toward, until
+from ..engine.watch import slopes, watch
+from ..errors import ComputationError, DefinitionError
+from ..sections.families import AtEvent, Crossing, ListLevels
+from ..systems.structure import Structure
+from ..systems.system import Guess
+from ..systems.transition import Scheduled
+
+
+class _Plane(eqx.Module):
+    """The hyperplane through a point, across the flow."""
+
+    point: Array
+    normal: Array
+
+    def __call__(self, t, q):
+        return jnp.dot(q - self.point, self.normal)
+
+
+def begin(system, guess, section, turns, settle, max_period, settings):
+    """Start state, base section and expected period, from a guess."""
+    s = Structure(system)
+    guess = system.guess() if guess is None else guess
+    if not isinstance(guess, Guess | None):
+        raise DefinitionError(
+            f"the guess is a Guess(chart, state) or a LimitCycle, not {type(guess).__name__}."
+        )
+    if guess is None:
+        raise DefinitionError(
+            f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
+        )
+    a = s.chart_index(guess.chart)
+    if guess.state.shape != (s.dims[a],) or not np.all(np.isfinite(guess.state)):
+        raise DefinitionError(
+            f"the guess must give finite values for the {s.dims[a]} states "
+            f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
+        )
+    if not np.isfinite(guess.time):
+        raise DefinitionError(f"the guess's time must be finite; got {guess.time}.")
+    if not isinstance(turns, int | np.integer) or turns < 1:
+        raise DefinitionError(f"turns must be a whole number, at least 1; got {turns}.")
+    for name, value in (("settle", settle), ("max_period", max_period)):
+        if not (np.isfinite(value) and value >= 0):
+            raise DefinitionError(f"{name} must be a finite time, not negative; got {value}.")
+    period = system.period()
+    if period is not None and not (np.isfinite(period) and period > 0):
+        raise DefinitionError(f"the clock's period must be positive; it is {period}.")
+    for transition in s.transitions:
+        if isinstance(transition.guard, Scheduled):
+            ratio = np.inf if period is None else float(period / transition.guard.period)
+            if not abs(ratio - round(min(ratio, 1e9))) < 1e-6:
+                raise DefinitionError(
+                    f"the schedule of '{transition.name}' must divide the clock's period, which is "
+                    f"{period}: otherwise no turn is like the last one."
+                )
+    if period is not None and section is not None:
+        raise DefinitionError(
+            "a clocked system returns to itself after its clock's period: leave out `section` "
+            "(sections of any kind are for linearize and run_experiments)."
+        )
+    if section is not None:
+        section.check(s)
+    q = np.zeros((s.d, 1))
+    q[: s.dims[a], 0] = guess.state
+    lanes = start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
+    if settle:
+        wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
+        moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
+        _require(moved, "settling", s)
+        lanes = moved.lanes
+        if period is not None:
+            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - wait)
+    if period is not None:
+        return lanes, None, turns * jnp.asarray(period, float)
+    a = int(lanes.chart[0])
+    q = np.asarray(lanes.q)[: s.dims[a], 0]
+    f, level, rate = jax.device_get(_at_start(system, lanes, section))
+    f = f[: s.dims[a]]
+    if not f.any():
+        raise ComputationError(
+            f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
+            "moves: start elsewhere."
+        )
+    on_section = rate < 0 and abs(level) <= -1e-9 * max_period * rate
+    if section is None:
+        plane = _Plane(jnp.asarray(q), jnp.asarray(f / np.linalg.norm(f)))
+        section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
+    event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
+
+    def next_meeting(lanes, doing):
+        target = toward(jnp.full(1, jnp.inf), event, lanes.t + max_period)
+        moved = _go(system, lanes, section, target, settings)
+        _require(moved, f"{doing} ({section})", s)
+        return moved.lanes
+
+    if not on_section:
+        lanes = next_meeting(lanes, "looking for the section")
+    back = lanes
+    for _ in range(turns):
+        back = next_meeting(back, "looking for the return to the section")
+    return lanes, section, back.t[0] - lanes.t[0]
+
+
+@quick_jit
+def _at_start(system, lanes, section):
+    """The field (d,), and the value and rate of the section's level, if it has one."""
+    s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, u)[:, 0]
+    target = _to_section(section, until(lanes.t))
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, jnp.ones(1, bool))
+    return f, seen.value[-1, 0], seen.rate[-1, 0]
+
+
+def _require(moved, doing: str, s: Structure) -> None:
+    result = Result(int(moved.result[0]))
+    if result != Result.OK:
+        lanes = moved.lanes
+        raise ComputationError(
+            f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
+            f"'{s.names[int(lanes.chart[0])]}': {result.message}. Check the guess and the guards "
+            "with `simulate(..., throw=False)`."
+        )
+
+
+@quick_jit
+def _go(system, lanes, section, target, settings):
+    """One lane to a time, or to one section, however many steps it takes."""
+    s = Structure(system)
+    settings = dataclasses.replace(settings, max_steps=1_000_000)
+    return move(system, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
+
+
+def _to_section(section, target: Target) -> Target:
+    """The target with the section's level, if it has one."""
+    if not isinstance(section, Crossing):
+        return target
+    return dataclasses.replace(target, levels=ListLevels((section,)))

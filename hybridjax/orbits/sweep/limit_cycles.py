@@ -1,0 +1,177 @@
+"""Limit cycles of many systems at once: the points of a parameter sweep side by side."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from ..._core.memo import remembered
+from ..._core.precision import require_x64
+from ..._core.results import Result
+from ..._core.threads import thread_count
+from ...engine.lanes import Lanes
+from ...engine.move import Settings
+from ...errors import DefinitionError
+from ...systems.structure import check_system
+from ...systems.system import HybridSystem
+from ..cycle import LimitCycle
+from .batches import FULL, QUICK, Tiles
+
+
+# Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
+_SMALL = 2000
+
+
+class LimitCycles(eqx.Module):
+    """Limit cycles of S systems; `cycles[i]` is one of them.
+
+    **Fields**, with the systems on the first axis:
+
+    - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`:
+        see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `codes`: the events of one period, in order, filled up with negative numbers.
+
+    `base`, `settings`, `conserved` and `turns` are those of every cycle.
+    """
+
+    systems: HybridSystem
+    base: object
+    period: Float[np.ndarray, " S"]
+    start: Lanes
+    legs: Lanes
+    factors: Float[np.ndarray, "S K d d"]
+    residual: Float[np.ndarray, " S"]
+    iterations: Int[np.ndarray, " S"]
+    result: Int[np.ndarray, " S"]
+    codes: Int[np.ndarray, "S R"]
+    settings: Settings
+    conserved: dict[str, Float[Array, ""]]
+    turns: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.result)
+
+    def __getitem__(self, i: int) -> LimitCycle:
+        """The cycle of system i, found or not (see its `result`)."""
+        pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
+        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+        return LimitCycle(
+            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.start),
+            pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
+            pick(self.result),
+            tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
+            self.conserved, self.turns,
+        )  # fmt: skip
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " S"]:
+        """Which cycles were found."""
+        return self.result == Result.OK
+
+    @property
+    def failed(self) -> Int[np.ndarray, " F"]:
+        """Indices of the systems without a cycle."""
+        return np.flatnonzero(~self.ok)
+
+    @remembered
+    def multipliers(self) -> Complex[np.ndarray, "S d"]:
+        """Floquet multipliers, the largest first; NaN where there is no cycle.
+
+        Eigenvalues of the product of the factors, filled up with zeros: those far below the
+        largest are lost in rounding. `cycles[i].multipliers` sees them, too.
+        """
+        factors = np.asarray(self.factors)
+        product = factors[:, 0]
+        for k in range(1, factors.shape[1]):
+            product = factors[:, k] @ product
+        product = np.where(self.ok[:, None, None], product, 0.0)
+        values = np.linalg.eigvals(product).astype(complex)
+        order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+        values = np.take_along_axis(values, order, axis=-1)
+        values[~self.ok] = np.nan
+        return values
+
+    def summary(self, limit: int = 5) -> str:
+        """`10000/10000 found`, or why the first `limit` of the others were not."""
+        text = [f"{self.ok.sum()}/{len(self)} found"]
+        text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
+        if len(self.failed) > limit:
+            text.append(f"and {len(self.failed) - limit} more")
+        return "; ".join(text)
+
+    def __repr__(self):
+        return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
+
+
+def find_limit_cycles(
+    systems: HybridSystem | Sequence[HybridSystem],
+    guess: LimitCycle,
+    *,
+    settings: Settings | None = None,
+    batch: int = 250,
+    workers: int | None = None,
+    progress: bool = False,
+) -> LimitCycles:
+    """Find the limit cycles of many systems that differ in their parameters.
+
+    Newton starts from the guess for some of them, side by side, and then for as many again from
+    the cycles of their neighbors, until all are done. Systems for which that fails flow freely
+    for some periods, and Newton starts again from where they are then.
+
+    **Arguments:**
+
+    - `systems`: a list of systems of one class, or one system whose arrays all have a leading
+        axis, as `equinox.filter_vmap` makes it:
+        `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
+    - `guess`: a limit cycle of a similar system.
+    - `settings`: accuracy of the flow; by default 1e-9 per step.
+    - `batch`: systems per compiled call.
+    - `workers`: threads that run calls at the same time; by default all cores on CPU.
+    - `progress`: show a progress bar over the systems.
+
+    **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
+    for those.
+
+    **Raises:** `DefinitionError` for systems that do not belong together.
+    """
+    settings = Settings(rtol=1e-9, atol=1e-9) if settings is None else settings
+    systems = _stacked(systems)
+    require_x64(systems)
+    arrays, rest = eqx.partition(systems, eqx.is_array)
+    S = len(jax.tree_util.tree_leaves(arrays)[0])
+    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
+    if not isinstance(guess, LimitCycle):
+        raise DefinitionError(
+            f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
+            "find_limit_cycle first."
+        )
+    programs = QUICK if S <= _SMALL else FULL
+    tiles = Tiles(systems, guess, settings, min(batch, S), thread_count(workers), programs)
+    found = tiles.solve(S, progress)
+    seen = found.seen
+    return LimitCycles(
+        systems, guess.base, found.period, found.start, seen.legs, found.factors,
+        seen.distance, found.steps, found.result, found.codes, settings, guess.conserved,
+        guess.turns,
+    )  # fmt: skip
+
+
+def _stacked(systems) -> HybridSystem:
+    if isinstance(systems, HybridSystem):
+        shapes = {x.shape[:1] for x in jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_array))}
+        if len(shapes) != 1 or () in shapes:
+            raise DefinitionError(
+                "all arrays of `systems` need the same leading axis, one entry for each system: "
+                "make it by equinox.filter_vmap, or pass a list of systems."
+            )
+        return systems
+    systems = list(systems)
+    kinds = {jax.tree_util.tree_structure(eqx.filter(x, eqx.is_array)) for x in systems}
+    if len(kinds) != 1 or not all(isinstance(x, HybridSystem) for x in systems):
+        raise DefinitionError("`systems` must be at least one system, all of the same class.")
+    arrays = [eqx.filter(x, eqx.is_array) for x in systems]
+    stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
+    return eqx.combine(stacked, eqx.filter(systems[0], eqx.is_array, inverse=True))

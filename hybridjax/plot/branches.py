@@ -1,0 +1,82 @@
+"""Branches of limit cycles against their parameter."""
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..errors import DefinitionError
+from ..orbits.branches.branch import KINDS, Branch
+from ..systems.structure import Structure
+from .look import COLORS, CYCLE, axes_or_new, label_of
+
+
+_MARKS = dict(
+    zip(KINDS, (("o", "red"), ("D", "orange"), ("s", "green"), ("^", "purple")), strict=True)
+)
+
+
+def branch(
+    *branches: Branch,
+    output: str | None = None,
+    labels: Mapping[str, str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Branches of limit cycles, with marks where their stability changes.
+
+    Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
+
+    **Arguments:**
+
+    - `branches`: from `follow`, all along the same parameter.
+    - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
+        default the first state of the chart in which the cycle begins.
+    - `labels`: texts for the axes by name, e.g. `{"Vin": "supply (V)"}`.
+    - `ax`: where to draw; a new figure of one column's width by default.
+
+    **Raises:** `DefinitionError` for branches along different parameters, or a name that does not
+    exist.
+    """
+    names = {b.parameter for b in branches}
+    if len(names) != 1:
+        raise DefinitionError(
+            f"branches to be drawn together need the same parameter; these have {sorted(names)}."
+        )
+    with axes_or_new(ax) as ax:
+        shown = set()
+        for b, color in zip(branches, itertools.cycle(CYCLE)):
+            name = _first_state(b) if output is None else output
+            height = b.largest(name)
+            for part, stable in _parts(b):
+                ax.plot(b.values[part], height[part], "-" if stable else "--", color=color)
+            for p in b.points:
+                marker, tint = _MARKS[p.kind]
+                ax.plot(
+                    p.value, height[p.index], marker, ms=4.5, mfc="white", mec=COLORS[tint],
+                    mew=1.2, zorder=5, label=None if p.kind in shown else p.kind,
+                )  # fmt: skip
+                shown.add(p.kind)
+        gray = COLORS["gray"]
+        ax.plot([], [], "-", color=gray, label="stable")
+        ax.plot([], [], "--", color=gray, label="unstable")
+        ax.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
+        ax.locator_params(axis="x", nbins=6)
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+    return ax
+
+
+def _first_state(branch: Branch) -> str:
+    cycle = branch[0]
+    return Structure(cycle.system).charts[int(cycle.start.chart[0])].states[0]
+
+
+def _parts(branch: Branch) -> list[tuple[slice, bool]]:
+    """Rows from one marked point to the next, and whether the cycles between them are stable."""
+    cuts = [0, *(p.index for p in branch.points), len(branch) - 1]
+    parts = []
+    for a, b in itertools.pairwise(cuts):
+        if b > a:
+            inside = branch.stable[a + 1 : b] if b > a + 1 else branch.stable[[a, b]]
+            parts.append((slice(a, b + 1), bool(np.mean(inside) > 0.5)))
+    return parts

@@ -1,0 +1,93 @@
+"""What a model explains of measured data, and what it leaves."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy import stats
+
+from ..identify.series.amplitude import AmplitudeSweep
+from ..identify.series.validation import Validation
+from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
+
+
+def validation(
+    found: Validation, *, cycles: int = 4, labels: Mapping[str, str] | None = None
+) -> Figure:
+    """Measured and simulated outputs, and correlations of the residuals; one row per output.
+
+    Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
+    ones, right: with earlier inputs. Bars are their means over all sections, in units of their
+    standard deviation; beyond the shaded band lie 1 % of them where there is no correlation.
+
+    **Arguments:** `cycles` to show; `labels`: texts for the outputs and inputs by name.
+    """
+    N, ny = found.n_sections, len(found.outputs)
+    shown = slice(max(len(found.measured) - cycles * N, 0), None)
+    time = (found.start + np.arange(len(found.measured)))[shown] / N
+    limit = stats.norm.isf(0.005)
+    with style():
+        figure, axes = new_figure(ny, 3, width=PAGE, height=0.6 + 1.6 * ny)
+        for i, name in enumerate(found.outputs):
+            signal, auto, cross = axes[i]
+            signal.plot(time, found.simulated[shown, i], color=CYCLE[0], label="simulated")
+            measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
+            signal.plot(time, found.measured[shown, i], **measured)
+            signal.set_ylabel(rf"$\delta$ {label_of(name, labels)}")
+            signal.set_title(f"fit {found.fit[i]:.2f} %")
+            signal.margins(x=0.02)
+            after = np.arange(1, 1 + found.autocorrelation.shape[1])
+            _stems(auto, after, found.autocorrelation[:, :, i], CYCLE[0], 0.0, limit)
+            auto.set_title(f"residuals: p = {found.whiteness[i]:.2g}")
+            for j, _ in enumerate(found.inputs):
+                lags = np.arange(found.cross_correlation.shape[1])
+                values = found.cross_correlation[:, :, i, j]
+                _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
+            cross.set_title(f"with the input: p = {found.independence[i]:.2g}")
+        axes[0, 0].legend(loc="best")
+        axes[-1, 0].set_xlabel("time (cycles)")
+        for ax in axes[-1, 1:]:
+            ax.set_xlabel("lag (sections)")
+        figure.align_ylabels(axes[:, 0])
+        letters(axes)
+    return figure
+
+
+def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
+    """Means over the sections of values that have variance 1 each."""
+    count = np.maximum((values != 0).sum(axis=0), 1)
+    mean = values.sum(axis=0) / np.sqrt(count)
+    ax.axhspan(-limit, limit, color="0.9", zorder=0)
+    ax.vlines(lags + shift, 0, mean, color=color, lw=1.2)
+    ax.axhline(0, color="black", lw=0.5)
+    ax.set_ylabel("std. deviations")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def amplitude(
+    sweep: AmplitudeSweep,
+    *,
+    misfit: float | None = None,
+    labels: Mapping[str, str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """The misfit of a linear model against the amplitude of the input, on logarithmic axes.
+
+    **Arguments:** `misfit`: one that is allowed; the amplitude up to which it is kept is marked.
+    """
+    with axes_or_new(ax) as ax:
+        for i, name in enumerate(sweep.outputs):
+            line = dict(marker="o", color=CYCLE[i % len(CYCLE)], label=label_of(name, labels))
+            ax.loglog(sweep.amplitudes, sweep.misfit[:, i], **line)
+        bad = sweep.failed > 0
+        for a in sweep.amplitudes[bad]:
+            ax.axvline(a, color=COLORS["red"], lw=0.6, ls=":")
+        if misfit is not None:
+            ax.axhline(misfit, color="0.5", lw=0.6)
+            ax.axvline(sweep.limit(misfit), color="0.5", lw=0.6)
+        ax.set_xlabel("amplitude of the input")
+        ax.set_ylabel("misfit / output (rms)")
+        ax.legend()
+    return ax

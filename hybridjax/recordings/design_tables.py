@@ -1,0 +1,126 @@
+"""The next experiment as a table, for hardware that plays one, and back."""
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import DefinitionError, FileFormatError
+from ..experiments.design.design import Design
+from .phase import Phase
+from .read import read_columns
+from .recording import Recording
+
+
+def write_design(
+    path: str | os.PathLike,
+    design: Design,
+    *,
+    cycles: int | None = None,
+    period: int | float | None = None,
+    rate: int | float | None = None,
+) -> None:
+    """Write the inputs of a design to a CSV file.
+
+    - Without `period`, for hardware that triggers on phase: a row for each section, with the
+      columns `experiment`, `cycle`, `section`, `phase` and the inputs, which are held until the
+      next section. `read_design` reads it.
+    - With `period` and `rate`, for hardware that does not: a row for each sample, with
+      `experiment`, `time` and the inputs.
+
+    **Arguments:** `cycles` of each experiment, by default its periods P; `period` of the cycle in
+    seconds and `rate` in samples per second.
+
+    **Raises:** `DefinitionError` for a period without a rate, and a file that cannot be written.
+    """
+    if (period is None) != (rate is None):
+        raise DefinitionError("a table against time needs both the period and the rate.")
+    u = np.asarray(design.inputs(cycles or design.periods))
+    S, n, _ = u.shape
+    N = design.n_sections
+    if period is None:
+        header = ["experiment", "cycle", "section", "phase"]
+        k = np.arange(n)
+        place = np.stack([k // N, k % N, (k % N) / N], axis=1)
+    else:
+        if not (period > 0 and rate > 0):
+            raise DefinitionError(f"period and rate must be positive, not {period} and {rate}.")
+        header = ["experiment", "time"]
+        time = np.arange(int(n / N * period * rate)) / rate
+        u = u[:, np.minimum((time * N / period + 1e-9).astype(int), n - 1)]
+        place = time[:, None]
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with open(temporary, "w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file)
+            table.writerow([*header, *design.input_names])
+            for s in range(S):
+                for row in np.concatenate([place, u[s]], axis=1):
+                    table.writerow([s, *(f"{x:.10g}" for x in row)])
+        os.replace(temporary, path)
+    except OSError as error:
+        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
+    """The inputs by name, for each experiment and section, from a table of `write_design`.
+
+    **Raises:** `FileFormatError` if it is no such table, or has experiments of different lengths.
+    """
+    columns = read_columns(Path(path))
+    needed = ("experiment", "cycle", "section", "phase")
+    if not set(needed) <= set(columns):
+        raise FileFormatError(f"'{path}' has no columns {', '.join(needed)}: no table by phase.")
+    experiment = columns["experiment"]
+    count = np.unique(experiment, return_counts=True)[1]
+    if (count != count[0]).any() or (np.diff(experiment) < 0).any():
+        raise FileFormatError(f"'{path}' has experiments of different lengths, or out of order.")
+    return {k: v.reshape(len(count), -1) for k, v in columns.items() if k not in needed}
+
+
+def add_command(
+    recording: Recording,
+    phase: Phase,
+    command: dict[str, Float[np.ndarray, "S n"]],
+    n_sections: int,
+) -> Recording:
+    """A recording with what hardware was told to apply, where that was not measured itself.
+
+    Experiment s was applied in trial s, from the first whole cycle on, and each value held from its
+    section to the next. Sample such inputs in the middle: `section_data(..., sampled="middle")`.
+
+    **Arguments:** `command`: as `read_design` gives it. `n_sections`: N of the design.
+
+    **Raises:** `DefinitionError` if the numbers of trials and experiments differ, or names are
+    taken.
+    """
+    trials = []
+    for name, values in command.items():
+        if name in recording.signals:
+            raise DefinitionError(f"the recording has a signal '{name}' already.")
+        if len(values) != len(recording.trials):
+            raise DefinitionError(
+                f"there are {len(recording.trials)} trials, but the table has {len(values)} "
+                "experiments."
+            )
+    for s, (trial, stretches) in enumerate(zip(recording.trials, phase.stretches, strict=True)):
+        added = np.full((len(trial.time), len(command)), np.nan)
+        if stretches:
+            winding = stretches[0]
+            inside = (trial.time >= winding.time[0]) & (trial.time <= winding.time[-1])
+            now = np.interp(trial.time[inside], winding.time, winding.phase)
+            k = np.floor((now - np.ceil(winding.phase[0])) * n_sections).astype(int)
+            for i, values in enumerate(command.values()):
+                row = np.pad(values[s], (1, 1), constant_values=0.0)  # nothing before and after
+                added[inside, i] = row[np.clip(k + 1, 0, len(row) - 1)]
+        signals = dict(zip(recording.signals, trial.values.T, strict=True))
+        signals |= dict(zip(command, added.T, strict=True))
+        units = dict(zip(recording.signals, recording.units, strict=True))
+        about = {"events": trial.events, "units": units, "name": trial.name}
+        trials.append(Recording(trial.time, signals, **about))
+    return Recording.join(trials)

@@ -1,0 +1,128 @@
+"""The flow under the transformations of JAX: exact derivatives through events, in both modes."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import Settings, move
+from hybridjax.engine.target import until
+from hybridjax.systems.structure import Structure
+
+from ..conftest import no_compilation
+
+
+# Compiled in half the time, to slower programs.
+compiled = ft.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+TIGHT = Settings(rtol=1e-13, atol=1e-13, max_steps=256)
+
+
+def flow(system, chart, q, u, t, end):
+    """State after the flow of one lane from time t to `end`, and its result."""
+    s = Structure(system)
+    q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
+    index = jnp.full(1, s.chart_index(chart), jnp.int32)
+    lanes = start_lanes(s, t[None], index, q)
+    moved = move(system, lanes, u[:, None], until(end[None]), TIGHT)
+    return moved.lanes.q[:, 0], moved.result[0]
+
+
+def ball(x):
+    """(y, v) of a bouncing ball; x = (y0, v0, gravity, restitution, input, duration)."""
+    system = hj.models.BouncingBall(g=x[2], restitution=x[3])
+    return flow(system, "fall", x[:2], x[4:5], jnp.zeros(()), x[5])[0]
+
+
+def ball_exact(x):
+    y0, v0, g, e, u, end = x
+    g = g - u
+    speed = jnp.sqrt(v0**2 + 2 * g * y0)
+    first = (v0 + speed) / g
+    rest = end - first
+    return jnp.stack([e * speed * rest - g * rest**2 / 2, e * speed - g * rest])
+
+
+X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
+
+
+def with_value(derivative):
+    """The derivative of `ball` together with its value."""
+    return derivative(lambda x: (ball(x),) * 2, has_aux=True)
+
+
+def test_forward_mode_has_a_closed_form():
+    found, value = compiled(with_value(jax.jacfwd))(X)
+    np.testing.assert_allclose(value, ball_exact(X), rtol=1e-13)
+    np.testing.assert_allclose(found, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
+
+
+def test_reverse_mode_and_second_derivatives_have_a_closed_form():
+    found, first = compiled(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
+    np.testing.assert_allclose(first, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
+    exact = jax.hessian(ball_exact)(X)
+    np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
+
+
+def test_mapped_over_parameters_and_differentiated():
+    many = X + jnp.linspace(0.0, 0.1, 4)[:, None] * jnp.array([1.0, 1, 0, 1, 0, 1])
+    found, value = compiled(jax.vmap(with_value(jax.jacrev)))(many)
+    np.testing.assert_allclose(value, jax.vmap(ball_exact)(many), rtol=1e-12)
+    exact = jax.vmap(jax.jacrev(ball_exact))(many)
+    np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-12)
+
+
+def hopper(x):
+    """Body of the lossy hopper after a touchdown; x = (q, input, retention, stiffness, end)."""
+    system = hj.models.VerticalHopper(retention=x[5], k=x[6])
+    return flow(system, "flight", x[:4], x[4:5], jnp.asarray(0.3), x[7])[0][:2]
+
+
+H = jnp.array([1.58, 1.2, 0.13, -4.1, 0.1, 0.8, 10.0, 0.45])
+
+
+def differences(f, x, e=1e-4):
+    """Derivative by central differences of fourth order."""
+    step = [(f(x + e * d) - f(x - e * d)) / (2 * e) for d in np.eye(len(x))]
+    wide = [(f(x + 2 * e * d) - f(x - 2 * e * d)) / (4 * e) for d in np.eye(len(x))]
+    return (4 * np.stack(step, -1) - np.stack(wide, -1)) / 3
+
+
+def test_derivatives_through_a_touchdown_that_loses_speed():
+    found = compiled(jax.jacrev(hopper))(H)
+    np.testing.assert_allclose(found, differences(compiled(hopper), H), atol=2e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_through_a_touchdown_that_loses_speed():
+    first = compiled(jax.jacfwd(hopper))
+    np.testing.assert_allclose(first(H), compiled(jax.jacrev(hopper))(H), rtol=1e-12, atol=1e-13)
+    hessian = compiled(jax.jacfwd(jax.jacfwd(hopper)))(H)
+    np.testing.assert_allclose(hessian, differences(first, H), atol=1e-7)
+
+
+def test_lanes_fail_one_by_one():
+    """NaN, blow-up and a good lane in one batch; no lane disturbs another."""
+    system = hj.models.BouncingBall()
+    s = Structure(system)
+    q = jnp.array([[1.0, jnp.nan, 1e-3, 2.0], [0.0, 0.0, 0.0, 0.0]])
+    chart = jnp.zeros(4, jnp.int32)
+    end = jnp.full(4, 0.6)
+    u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
+    lanes = start_lanes(s, jnp.zeros(4), chart, q)
+    moved = move(system, lanes, u, until(end), TIGHT)
+    bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
+    assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
+    x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
+    np.testing.assert_allclose(moved.lanes.q[:, 0], ball_exact(x), rtol=1e-12)
+
+
+def test_new_numbers_compile_nothing():
+    """Parameters, states, times and tolerances are data; only shapes and types are compiled."""
+
+    hj.simulate(hj.models.BouncingBall(g=9.0), "fall", (1.0, 0.0), 1.0)
+    with no_compilation():
+        hj.simulate(hj.models.BouncingBall(g=8.0), "fall", (1.1, 0.1), 1.3, time=0.2)

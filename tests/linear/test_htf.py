@@ -1,0 +1,279 @@
+"""Harmonic transfer functions: exact values, three independent ways, prediction, bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.test_util
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+from hybridjax.linear.frequency_response import all_harmonics
+
+from .conftest import blocks_at_random, simulate_blocks
+
+
+# (dimensions, outputs, inputs): even and odd N, dimensions that vary, several inputs and outputs.
+SHAPES = [((3, 2, 4, 1), 2, 2), ((2, 3, 2, 1, 2), 1, 2), ((2,), 1, 1)]
+seeds = st.integers(0, 2**32)
+
+# Entries [11, 12, 21, 22] of the synthetic system, by three computations of other authorship.
+PUBLISHED = {
+    (0.375, -1): [
+        0.0870168190513334 - 0.104740591601557j,
+        0.136930404243867 - 0.00849364383439899j,
+        0.177542319766032 + 0.140249777743610j,
+        0.134084302352115 - 0.796760585940421j,
+    ],
+    (0.375, 0): [
+        -0.0155718849200377 - 0.464519781537683j,
+        0.484791750769152 - 0.709348830936539j,
+        0.235944251031154 - 0.0967340260593198j,
+        0.0585691535423064 - 0.530709131326115j,
+    ],
+    (0.375, 1): [
+        -0.197463738897656 - 0.135644964777583j,
+        0.0618068237928809 + 0.0962861563864056j,
+        -0.0812503237919122 - 0.0468651742365950j,
+        -0.0201885781660477 - 0.349237894484668j,
+    ],
+    (0.375, -3): [
+        0.129440211654674 - 0.309710364604919j,
+        0.108293999329773 + 0.142151815209447j,
+        0.230149561273491 - 0.0164694307438428j,
+        0.00395711407298096 + 0.118194359053034j,
+    ],
+    (1.625, -2): [
+        0.475877515178889 + 0.256577098584805j,
+        -0.339553047966473 - 0.183100528413716j,
+        0.187680805609276 + 0.0872384969698475j,
+        -0.178822341466915 + 0.126416075679082j,
+    ],
+    (1.625, 0): [
+        0.140386880184425 - 0.300228235870690j,
+        0.0150139226075515 - 0.476099969045470j,
+        -0.500707893221423 - 0.0742555981401889j,
+        -0.0857139174906250 - 0.217184053891879j,
+    ],
+    (1.625, 2): [
+        -0.0494116126341986 + 0.329373837208814j,
+        -0.0776748978722265 + 0.261505315857721j,
+        0.111638050073311 - 0.180491401910538j,
+        -0.154576116293404 + 0.0915279198993514j,
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def exact(hopper, reference):
+    return hopper.htf(reference("htf_exact_isochron")["f"])
+
+
+def test_published_values(synthetic):
+    htf = synthetic.htf([0.375, 1.625])
+    for (f, m), expected in PUBLISHED.items():
+        found = htf[m][[0.375, 1.625].index(f)]
+        np.testing.assert_allclose(found.ravel(), expected, rtol=0, atol=1e-14)
+
+
+def test_hopper_at_all_frequencies_and_harmonics(exact, reference):
+    truth = reference("htf_exact_isochron")
+    expected = hj.HTF(
+        truth["f"],
+        np.moveaxis(truth["H"], 0, 1)[..., None],
+        truth["m"],
+        32,
+        outputs=("yM", "vM"),
+    )
+    assert exact.H.shape == (32, 620, 2, 1) and exact.harmonics == tuple(range(-16, 16))
+    assert np.max(exact.error(expected)) < 1e-12
+    np.testing.assert_array_equal(exact.error(exact), 0)
+    assert exact.harmonic_errors(expected).shape == (32, 2)
+
+
+@settings(max_examples=25)
+@given(seeds, st.sampled_from(SHAPES), st.sampled_from([0.125, 0.375, -0.375, 0.875]))
+def test_three_ways_agree(seed, shape, f):
+    dims, ny, nu = shape
+    N = len(dims)
+    blocks = blocks_at_random(seed, dims, ny, nu)
+    ldtp = hj.LDTP.from_blocks(*blocks)
+    htf = ldtp.htf([f])
+    assert htf.harmonics == all_harmonics(N) and len(htf.harmonics) == N
+    assert htf.harmonics[0] == -(N // 2)
+
+    # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
+    w, m = 2 * np.pi * f / N, np.array(htf.harmonics)
+    h = np.asarray(ldtp.impulse_response(120))
+    G = np.einsum("nrij,r->nij", h, np.exp(-1j * w * np.arange(120)))
+    H = np.einsum("mn,nij->mij", np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N), G) / N
+    np.testing.assert_allclose(htf.H[:, 0], H, rtol=0, atol=1e-12)
+
+    # The DFT of the response to a cosine, once the transient has died.
+    periods, settle = 8, 160 // N
+    u = np.zeros(((settle + periods) * N, nu))
+    j = seed % nu
+    u[:, j] = np.cos(w * np.arange(len(u)) + 0.3)
+    _, y = simulate_blocks(blocks, u, np.zeros(dims[0]))
+    Y, U = np.fft.fft(y[settle * N :], axis=0), np.fft.fft(u[settle * N :, j])
+    k = round(f * periods)
+    lines = (k + m * periods) % (periods * N)
+    np.testing.assert_allclose(htf.H[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12)
+
+
+@settings(max_examples=10)
+@given(seeds, st.sampled_from(SHAPES), st.floats(-3, 3))
+def test_symmetry_for_real_signals_and_period_in_f(seed, shape, f):
+    dims, ny, nu = shape
+    N = len(dims)
+    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    htf = ldtp.htf([f, -f, f + N])
+    for m in range(-N, N + 1):
+        np.testing.assert_allclose(htf[-m][1], np.conj(htf[m][0]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(htf[m][2], htf[m][0], rtol=0, atol=1e-12)
+
+
+@settings(max_examples=10)
+@given(seeds, st.sampled_from(SHAPES))
+def test_prediction_is_the_periodic_response(seed, shape):
+    dims, ny, nu = shape
+    N, P = len(dims), 4
+    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    u = np.random.default_rng(seed).normal(size=(P * N, nu))
+    y = ldtp.simulate(u, ldtp.periodic_state(u, P))
+    htf = ldtp.htf(np.arange(P * N // 2 + 1) / P)  # negative frequencies by symmetry
+    np.testing.assert_allclose(htf.predict(u), y, rtol=0, atol=1e-11)
+
+
+def test_derivatives(synthetic):
+    f = jnp.array([0.4, 1.7])
+
+    @jax.jit
+    def values(A, B, C, D, f):
+        htf = hj.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
+        return jnp.stack([htf.H.real, htf.H.imag])
+
+    arrays = (synthetic.A, synthetic.B, synthetic.C, synthetic.D, f)
+    jax.test_util.check_grads(values, arrays, order=1, modes=("fwd", "rev"), eps=1e-6)
+    u = jnp.cos(2 * jnp.pi * 0.5 * jnp.arange(12) / 6)[:, None] * jnp.ones(2)
+
+    def loss(htf):
+        return jnp.sum(htf.predict(u) ** 2)
+
+    htf = synthetic.htf([0.5])
+    gradient = eqx.filter_grad(lambda H: loss(eqx.tree_at(lambda h: h.H, htf, H)))(htf.H)
+    bump = jnp.zeros_like(htf.H).at[2, 0, 1, 0].set(1e-6)
+    up, down = (loss(eqx.tree_at(lambda h: h.H, htf, htf.H + s * bump)) for s in (1, -1))
+    np.testing.assert_allclose((up - down) / 2e-6, gradient[2, 0, 1, 0].real, rtol=1e-6)
+
+
+def test_jit_and_vmap(synthetic):
+    f = np.array([0.3, 0.7])
+    plain = synthetic.htf(f, harmonics=(0, 1))
+    jitted = eqx.filter_jit(lambda ldtp, f: ldtp.htf(f, (0, 1)))(synthetic, f)
+    np.testing.assert_allclose(jitted.H, plain.H, rtol=0, atol=1e-14)
+    assert jitted.harmonics == (0, 1)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
+    batch = eqx.tree_at(lambda ldtp: ldtp.B, batch, batch.B.at[1].multiply(2.0))
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].multiply(2.0))
+    many = eqx.filter_vmap(lambda ldtp: ldtp.htf(f, (0, 1)))(batch)
+    np.testing.assert_allclose(many.H, np.stack([plain.H, 2 * plain.H]), rtol=0, atol=1e-14)
+
+
+def test_one_frequency_and_one_harmonic(synthetic):
+    htf = synthetic.htf(0.4, harmonics=0)
+    assert htf.H.shape == (1, 1, 2, 2)
+    np.testing.assert_array_equal(htf[0], htf.harmonic(0))
+    np.testing.assert_array_equal(synthetic.htf([0.4], (1, -3))[3], synthetic.htf([0.4])[-3])
+
+
+def test_interpolation_fills_the_gaps(hopper):
+    step = 1 / 128
+    f = np.arange(1, 16 / step) * step
+    f = f[(2 * f) % 1 != 0]
+    wanted = np.array([0.0, 0.5, 1.0, 3.3, 16.0, -0.25])
+    sparse = hopper.htf(f).interpolate(wanted)
+    exact = hopper.htf(wanted)
+    assert np.max(sparse.error(exact)) < 1e-5  # the resonance is 0.05 cycles per period wide
+    at_grid = hopper.htf(f, (0, 1)).interpolate(f[[3, 77]])
+    assert np.max(at_grid.error(hopper.htf(f[[3, 77]], (0, 1)))) < 1e-12
+
+
+def test_repr(exact, synthetic):
+    assert repr(exact) == (
+        "HTF(exact; harmonics -16 to 15; 620 frequencies 0.01562 to 9.984 cycles/period; "
+        "inputs (u); outputs (yM, vM); 32 sections)"
+    )
+    assert "harmonics -3, 0;" in repr(synthetic.htf([0.1], (0, -3)))
+    jax.jit(lambda htf: repr(htf) and 0)(exact)
+
+
+def test_bad_requests(synthetic):
+    cases = [
+        (dict(f=[0.1], harmonics=(0, 3)), "Harmonic 3 does not exist.*6 sections.*-3 to 2"),
+        (dict(f=[0.1], harmonics=(0, 0)), "distinct"),
+        (dict(f=[0.1], harmonics=()), "at least one"),
+        (dict(f=[0.1], harmonics=(0.5,)), "must be integers"),
+        (dict(f=[np.nan]), "`f` is not finite at index"),
+        (dict(f=[[0.1]]), "`f` must have 1 axes"),
+        (dict(f=[0.1j]), "`f` must be real"),
+    ]
+    for arguments, message in cases:
+        with pytest.raises(hj.DefinitionError, match=message):
+            synthetic.htf(**arguments)
+
+
+def test_a_multiplier_on_the_unit_circle_is_named():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    ldtp = hj.LDTP.from_blocks([turn] * 3, [np.ones((2, 1))] * 3, [np.ones((1, 2))] * 3)
+    f = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
+    assert np.all(np.isfinite(ldtp.htf([0.1, f + 1e-6]).H))
+    with pytest.raises(hj.DefinitionError, match=rf"f = {f:g} .* unbounded: the multiplier"):
+        ldtp.htf([0.1, f])
+    integrator = hj.LDTP(np.ones((4, 1, 1)), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+    with pytest.raises(hj.DefinitionError, match="f = 2 cycles per period is unbounded"):
+        integrator.htf([0.3, 2.0, 0.7])
+
+
+def test_bad_containers():
+    H = np.zeros((2, 3, 1, 1), complex)
+    good = dict(f=[0.1, 0.2, 0.3], H=H, harmonics=(0, 1), n_sections=4)
+    hj.HTF(**good)
+    cases = [
+        ({"f": [0.1, 0.2]}, "2 frequencies"),
+        ({"H": H[0]}, "harmonic, frequency, output, input"),
+        ({"H": H > 0}, "complex numbers"),
+        ({"harmonics": (0, 2)}, "-2 to 1"),
+        ({"harmonics": (1, 0)}, "ascending"),
+        ({"harmonics": (-1, 0, 1)}, "3 harmonics"),
+        ({"outputs": ("a", "b")}, "1 outputs need 1 names"),
+    ]
+    for change, message in cases:
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.HTF(**(good | change))
+
+
+def test_bad_use(synthetic, hopper):
+    htf = synthetic.htf([0.25, 0.75], harmonics=(-1, 0, 1))
+    u = np.cos(2 * np.pi * 0.25 * np.arange(24) / 6)[:, None] * np.ones(2)
+    cases = [
+        (lambda: htf[2], "Harmonic 2 is not stored"),
+        (lambda: htf.select((0, 2)), "Harmonic 2 is not stored"),
+        (lambda: htf.predict(u[:23]), "multiple of 6 samples"),
+        (lambda: htf.predict(u[:, :1]), "2 columns"),
+        (lambda: htf.predict(u**2), "f = 0 cycles per period, where"),
+        (lambda: htf.select((0, 1)).predict(u), "symmetric about 0"),
+        (lambda: htf.interpolate([2.0]), "f = 2 cycles per period is too far"),
+        (lambda: synthetic.htf(0.25).interpolate([0.3]), "at least two"),
+        (lambda: htf.error(htf.select((0, 1))), "different harmonics"),
+        (lambda: htf.error(synthetic.htf([0.25, 0.7], (-1, 0, 1))), "different frequencies"),
+        (lambda: htf.error(hopper.htf([0.25, 0.75], (-1, 0, 1))), "different sections"),
+        (lambda: htf.select(1).error(htf.select(1)), "Harmonic 0 is not stored"),
+        (lambda: jax.jit(lambda u: htf.predict(u))(u), "outside of jit"),
+    ]
+    for call, message in cases:
+        with pytest.raises(hj.DefinitionError, match=message):
+            call()
+    assert htf.select((-1, 0)).harmonics == (-1, 0)
+    np.testing.assert_array_equal(htf.predict(0 * u), 0)

@@ -1,0 +1,196 @@
+"""LDTP: simulation, impulse response, periodic states, transformations, bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.test_util
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import hybridjax as hj
+
+from .conftest import blocks_at_random, simulate_blocks
+
+
+# Few shapes, so that few programs are compiled: (dimensions, outputs, inputs).
+SHAPES = [((3, 2, 4, 1), 2, 1), ((2, 2, 3), 1, 2), ((2,), 1, 1)]
+seeds = st.integers(0, 2**32)
+
+
+@settings(max_examples=15)
+@given(seeds, st.sampled_from(SHAPES), st.sampled_from([0, 1, -3]))
+def test_simulation_follows_the_definition(seed, shape, start):
+    dims, ny, nu = shape
+    blocks = blocks_at_random(seed, dims, ny, nu, gain=1.0)
+    ldtp = hj.LDTP.from_blocks(*blocks)
+    rng = np.random.default_rng(seed)
+    u, x0 = rng.normal(size=(11, nu)), rng.normal(size=dims[start % len(dims)])
+    xs, ys = simulate_blocks(blocks, u, x0, start)
+    states = ldtp.states(u, x0, start)
+    for row, x in zip(states, xs, strict=True):
+        np.testing.assert_allclose(row[: len(x)], x, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(row[len(x) :], 0)
+    np.testing.assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
+
+
+def test_impulse_response_is_the_response_to_impulses(synthetic):
+    lags, N = 9, synthetic.n_sections
+    response = synthetic.impulse_response(lags)
+    assert response.shape == (N, lags, 2, 2)
+    for k in range(N):
+        for j in range(2):
+            u = np.zeros((lags, 2))
+            u[0, j] = 1
+            y = synthetic.simulate(u, start=k)
+            for r in range(lags):
+                np.testing.assert_allclose(response[(k + r) % N, r, :, j], y[r], atol=1e-14)
+
+
+def test_markov_parameters_of_the_hopper(hopper, reference):
+    expected = reference("ldtp_isochron")["markov"]
+    found = hopper.impulse_response(97)[..., 0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@settings(max_examples=10)
+@given(seeds, st.sampled_from(SHAPES))
+def test_periodic_state_returns_to_itself(seed, shape):
+    dims, ny, nu = shape
+    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    u = np.random.default_rng(seed).normal(size=(4 * len(dims), nu))
+    x = ldtp.states(u, ldtp.periodic_state(u, 4))
+    np.testing.assert_allclose(x[-1], x[0], rtol=0, atol=1e-12)
+
+
+def test_periodic_state_of_an_unstable_system():
+    # Phi^20 has the entries 1e20 and 1e-20; the stable part must not drown.
+    A = [np.array([[10.0, 0.0], [3.0, 0.1]])]
+    ldtp = hj.LDTP.from_blocks(A, [np.ones((2, 1))], [np.eye(2)])
+    u = np.random.default_rng(0).normal(size=(20, 1))
+    expected = np.linalg.solve(
+        np.eye(40) - np.kron(np.roll(np.eye(20), 1, axis=0), A[0]),
+        np.kron(np.roll(np.eye(20), 1, axis=0), np.ones((2, 1))) @ u[:, 0],
+    )
+    np.testing.assert_allclose(ldtp.periodic_state(u, 20), expected[:2], rtol=1e-12)
+
+
+def test_jit_vmap_and_gradients(synthetic):
+    u = np.random.default_rng(1).normal(size=(18, 2))
+    plain = synthetic.simulate(u)
+    np.testing.assert_allclose(eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14)
+    many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
+    np.testing.assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    many = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
+    np.testing.assert_allclose(many[0], plain, atol=1e-14)
+    assert not np.allclose(many[1], plain)
+
+    @jax.jit
+    def scaled(s):
+        ldtp = hj.LDTP(s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        return jnp.concatenate([ldtp.simulate(u)[-1], ldtp.periodic_state(u, 3)])
+
+    jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("fwd", "rev"), eps=1e-6)
+
+
+def test_blocks_may_be_traced(synthetic):
+    @jax.jit
+    def last(a):
+        ldtp = hj.LDTP.from_blocks([a, a[:, :1]], [a[:, 1:], a[:, 1:]], [a[:1], a[:1, :1]])
+        return ldtp.simulate(jnp.ones((4, 1)))[-1, 0]
+
+    with pytest.raises(hj.DefinitionError, match=r"`A\[0\]` has shape \(2, 2\)"):
+        last(jnp.eye(2))  # A[0] must be (1, 2)
+
+
+def test_systems_known_outside_of_jit_work_inside(synthetic):
+    @jax.jit
+    def inside(u):
+        ldtp = hj.LDTP(synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        htf = ldtp.htf([0.3, 0.4], (0, 1))
+        repr(ldtp), repr(htf), repr(synthetic.htf([0.3]))
+        x0 = synthetic.periodic_state(u, 2)
+        return ldtp.simulate(u, x0[:3]), htf.error(synthetic.htf([0.3, 0.4], (0, 1)))
+
+    u = np.random.default_rng(2).normal(size=(12, 2))
+    y, error = inside(u)
+    np.testing.assert_allclose(y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13)
+    np.testing.assert_allclose(error, 0, atol=1e-14)
+
+
+def test_names_and_repr(synthetic, hopper):
+    assert (synthetic.inputs, synthetic.outputs) == (("u0", "u1"), ("y0", "y1"))
+    assert repr(hopper) == "LDTP(32 sections, dimension 2 to 4, inputs (u), outputs (yM, vM))"
+    jax.jit(lambda ldtp: repr(ldtp) and 0)(hopper)
+    ldtp = hj.LDTP(np.zeros((2, 1, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)), outputs="height")
+    assert (ldtp.inputs, ldtp.outputs) == (("u",), ("height",))
+    assert ldtp.multipliers().shape == (0,)
+
+
+GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1, 3))}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"A": np.zeros((2, 3, 2))}, "`A` has shape"),
+        ({"A": np.zeros((2, 3))}, "`A` must have 3 axes"),
+        ({"A": np.full((2, 3, 3), np.nan)}, "`A` is not finite at index"),
+        ({"A": np.zeros((2, 3, 3), complex)}, "`A` must be real"),
+        ({"A": [[[1.0, 2.0]], [[1.0]]]}, "`A` is not a rectangular array"),
+        ({"A": "three"}, "`A` must hold real numbers"),
+        ({"B": np.zeros((3, 3, 1))}, "`B` has shape"),
+        ({"C": np.zeros((2, 1, 2))}, "`C` has shape"),
+        ({"C": np.zeros((2, 0, 3))}, "without empty axes"),
+        ({"D": np.zeros((2, 1, 2))}, "`D` has shape"),
+        ({"dims": [3, 3, 3]}, "`dims` must hold 2 integers"),
+        ({"dims": [3.0, 3.0]}, "`dims` must hold 2 integers"),
+        ({"dims": [3, 4]}, "`dims` must lie between 1 and 3"),
+        ({"dims": [3, 2], "A": np.ones((2, 3, 3))}, r"`A\[0\]` has entries outside"),
+        ({"dims": [3, 2], "B": np.ones((2, 3, 1))}, r"`B\[0\]` has entries outside"),
+        ({"dims": [3, 2], "C": np.ones((2, 1, 3))}, r"`C\[1\]` has entries outside"),
+        ({"inputs": ("a", "b")}, "1 inputs need 1 names"),
+        ({"C": np.zeros((2, 2, 3)), "outputs": ("a", "a")}, "`outputs` repeats a name"),
+        ({"coordinates": [("x", "y", "z")]}, "`coordinates` names 1 sections"),
+    ],
+)
+def test_bad_definitions(change, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.LDTP(**(GOOD | change))
+
+
+def test_single_precision_is_refused():
+    with pytest.raises(hj.errors.PrecisionError, match="A.*float32"):
+        hj.LDTP(**(GOOD | {"A": jnp.zeros((2, 3, 3), jnp.float32)}))
+
+
+def test_bad_blocks():
+    A, B, C, D = blocks_at_random(0, (2, 3), 1, 1)
+    with pytest.raises(hj.DefinitionError, match=r"`B\[1\]` has shape \(3, 1\).*x\[0\] 2 coord"):
+        hj.LDTP.from_blocks(A, [B[0], B[0]], C, D)
+    with pytest.raises(hj.DefinitionError, match="`A` has 2 matrices, `C` 1"):
+        hj.LDTP.from_blocks(A, B, C[:1])
+    with pytest.raises(hj.DefinitionError, match=r"`C\[0\]` must have 2 axes"):
+        hj.LDTP.from_blocks(A, B, [c[0] for c in C])
+    with pytest.raises(hj.DefinitionError, match="`A` has 0 matrices"):
+        hj.LDTP.from_blocks([], [], [])
+
+
+def test_bad_calls(synthetic):
+    u = np.zeros((6, 2))
+    with pytest.raises(hj.DefinitionError, match="`u` has 1 columns"):
+        synthetic.simulate(u[:, :1])
+    with pytest.raises(hj.DefinitionError, match="`u` must have 2 axes"):
+        synthetic.simulate(u[:, 0])
+    with pytest.raises(hj.DefinitionError, match="`x0` has 3 entries, but section 1 has 2"):
+        hj.LDTP.from_blocks(*blocks_at_random(0, (4, 2), 1, 2)).states(u, np.zeros(3), start=1)
+    with pytest.raises(hj.DefinitionError, match="`u` has 6 samples, but 2 periods of 6"):
+        synthetic.periodic_state(u, 2)
+    with pytest.raises(hj.DefinitionError, match="`n_lags` must be at least 1"):
+        synthetic.impulse_response(0)
+    rotation = hj.LDTP([[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2)))
+    rotation.periodic_state(np.ones((3, 1)), 3)
+    with pytest.raises(hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"):
+        rotation.periodic_state(np.ones((4, 1)), 4)

@@ -1,0 +1,219 @@
+"""Floquet multipliers and ranks of factor chains, against constructed and published truths."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.integrate import solve_ivp
+from scipy.optimize import linear_sum_assignment
+
+import hybridjax as hj
+from hybridjax.linear.multipliers import product_eigenvalues, product_rank
+
+
+RTOL = 1e-12
+
+
+def basis_at_random(rng, d):
+    """A matrix with condition number at most 9."""
+    left, right = (np.linalg.qr(rng.normal(size=(d, d)))[0] for _ in range(2))
+    return left * np.exp(rng.uniform(-np.log(3), np.log(3), d)) @ right
+
+
+def chain(rng, multipliers, extra):
+    """Factors `S[n+1] diag(d[n], ...) S[n]^-1`; `extra[n]` more coordinates at section `n`.
+
+    The product has the multipliers given (a complex number stands for a pair); the extra
+    coordinates drive the others and die at a section where there are none.
+    """
+    N = len(extra)
+    modes = sum(1 + np.iscomplex(m) for m in multipliers)
+    S = [basis_at_random(rng, modes + e) for e in extra]
+    share = rng.dirichlet(np.full(N, 10.0))
+    factors = []
+    for n in range(N):
+        after = extra[(n + 1) % N]
+        core = rng.normal(size=(modes + after, modes + extra[n])) / 2
+        core[:, :modes] = 0
+        place = 0
+        for m in multipliers:
+            if np.iscomplex(m):
+                z = abs(m) ** share[n] * np.exp(1j * np.angle(m) * share[n])
+                core[place : place + 2, place : place + 2] = [[z.real, -z.imag], [z.imag, z.real]]
+                place += 2
+            else:
+                sign = np.sign(m) if n == 0 else 1.0
+                core[place, place] = sign * abs(m) ** share[n]
+                place += 1
+        factors.append(S[(n + 1) % N] @ core @ np.linalg.inv(S[n]))
+    return factors
+
+
+def relative_error(found, true):
+    true = np.concatenate([[m, np.conj(m)] if np.iscomplex(m) else [m] for m in true])
+    assert found.shape == true.shape
+    cost = np.abs(found[:, None] - true) / np.abs(true)
+    return cost[linear_sum_assignment(cost)].max()
+
+
+def assert_conjugate_and_sorted(found):
+    assert np.all(np.diff(np.abs(found)) <= 1e-15 * np.abs(found[:-1]))
+    values = list(found)
+    assert all(np.conj(value) in values for value in values)
+
+
+@pytest.mark.parametrize(
+    "multipliers",
+    [
+        [1.0, 7e-16],
+        [1.0, -7e-16],
+        [0.3 + 0.7j, 1e-10],
+        [0.9, 0.5 + 0.1j, -1e-3, 1e-6],
+        [1e8, 1.0, 1e-8],
+        [1.0, 1e-20, 1e-40],
+        [0.5, 0.500001],
+        [-1.0, 1.0],
+        [1j, -0.5],
+    ],
+)
+@pytest.mark.parametrize("sections", [32, 41])
+def test_widely_spread_multipliers_keep_their_digits(multipliers, sections):
+    rng = np.random.default_rng(sections)
+    found = product_eigenvalues(chain(rng, multipliers, np.zeros(sections, int)), RTOL)
+    assert relative_error(found, multipliers) < 1e-11
+    assert_conjugate_and_sorted(found)
+
+
+@pytest.mark.parametrize("multipliers", [[1.0, 1e-9], [0.3 + 0.7j, -1e-6], [0.9, 0.5 + 0.1j, 2.0]])
+def test_dimensions_that_vary_add_no_multipliers(multipliers):
+    # The extra coordinates drive the modes: the smaller a mode, the more its digits depend on them.
+    rng = np.random.default_rng(5)
+    extra = rng.integers(0, 3, 32)
+    extra[5] = 0
+    factors = chain(rng, multipliers, extra)
+    found = product_eigenvalues(factors, RTOL)
+    assert relative_error(found, multipliers) < 1e-10
+    assert product_rank(factors[5:] + factors[:5], RTOL) == len(found)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32), st.integers(1, 7), st.integers(1, 9))
+def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
+    rng = np.random.default_rng(seed)
+    factors = [rng.normal(size=(d, d)) for _ in range(sections)]
+    found = product_eigenvalues(factors, RTOL)
+    product = np.linalg.multi_dot(factors[::-1]) if sections > 1 else factors[0]
+    expected = np.linalg.eigvals(product)
+    size = np.prod([np.linalg.norm(factor, 2) for factor in factors])
+    cost = np.abs(found[:, None] - expected)
+    # Backward error of the product, magnified by the sensitivity of its eigenvalues.
+    vectors = np.linalg.eig(product)[1]
+    bound = 1e-14 * d * sections * size * np.linalg.cond(vectors)
+    assert cost[linear_sum_assignment(cost)].max() <= bound
+    assert_conjugate_and_sorted(found)
+
+
+def test_van_der_pol_has_a_multiplier_of_7e_16_beside_one():
+    mu, period, sections = 3.0, 8.85909549971992, 32
+
+    def field(t, z):
+        x, v, J = z[0], z[1], z[2:].reshape(2, 2)
+        slope = np.array([[0, 1], [-2 * mu * x * v - 1, mu * (1 - x**2)]])
+        return [v, mu * (1 - x**2) * v - x, *(slope @ J).ravel()]
+
+    state, factors = np.array([2.02330414168221, 0.0]), []
+    for _ in range(sections):
+        start = [*state, 1, 0, 0, 1]
+        span = (0, period / sections)
+        end = solve_ivp(field, span, start, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+        state = end[:2]
+        factors.append(end[2:].reshape(2, 2))
+    found = product_eigenvalues(factors, RTOL)
+    assert abs(found[0] - 1) < 1e-9
+    assert abs(found[1] / 6.98947562607979e-16 - 1) < 1e-9
+    small = np.linalg.eigvals(np.linalg.multi_dot(factors[::-1]))
+    assert min(abs(small / 6.98947562607979e-16 - 1)) > 1e-3  # what the product alone would say
+
+
+def test_structural_zeros_are_counted_not_guessed():
+    nilpotent = np.diag([1.0, 1.0], 1)  # dies after three cycles
+    assert product_eigenvalues([nilpotent], RTOL).shape == (0,)
+    assert [product_rank([nilpotent] * k, RTOL) for k in (1, 2, 3)] == [2, 1, 0]
+    mixed = np.zeros((4, 4))
+    mixed[:3, :3], mixed[:, 3] = nilpotent, [3, 2, 5, 0.5]
+    change = basis_at_random(np.random.default_rng(0), 4)
+    mixed = change @ mixed @ np.linalg.inv(change)
+    np.testing.assert_allclose(product_eigenvalues([mixed], RTOL), [0.5], rtol=1e-12)
+    assert product_rank([mixed], RTOL) == 3
+    # A true multiplier of 1e-20 is none of them, a zero factor is.
+    assert len(product_eigenvalues([np.diag([1, 1e-2])] * 10, RTOL)) == 2
+    assert len(product_eigenvalues([np.diag([1.0, 0.0])] * 10, RTOL)) == 1
+
+
+def test_defective_and_cyclic_products():
+    jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
+    np.testing.assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
+    permutation = [np.roll(np.eye(6), 1, axis=0)]
+    roots = product_eigenvalues(permutation, RTOL)
+    np.testing.assert_allclose(roots**6, 1, atol=1e-13)
+    assert_conjugate_and_sorted(roots)
+    np.testing.assert_array_equal(product_eigenvalues([np.eye(3)] * 4, RTOL), np.ones(3))
+
+
+def test_synthetic_system(synthetic):
+    expected = 0.3270675 + 0.0596405918293070j
+    np.testing.assert_allclose(
+        synthetic.multipliers(), [expected, expected.conjugate()], rtol=0, atol=1e-14
+    )
+    assert [synthetic.rank(n) for n in range(6)] == [2] * 6
+
+
+def test_hopper(hopper, reference):
+    data = reference("ldtp_isochron")
+    found = hopper.multipliers()
+    np.testing.assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
+    assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
+    np.testing.assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
+
+
+def test_multipliers_agree_at_every_section(hopper):
+    first = hopper.multipliers()
+    for n in (3, 17):
+        rolled = hj.LDTP(
+            *(jnp.roll(a, -n, axis=0) for a in (hopper.A, hopper.B, hopper.C, hopper.D)),
+            dims=jnp.roll(hopper.dims, -n),
+        )
+        np.testing.assert_allclose(rolled.multipliers(), first, rtol=0, atol=1e-13)
+
+
+def test_characteristic_polynomial(synthetic, hopper):
+    for ldtp in (synthetic, hopper):
+        r = len(ldtp.multipliers())
+        coefficients = np.asarray(ldtp.characteristic_polynomial())
+        expected = np.poly(ldtp.multipliers()).real
+        np.testing.assert_allclose(coefficients[: r + 1], expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(coefficients[r + 1 :], 0, atol=1e-13)
+
+
+def test_characteristic_polynomial_is_smooth_where_multipliers_meet():
+    def coefficients(a):
+        A = jnp.array([[[0.5, 1.0], [a, 0.5]]])
+        return hj.LDTP(A, jnp.ones((1, 2, 1)), jnp.ones((1, 1, 2))).characteristic_polynomial()
+
+    np.testing.assert_allclose(jax.jacfwd(coefficients)(0.0), [0, 0, -1], atol=1e-15)
+    np.testing.assert_allclose(jax.jacrev(coefficients)(0.0), [0, 0, -1], atol=1e-15)
+
+
+def test_factors_that_are_not_finite():
+    for function in (product_eigenvalues, product_rank):
+        with pytest.raises(hj.ComputationError, match="Factor 1 .* NaN or infinity"):
+            function([np.eye(2), np.full((2, 2), np.nan)], RTOL)
+
+
+def test_multipliers_refuse_to_be_traced(synthetic):
+    with pytest.raises(hj.DefinitionError, match="works on the host"):
+        jax.jit(lambda ldtp: ldtp.multipliers())(synthetic)
+    with pytest.raises(hj.DefinitionError, match="one LDTP at a time"):
+        batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
+        batch.rank()

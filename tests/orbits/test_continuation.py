@@ -1,0 +1,289 @@
+"""Continuation against closed forms, numbers from elsewhere, and scipy.
+
+The paddle juggler's multipliers solve lambda^2 - (1 + a^2 + (1 + a)^2 s / g) lambda + a^2 = 0, with
+s the paddle's acceleration at the impact (Holmes 1982): all three kinds of points follow.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings, strategies as st
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, fsolve
+
+import hybridjax as hj
+
+from ..toys import Field
+
+
+m = hj.models
+
+
+@pytest.fixture(scope="module")
+def juggling():
+    return hj.find_limit_cycle(m.PaddleJuggler())
+
+
+def test_fold_and_flip_of_the_juggler(juggling):
+    """Small amplitudes of the paddle end in a fold, large ones in a flip."""
+    p = juggling.system
+    a, v = float(p.restitution), float(p.g * p.T / 2)
+    speed = (1 - a) * v / (1 + a)
+    fold = speed / (2 * np.pi)  # the paddle just reaches the speed: s = 0
+    s = 2 * (1 + a**2) / (1 + a) ** 2 * float(p.g)
+    flip = np.hypot(speed / (2 * np.pi), s / (2 * np.pi) ** 2)
+
+    branch = hj.continuation(juggling, "A", (0.1, 0.2, 0.35))
+    assert [x.kind for x in branch.points] == ["fold", "flip"]
+    np.testing.assert_allclose([x.value for x in branch.points], [fold, flip], rtol=1e-11)
+    np.testing.assert_allclose(branch.points[0].multipliers, [1, a**2], atol=2e-6)
+    np.testing.assert_allclose(branch.points[1].multipliers, [-1, -(a**2)], rtol=1e-9)
+    # From the fold on, two cycles, one of them unstable: the branch begins with this one.
+    assert 0.2 in branch.values and [x.message for x in branch.ends] == ["the values end"] * 2
+    at = np.flatnonzero(branch.values == 0.2)
+    assert len(at) == 2 and list(branch.stable[at]) == [False, True]
+    for k in at:
+        cycle = branch[k]
+        y = cycle.trajectory().events[0].before["y"]
+        trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi) ** 2 * y / float(p.g)
+        np.testing.assert_allclose(np.sum(cycle.multipliers).real, trace, rtol=1e-9)
+        again = hj.find_limit_cycle(cycle.system, cycle)
+        np.testing.assert_allclose(again.start.q, cycle.start.q, rtol=1e-11)
+
+
+def test_neimark_sacker_of_the_juggler(juggling):
+    """The product of the multipliers is the restitution's square: 1 where nothing is lost."""
+    branch = hj.continuation(juggling, "restitution", (0.7, 1.1))
+    (point,) = branch.find("Neimark-Sacker")
+    np.testing.assert_allclose(point.value, 1.0, rtol=1e-11)
+    np.testing.assert_allclose(np.abs(point.multipliers), 1, rtol=1e-9)
+    assert len(branch.points) == 1
+    assert branch.stable[: point.index].all() and not branch.stable[point.index + 1 :].any()
+    assert not branch.find("flip")
+    assert "Neimark-Sacker at restitution = 1 (multipliers" in repr(branch)
+    with pytest.raises(hj.DefinitionError, match="there is no kind 'Hopf'"):
+        branch.find("Hopf")
+
+
+@settings(max_examples=6, phases=(Phase.generate,))
+@given(
+    st.sampled_from(["A", "restitution", "g", "T"]),
+    st.floats(0.75, 0.95) | st.floats(1.05, 1.3),
+    st.floats(0.02, 0.3),
+)
+def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
+    """Any parameter, either way, in long steps and short ones; with T the clock changes, too."""
+    own = float(getattr(juggling.system, parameter))
+    branch = hj.continuation(juggling, parameter, np.sort([own, own * factor]), step=step)
+    for k in (0, len(branch) - 1):
+        p = branch[k].system
+        a, g, T = float(p.restitution), float(p.g), float(p.T)
+        bounce, multipliers = branch[k].trajectory().events[0], branch[k].multipliers
+        np.testing.assert_allclose(bounce.after["v"], g * T / 2, rtol=1e-9)
+        trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi / T) ** 2 * bounce.before["y"] / g
+        np.testing.assert_allclose(np.sum(multipliers), trace, atol=1e-7)
+        np.testing.assert_allclose(np.prod(multipliers), a**2, rtol=1e-9)
+
+
+def test_the_direction_of_values_is_that_of_the_branch(juggling):
+    up = hj.continuation(juggling, "A", (0.15, 0.2))
+    down = hj.continuation(juggling, "A", (0.2, 0.15))
+    np.testing.assert_array_equal(up.values, down.values[::-1])
+    assert (up.values[0], up.values[-1]) == (0.15, 0.2)
+
+
+def test_bad_input(juggling):
+    follow = hj.continuation
+    bad = {"two or more": (0.2,), "ascending": (0.1, 0.3, 0.2), "finite": (0.1, np.nan)}
+    for words, values in (bad | {"outside of the values": (0.2, 0.3)}).items():
+        with pytest.raises(hj.DefinitionError, match=words):
+            follow(juggling, "A", values)
+    with pytest.raises(hj.DefinitionError, match="no parameter 'B'; parameters are A, T, g, rest"):
+        follow(juggling, "B", (0.1, 0.2))
+    with pytest.raises(hj.DefinitionError, match="no single floating-point number"):
+        follow(juggling, "period", (0.1, 0.2))
+    with pytest.raises(hj.DefinitionError, match="longest step"):
+        follow(juggling, "A", (0.1, 0.2), step=0.0)
+    with pytest.raises(hj.DefinitionError, match="outside of JAX transformations"):
+        eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
+    with pytest.raises(hj.DefinitionError, match="turns must be a whole number, at least 1; got 0"):
+        hj.find_limit_cycle(juggling.system, turns=0)
+    with pytest.raises(hj.DefinitionError, match="closes after 1 turns, not 2"):
+        hj.find_limit_cycle(juggling.system, juggling, turns=2)
+
+
+class Spring(eqx.Module):
+    k: jax.Array = hj.parameter(1.5)
+
+
+class Pushed(hj.HybridSystem):
+    """x'' + x' / 5 + k x = cos t, with k in a part of the system."""
+
+    spring: Spring = eqx.field(default_factory=Spring)
+
+    def charts(self):
+        def field(t, q, u):
+            return q[1], jnp.cos(t) - 0.2 * q[1] - self.spring.k * q[0] + u[0]
+
+        return {"a": Field(("x", "v"), field)}
+
+    def period(self):
+        return 2 * jnp.pi
+
+
+@pytest.mark.slow
+def test_a_parameter_of_a_part():
+    """A linear oscillator: everything is known. Stiff enough, its multipliers circle the origin."""
+    cycle = hj.find_limit_cycle(Pushed(), hj.Guess("a", (0.0, 0.0)))
+    with pytest.raises(hj.DefinitionError, match="'spring.c'; parameters are spring.k"):
+        hj.continuation(cycle, "spring.c", (1.0, 2.0))
+    branch = hj.continuation(cycle, "spring.k", (1.4, 3.0))
+    assert not branch.points and branch.stable.all()
+    rate = -0.1 + 1j * np.sqrt(branch.values - 0.01)
+    truth = np.exp(2 * np.pi * rate)
+    truth = truth.real + 1j * np.abs(truth.imag)
+    np.testing.assert_allclose(branch.multipliers[:, 0], truth, atol=1e-10)
+    x = [float(branch[k].start.q[0, 0]) for k in (0, -1)]
+    k = branch.values[[0, -1]]
+    np.testing.assert_allclose(x, (k - 1) / ((k - 1) ** 2 + 0.04), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_wheel_that_comes_to_rest():
+    """On a slope too gentle the wheel no longer gets over the top: the branch ends there."""
+    wheel = m.RimlessWheel()
+    cycle = hj.find_limit_cycle(wheel, section=hj.AtEvent("impact"))
+    branch = hj.continuation(cycle, "slope", (0.02, 0.1))
+    alpha = np.pi / 8
+
+    def excess(slope):  # of the energy over what the top takes
+        w2 = 4 * np.sin(alpha) * np.sin(slope) / np.tan(2 * alpha) ** 2
+        return w2 / 2 - (1 - np.cos(slope - alpha))
+
+    limit = brentq(excess, 0.01, 0.3)
+    assert branch.ends[0].result != hj.Result.OK
+    assert 0 < branch.ends[0].value - limit < 1e-3
+    # Errors grow without bound towards the top, where the wheel all but rests.
+    away = branch.values > 1.01 * limit
+    np.testing.assert_allclose(branch.multipliers[away, 0], np.cos(2 * alpha) ** 2, rtol=1e-9)
+    assert not branch.points and branch.stable.all()
+
+
+def _duffing_turn(q, rate):
+    """One period of the model's default oscillator and its monodromy, by scipy."""
+
+    def field(t, y):
+        x, v = y[:2]
+        force = 0.5 * np.cos(rate * t)
+        slope = np.array([[0, 1], [-1 - 0.15 * x**2, -0.1]])
+        return [v, force - 0.1 * v - x - 0.05 * x**3, *(slope @ y[2:].reshape(2, 2)).ravel()]
+
+    start = [*q, 1, 0, 0, 1]
+    out = solve_ivp(field, (0, 2 * np.pi / rate), start, "DOP853", rtol=1e-12, atol=1e-13)
+    return out.y[:2, -1], out.y[2:, -1].reshape(2, 2)
+
+
+def test_resonance_of_the_duffing_oscillator():
+    cycle = hj.find_limit_cycle(m.Duffing())
+    branch = hj.continuation(cycle, "rate", (0.5, 1.2, 2.0))
+    assert [x.kind for x in branch.points] == ["fold", "fold"]
+    assert [x.message for x in branch.ends] == ["the values end"] * 2
+
+    def fold(z):
+        end, monodromy = _duffing_turn(z[:2], z[2])
+        return [*(end - z[:2]), np.linalg.det(monodromy - np.eye(2))]
+
+    for point in branch.points:
+        q = np.asarray(branch[point.index].start.q[:, 0])
+        rough = np.round([*q, point.value], 2)
+        np.testing.assert_allclose([*q, point.value], fsolve(fold, rough, xtol=1e-12), rtol=1e-8)
+    # At 1.2 there are three responses, the middle one unstable.
+    at = np.flatnonzero(branch.values == 1.2)
+    assert list(branch.stable[at]) == [True, False, True]
+    for k in at:
+        end, monodromy = _duffing_turn(np.asarray(branch[k].start.q[:, 0]), 1.2)
+        np.testing.assert_allclose(end, branch[k].start.q[:, 0], atol=1e-9)
+        mine, scipys = np.sort(branch[k].multipliers), np.sort(np.linalg.eigvals(monodromy))
+        np.testing.assert_allclose(mine, scipys, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_period_doubling_of_the_buck_converter():
+    """Numbers as in tests/models/test_gallery.py."""
+    cycle = hj.find_limit_cycle(m.BuckConverter())
+    branch = hj.continuation(cycle, "Vin", (20.0, 25.0, 26.0))
+    (flip,) = branch.find("flip")
+    np.testing.assert_allclose(flip.value, 24.5165728285634, rtol=1e-12)
+    np.testing.assert_allclose(flip.multipliers, [-1, -0.679194871126936], rtol=1e-9)
+    state = branch[flip.index].state
+    np.testing.assert_allclose(
+        [state["v"], state["i"]], [12.0277089452064, 0.608084287838342], rtol=1e-10
+    )
+    (k,) = np.flatnonzero(branch.values == 25.0)
+    np.testing.assert_allclose(
+        branch.multipliers[k], [-1.09293543528951, -0.621440982876560], rtol=1e-9
+    )
+    assert branch.stable[: flip.index].all() and not branch.stable[flip.index + 1 :].any()
+
+
+@pytest.mark.slow
+def test_period_2_of_the_buck_converter():
+    """It ends in the flip of the cycle of period 1, where the two halves change places."""
+    buck = m.BuckConverter(Vin=25.0)
+    cycle = hj.find_limit_cycle(buck, hj.Guess("open", (12.04, 0.627, 3.8)), turns=2)
+    np.testing.assert_allclose(cycle.period, 800e-6)
+    np.testing.assert_allclose(
+        [cycle.state["v"], cycle.state["i"]], [12.0384992252652, 0.626948841497016], rtol=1e-11
+    )
+    pair = 0.613891423607179 + 0.290590765487630j
+    np.testing.assert_allclose(cycle.multipliers, [pair, np.conj(pair)], rtol=1e-9)
+    branch = hj.continuation(cycle, "Vin", (24.0, 25.5))
+    (point,) = branch.points
+    assert point.kind == "branch point"
+    np.testing.assert_allclose(point.value, 24.5165728285634, rtol=1e-7)
+    assert branch.values[0] == branch.values[-1] == 25.5
+    at = np.abs([branch.values[1 : point.index].min(), branch.values[point.index + 1 :].min()])
+    assert np.all(at > 24.5165)
+
+
+@pytest.mark.slow
+def test_period_doubling_of_the_long_gait():
+    walker = m.SimplestWalker()
+    cycle = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
+    branch = hj.continuation(cycle, "slope", (0.005, 0.016))
+    (flip,) = branch.points
+    assert flip.kind == "flip"
+    np.testing.assert_allclose(flip.value, 0.0150884379411195, rtol=1e-11)
+    np.testing.assert_allclose(flip.multipliers, [-1, -0.297621361684963], rtol=1e-9)
+    doubled = branch[flip.index]
+    np.testing.assert_allclose(doubled.period, 3.91240921248050, rtol=1e-11)
+    np.testing.assert_allclose(
+        [doubled.state["th"], doubled.state["w"]], [0.237165863591579, -0.231927076424014],
+        rtol=1e-10,
+    )  # fmt: skip
+    # Two steps make one round of the gait beyond it.
+    beyond = branch[-1]
+    th, phi, w, p = np.asarray(beyond.start.q[:, 0])
+    guess = hj.Guess("step", (1.02 * th, 2 * 1.02 * th, 1.02 * w, 1.02 * p))
+    limping = hj.find_limit_cycle(
+        beyond.system, guess, section=hj.AtEvent("heelstrike"), turns=2, settle=400.0
+    )
+    assert len(limping.order) == 2 and limping.stable
+    assert abs(float(limping.period) - 2 * float(beyond.period)) > 1e-6
+
+
+@pytest.mark.slow
+def test_a_foot_that_stays_on_the_ground(hopper_cycle):
+    """Driven less, the hopper stops hopping: the force of the ground, (m + M) g plus a sine of
+    amplitude a r / (r - k), r = M w^2, just reaches zero."""
+    branch = hj.continuation(hopper_cycle, "a", (1.0, 30.0))
+    assert branch.ends[0].result == hj.Result.GRAZING
+    r = 2 * (2 * np.pi) ** 2
+    np.testing.assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
+    # More, and liftoff comes before the phase at which the cycle given begins.
+    assert branch.ends[1].message == "the values end" and not branch.points
+    assert branch.values[-1] == 30.0 and float(branch[-1].start.t[0]) != 0.5
+    again = hj.find_limit_cycle(branch[-1].system, branch[-1])
+    np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
