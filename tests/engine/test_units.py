@@ -50,7 +50,7 @@ def flow(length, time, scale, tangents):
     lanes, u = begin(system, length, time), jnp.zeros((1, 2))
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
-    moved, tape = record(system, lanes, u, end, settings, tangents=tangents)
+    moved, tape = record(Structure(system), lanes, u, end, settings, tangents=tangents)
     return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
 
 
@@ -80,7 +80,7 @@ def test_sizes_of_each_of_many_flows_and_derivatives():
     def end(u, scale, rtol=1e-13, atol=1.0):
         target = until(jnp.full(2, 1.5))
         settings = Settings(rtol, atol, 256, scale)
-        return move(system, lanes, jnp.full((1, 2), u), target, settings).lanes.q
+        return move(Structure(system), lanes, jnp.full((1, 2), u), target, settings).lanes.q
 
     scales = SIZES * np.array([1e-13, 1e-12, 1e-4, 1.0])[:, None, None]
     truth, *found = jax.jit(jax.vmap(lambda scale: end(0.1, scale)))(scales)

@@ -298,17 +298,17 @@ def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
 
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
-        u = jnp.zeros((len(system.inputs), 1))
-        moved = move(system, start, u, until(start.t + _SETTLE * expected), patient)
+        s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
+        moved = move(s, start, u, until(start.t + _SETTLE * expected), patient)
         if base is not None:
             at_event = isinstance(base, AtEvent)
-            event = Structure(system).transition_index(base.name) if at_event else -1
+            event = s.transition_index(base.name) if at_event else -1
             target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
             if not at_event:
                 target = eqx.tree_at(
                     lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
                 )
-            moved = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
         start = eqx.tree_at(lambda x: (x.chart, x.q), start, (moved.lanes.chart, q))
         return start, expected
