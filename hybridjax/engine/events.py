@@ -58,7 +58,7 @@ def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> La
 
 def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
     """Which rows of a `Watch` belong to the chart of each lane (the target's row to all)."""
-    source = jnp.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
+    source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)
 
 
@@ -80,7 +80,7 @@ def rearm(
     other than the one that fired, at zero and falling, is still due.
     """
     value, rate = seen.value[:-1], seen.rate[:-1]
-    other = jnp.arange(len(s.transitions))[:, None] != fired
+    other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
     zero = jnp.maximum(zero, jnp.where(other, 0.0, 4 * residue))
     due = together & other & (jnp.abs(value) <= zero) & (rate < 0)
