@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.precision import at_precision
 from .solver.step import Step
 
 
@@ -28,6 +29,11 @@ SINGLE_PRECISION_EXPERIMENT = 1e-4
 """Experiments in single precision."""
 STEADY_START = 1e-10
 """Starts of periodic responses, relative to their largest entry."""
+
+
+# Rounding errors of a time or a state, relative to it, in double and in single precision. Twice as
+# much: events that are as near to each other are taken for one.
+ROUNDING = 4e-15, 2e-6
 
 
 def _number(x) -> Array:
@@ -81,6 +87,6 @@ class Settings(eqx.Module):
             return self.rtol * size
         own = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         change = jnp.abs(tau) * jnp.maximum(jnp.abs(step.f0), jnp.abs(step.f1))
-        precision = jnp.finfo(own.dtype)
-        rounding = precision.eps * jnp.max(own, axis=0, initial=0.0) + precision.tiny
-        return self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
+        rounding = at_precision(*ROUNDING) * jnp.max(own, axis=0, initial=0.0)
+        tolerance = self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
+        return jnp.maximum(tolerance, jnp.finfo(own.dtype).tiny)  # where all is at rest at zero
