@@ -1,8 +1,9 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any
 
@@ -10,6 +11,9 @@ import jax
 
 from ..errors import DefinitionError
 from .precision import require_x64
+
+
+_log = logging.getLogger("hybridjax")
 
 
 def thread_count(workers: int | None) -> int:
@@ -47,12 +51,22 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         return [one.result() for one in running]
 
 
-def meanwhile(work: Callable[[], Any]) -> None:
-    """Begin with `work` in a thread of its own, under the caller's configuration of JAX. What it
-    returns or raises is lost: it only makes ready what will be asked for again."""
+def meanwhile(work: Callable[[], Any]) -> Future[Any]:
+    """Begin with `work` in a thread of its own, under the caller's configuration of JAX.
+
+    Its `result()` waits for it, and raises what it has raised. An error is also logged when it
+    happens, since what is made ready ahead is not always asked for.
+    """
     pool = ThreadPoolExecutor(1)
-    pool.submit(_configured(work))
+    future = pool.submit(_configured(work))
+    future.add_done_callback(_log_error)
     pool.shutdown(wait=False)
+    return future
+
+
+def _log_error(future: Future) -> None:
+    if not future.cancelled() and (error := future.exception()) is not None:
+        _log.error("what was begun in another thread has failed", exc_info=error)
 
 
 def _cores() -> int:

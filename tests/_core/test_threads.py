@@ -30,3 +30,11 @@ def test_cores_are_left_to_blas_unless_it_has_one_thread(monkeypatch, blas, core
 def test_errors_are_raised():
     with pytest.raises(ZeroDivisionError):
         threads.on_all_cores(lambda k: 1 / k, [1, 0])
+
+
+def test_what_runs_meanwhile_gives_its_result_or_its_error(caplog):
+    assert threads.meanwhile(lambda: threading.current_thread()).result() is not None
+    failed = threads.meanwhile(lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        failed.result()
+    assert "has failed" in caplog.text and "ZeroDivisionError" in caplog.text
