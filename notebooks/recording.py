@@ -128,7 +128,7 @@ axes = hj.plot.multiplier_regions(fit, advice.plain)
 # %%
 sections = hj.KinematicPhase(
     32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-    start=hj.Crossing("vM", "falling"),
+    anchor=hj.Crossing("vM", "falling"),
 )  # fmt: skip
 exact = hj.linearize(cycle, sections, outputs=("yM", "vM"))
 f = np.arange(1, 161) / 20

@@ -28,7 +28,7 @@ from ..systems.structure import Outputs, Structure
 from .data import ExperimentData
 from .design.design import Design
 from .plan import Plan, check_accuracy, plan_flow
-from .respond import observe, respond
+from .respond import respond
 from .single_precision import plan_single
 
 
@@ -106,7 +106,7 @@ class Campaign:
                     part = _once_compiled(program, single(arguments))
             return [np.asarray(x)[: S - k] for x in part]
 
-        base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
+        base = np.asarray(self.placed.observe(self.outputs.items))
         y, rest = np.empty((S, u.shape[1] // N, *base.shape)), []
         parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
@@ -140,8 +140,7 @@ class Campaign:
 
     def _start(self, u) -> Float[np.ndarray, "n S"]:
         """Times and states in which the experiments begin, at section 0."""
-        lanes = self.placed.lanes
-        on_cycle = np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
+        on_cycle = np.asarray(self.placed.section_zero)[:, None]
         if self.model is None:
             return np.repeat(on_cycle, len(u), axis=1)
         embed = np.asarray(self.placed.frames()[0][0])[:, : self.model.A.shape[1]]
@@ -337,10 +336,3 @@ def _source(design, N: int, nu: int, start: str, discard, periods):
             f"for estimation; got periods = {periods}."
         )
     return u, len(u), cycles, int(periods)
-
-
-@quick_jit
-def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
-    s = Structure(placed.cycle.system)
-    u = jnp.zeros((s.nu, placed.n_sections))
-    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T

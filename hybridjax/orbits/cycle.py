@@ -21,7 +21,7 @@ from ..engine.trajectory import Trajectory, simulate
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError, DefinitionError
 from ..linear.multipliers import product_eigenvalues
-from ..sections.families import AtEvent, Crossing
+from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .guess import begin

@@ -15,7 +15,8 @@ from ..engine.move import move
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError, DefinitionError
-from ..sections.families import AtEvent, Crossing, ListLevels
+from ..sections.crossing import AtEvent, Crossing
+from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import Guess
 from ..systems.transition import Scheduled

@@ -23,7 +23,8 @@ from ..engine.lanes import Lanes
 from ..engine.move import move
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
-from ..sections.families import AtEvent, Crossing, ListLevels
+from ..sections.crossing import AtEvent, Crossing
+from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 
 

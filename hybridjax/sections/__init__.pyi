@@ -1,1 +1,8 @@
-from .families import AbstractSections as AbstractSections
+from .abstract import (
+    AbstractLevels as AbstractLevels,
+    AbstractSections as AbstractSections,
+    BoundSections as BoundSections,
+    CyclePoint as CyclePoint,
+)
+from .crossing import Direction as Direction
+from .section_list import FamilyLike as FamilyLike

@@ -113,7 +113,7 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
     found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
     sections = hj.KinematicPhase(
         16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-        start=hj.Crossing("vM", "falling"),
+        anchor=hj.Crossing("vM", "falling"),
     )  # fmt: skip
     exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
     reach, step = 4, found.period / 16

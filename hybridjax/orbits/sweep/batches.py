@@ -18,7 +18,8 @@ from ..._core.threads import in_threads
 from ...engine.lanes import Lanes
 from ...engine.move import Settings, move
 from ...engine.target import toward, until
-from ...sections.families import AtEvent, ListLevels
+from ...sections.crossing import AtEvent
+from ...sections.section_list import ListLevels
 from ...systems.structure import Structure
 from ..cycle import LimitCycle
 from ..return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_jacobian
