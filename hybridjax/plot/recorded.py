@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..identify.series.fit import SeriesFit
+from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
-from ..recordings.phase import Phase
-from ..recordings.sampling import SectionData
+from ..recordings.phase.winding import Phase
 from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
 
@@ -44,7 +44,7 @@ def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) 
     deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
     cycle, at the section where it is largest.
     """
-    N = data.sections
+    N = data.n_sections
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     f, power = input_spectrum(data)

@@ -1,7 +1,6 @@
 """What the data cannot carry, in plain words."""
 
 from itertools import combinations
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -11,21 +10,32 @@ from .._core.results import Result
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import compare_multipliers
 from ..identify.multipliers.estimate import roots_of
-from ..identify.series.fit import SeriesFit, fit_series, quick_fit, refuse_order
-from ..identify.series.layout import Record, lay_out, pieces_of
-from ..identify.series.prediction import predict
-from ..identify.series.regression import Delayed, delayed_outputs, initial, linearize, set_up
-from ..identify.series.validation import Validation, validate
-from .sampling import SectionData
+from ..identify.series.fit import SeriesFit, refuse_order
+from ..identify.series.layout import Record, lay_out
+from ..identify.series.regression import Delayed, delayed_outputs, set_up
+from .data import SectionData
 from .spectra import input_band, input_spectrum
 
 
-_FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are few
-_WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
-_LOST = 0.2  # of all samples
-_ALIKE = 0.98  # median of the correlations of two outputs at the sections: they say the same
-ENOUGH = 1000  # cycles to choose an order from, and to try it on
-_TIE = 0.02  # relative difference of misfits that are as good as equal
+# Of the samples of a section, the share that the unknowns must leave over. Doubled: more recordings
+# are said to have few strides.
+_FEW_LEFT_OVER = 0.25
+# Of its mean power, what an input has near a multiplier's frequency; less is weak. Doubled: more
+# inputs are.
+_WEAK_POWER = 0.02
+# How near a multiplier's frequency is, in cycles per period. Doubled: power further off counts.
+_NEAR = 0.1
+# Of all samples, the share that may be missing unsaid. Doubled: recordings with more gaps pass.
+_MANY_MISSING = 0.2
+# Two outputs say the same if the median of their correlations at the sections is larger. (Not to be
+# doubled: it lies below 1.)
+_SAME_OUTPUTS = 0.98
+# Standard errors by which plain regression must be off before it is said. Doubled: it is said less
+# often.
+_BIASED = 2
+# Of N/2 cycles per period, the highest frequency of all, the share up to which an input must have
+# power. Doubled: the edge is named for all inputs.
+_WHOLE_BAND = 0.9
 
 
 def plain_regression(
@@ -43,82 +53,6 @@ def plain_regression(
 def _plain(delayed: Delayed) -> Complex[np.ndarray, " d"]:
     gram = delayed.gram.sum(axis=0)
     return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
-
-
-def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
-    """The number of multipliers that predicts best what it was not fitted to.
-
-    For each number a first, consistent estimate (total least squares) is made from all but the last
-    `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
-    within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
-
-    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
-    """
-    early, late = _split(data, share)
-    layout = lay_out(early)
-    rest = pieces_of(late).pieces
-    misfits = []
-    for d in range(1, most + 1):
-        problem = set_up(layout, d, layout.y.shape[2], False)
-        c = initial(delayed_outputs(problem, d))
-        found = linearize(problem, c)
-        if (found.freedom <= 2 * d).any():
-            break
-        fit = quick_fit(problem, c, found, layout)
-        error = np.concatenate([predict(fit, p, True) - p.y for p in rest])
-        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
-    if not misfits:
-        raise DefinitionError(
-            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
-            "sections: record more, or take fewer sections."
-        )
-    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _TIE))
-
-
-class HeldOut(NamedTuple):
-    """A fit to the first part of each record, tried on the rest."""
-
-    fit: SeriesFit
-    validation: Validation
-
-
-def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
-    """Fit all but the last `share` of every record, and simulate that.
-
-    Of long recordings the first 1000 cycles are looked at.
-
-    **Raises:** `DefinitionError` if too few cycles are left for either.
-    """
-    if not 0 < share < 1:
-        raise DefinitionError(f"share must lie between 0 and 1, not {share}.")
-    early, late = _split(data, share)
-    fit = fit_series(early, order, check=False)
-    return HeldOut(fit, validate(fit, late))
-
-
-def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
-    early, late = [], []
-    enough = min(1.0, ENOUGH / data.cycles)
-    for r in data.records:
-        end = round(len(r.u) * enough)
-        cut = round(end * (1 - share))
-        early.append(_part(r, slice(0, cut)))
-        late.append(_part(r, slice(cut, end)))
-    return early, late
-
-
-def _part(record: Record, rows: slice) -> Record:
-    start = (record.start + rows.start) % record.n_sections
-    return Record(
-        record.u[rows],
-        record.y[rows],
-        n_sections=record.n_sections,
-        start=start,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        lead=record.lead,
-        drift=record.drift,
-    )
 
 
 class Advice(eqx.Module):
@@ -158,7 +92,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     layout = lay_out(data.records)
     sampled = np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min()
     unknown = R * nu + len(layout.y) * (d + 1)
-    if sampled - unknown < _FEW * sampled:
+    if sampled - unknown < _FEW_LEFT_OVER * sampled:
         found.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
             "record more, take fewer sections, or excite fewer inputs."
@@ -177,9 +111,9 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     for i, name in enumerate(fit.inputs):
         mean = power[:, i].mean()
         for m, at in zip(fit.multipliers, resonance, strict=True):
-            near = np.abs((f - at + 0.5) % 1 - 0.5) < 0.1
-            mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < 0.1
-            if m.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK * mean:
+            near = np.abs((f - at + 0.5) % 1 - 0.5) < _NEAR
+            mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < _NEAR
+            if m.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK_POWER * mean:
                 found.append(
                     f"Weak excitation: {name} has next to no power at the frequencies "
                     f"{at:.2f} + k cycles per period, where the multiplier {m:.3g} is seen."
@@ -191,22 +125,22 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
                 f"Narrow excitation: {name} has power only up to {edge:.2g} cycles per period, so "
                 "that responses at different phases can hardly be told apart."
             )
-        elif edge < 0.9 * N / 2:
+        elif edge < _WHOLE_BAND * N / 2:
             found.append(
                 f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
                 f"where the power of {name} ends."
             )
     for i, j in combinations(range(layout.y.shape[3]), 2):
-        if _correlation(layout.y[..., i], layout.y[..., j]) > _ALIKE:
+        if _correlation(layout.y[..., i], layout.y[..., j]) > _SAME_OUTPUTS:
             found.append(
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "
-                "crossing to crossing (`CrossingPhase`, `--crossing`) may make multipliers "
-                "much surer."
+                "crossing to crossing (a `Crossing` as the phase, `--crossing`) may make "
+                "multipliers much surer."
             )
     plain = _plain(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
-    if bias > 2 * fit.standard_errors.max():
+    if bias > _BIASED * fit.standard_errors.max():
         found.append(
             f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
             "use it here."
@@ -218,7 +152,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
             )
     if fit.result != Result.OK:
         found.append(f"The fit did not end: {Result(fit.result).message}.")
-    if data.missing > _LOST:
+    if data.missing > _MANY_MISSING:
         found.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
     strides = (100, 300, 1000, 3000)
     now = max(sampled - unknown, 1)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
-from .phase import Phase
+from .phase.winding import Phase
 from .read import read_columns
 from .recording import Recording
 
@@ -121,6 +121,7 @@ def add_command(
         signals = dict(zip(recording.signals, trial.values.T, strict=True))
         signals |= dict(zip(command, added.T, strict=True))
         units = dict(zip(recording.signals, recording.units, strict=True))
-        about = {"events": trial.events, "units": units, "name": trial.name}
-        trials.append(Recording(trial.time, signals, **about))
+        trials.append(
+            Recording(trial.time, signals, events=trial.events, units=units, name=trial.name)
+        )
     return Recording.join(trials)

@@ -6,8 +6,18 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit
-from .sampling import SectionData
+from .data import SectionData
 from .spectra import input_band
+
+
+# Of the Nyquist frequency: an input that reaches so far needs no smoothing of the push. Doubled: no
+# input does.
+_WHOLE_BAND = 0.9
+# Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
+# Doubled: pushes are twice as wide, and have no power at all beyond the band.
+_SPECTRUM_REACH = 2.5
+# Standard deviations after which the push is cut off. Doubled: nothing changes but a part in 1000.
+_PUSH_REACH = 3
 
 
 class ImpulseResponses(eqx.Module):
@@ -61,7 +71,7 @@ def impulse_responses(
 
     **Raises:** `DefinitionError` if fit and data have different sections or names.
     """
-    for name in ("sections", "inputs", "outputs"):
+    for name in ("n_sections", "inputs", "outputs"):
         if getattr(fit, name) != getattr(data, name):
             raise DefinitionError(
                 f"fit and data have different {name}: {getattr(fit, name)} and "
@@ -70,17 +80,16 @@ def impulse_responses(
     N, R, ny, nu = fit.numerators.shape
     lags = round(cycles * N) + 1
     if width is None:
-        # The spectrum of the push is down to 4 % at the edge of the narrowest band.
         edge = min(input_band(data))
-        width = 2.5 / (2 * np.pi * edge) if edge < 0.9 * N / 2 else 0.0
+        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
     if lags < 2 or width < 0:
         raise DefinitionError(f"cycles and width must be positive, not {cycles} and {width}.")
-    reach = int(np.ceil(3 * width * N))
+    reach = int(np.ceil(_PUSH_REACH * width * N))
     push = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     push /= push.sum()
     longest, d = max(fit.lead + lags + reach, R), len(fit.coefficients)
-    # The responses, what they owe to each coefficient, and to noise in the numerators: all obey
-    # the same recursion from cycle to cycle.
+    # The responses h, their derivatives by each coefficient, and a square root of their covariance
+    # from the numerators': all obey the same recursion from cycle to cycle.
     h = np.zeros((longest, N, ny, nu))
     h[:R] = fit.numerators.swapaxes(0, 1)
     slope = np.zeros((longest, d, N, ny, nu))

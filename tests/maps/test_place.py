@@ -137,8 +137,8 @@ def test_bad_families(define, message):
 @pytest.mark.parametrize(
     "sections, message",
     [
-        ("x", "sections are a family such as ClockPhase"),
-        (None, "sections are a family such as ClockPhase"),
+        ("x", "sections are a family such as ClockPhase|'sections'"),
+        (None, "sections are a family such as ClockPhase|'sections'"),
         ([AtEvent("bounce")], "there is no event 'bounce'"),
         ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
         ([Crossing("x", "falling", charts=("a",))], "there is no chart 'a'"),
@@ -147,7 +147,7 @@ def test_bad_families(define, message):
     ],
 )
 def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
-    with pytest.raises((hj.DefinitionError, TypeError), match=f"{message}|type"):
+    with pytest.raises((hj.DefinitionError, TypeError), match=message):
         hj.place_sections(vanderpol_cycle, sections)
 
 
