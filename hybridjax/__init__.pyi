@@ -65,7 +65,12 @@ from .sections.kinematic import KinematicPhase as KinematicPhase
 from .sections.section_list import SectionList as SectionList
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
-from .systems.system import Guess as Guess, HybridSystem as HybridSystem, parameter as parameter
+from .systems.system import (
+    Guess as Guess,
+    HybridSystem as HybridSystem,
+    Parameter as Parameter,
+    parameter as parameter,
+)
 from .systems.transition import Scheduled as Scheduled, Transition as Transition
 
 __version__: str

@@ -160,5 +160,5 @@ with tempfile.TemporaryDirectory() as folder:
 # %%
 found = hj.identify_recording(recording, angle, inputs="u", outputs=("yM", "vM"), order=2)
 with tempfile.TemporaryDirectory() as folder:
-    page = hj.write_report(found, Path(folder) / "results")
+    page = hj.write_report(Path(folder) / "results", found)
     print(sorted(path.name for path in page.parent.iterdir()), page.stat().st_size // 1000, "kB")

@@ -126,7 +126,7 @@ def _identify(options) -> None:
         timing=options.timing, drift=options.drift,
     )  # fmt: skip
     print(found)
-    print(write_report(found, options.out))
+    print(write_report(options.out, found))
 
 
 def _reproduce(options) -> None:
