@@ -49,12 +49,9 @@ def identify_recording(
     sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
     drift: int | float | None = None,
-    max_gap: int | float | None = None,
 ) -> Identification:
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
     them.
-
-    It takes what `section_data` takes, and `order`, so that one call does all.
 
     **Arguments:** as for `section_data`, and
 
@@ -85,7 +82,6 @@ def identify_recording(
         sampled=sampled,
         timing=timing,
         drift=drift,
-        max_gap=max_gap,
     )
     order = choose_order(data) if order is None else order
     held = hold_out(data, order)

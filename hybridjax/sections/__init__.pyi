@@ -4,5 +4,4 @@ from .abstract import (
     BoundSections as BoundSections,
     CyclePoint as CyclePoint,
 )
-from .crossing import Direction as Direction
 from .section_list import FamilyLike as FamilyLike
