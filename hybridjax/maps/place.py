@@ -139,7 +139,7 @@ def _visit(
         target = Target(
             time[None], i[None], event[None], limit, None, levels, Result.SECTION_MISSED
         )
-        moved, tape = record(cycle.system, lanes, u, target, settings, h, result, tangents=True)
+        moved, tape = record(s, lanes, u, target, settings, h, result, tangents=True)
         end = moved.lanes
         if anchored:
             anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(first, x, y), end, anchor)

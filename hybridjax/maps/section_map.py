@@ -108,7 +108,7 @@ def _map(placed: PlacedSections, i: int, j: int, q, u, t) -> Arrival:
          lanes.pace[:, pick]),
     )  # fmt: skip
     target = placed.target(jnp.array([j]), t[None], jnp.array([1 if j <= i else 0]))
-    moved = move(placed.cycle.system, start, u[:, None], target, placed.cycle.settings)
+    moved = move(s, start, u[:, None], target, placed.cycle.settings)
     end = moved.lanes
     result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
     keep = jnp.where(result == Result.OK, 1.0, jnp.nan)  # a factor makes derivatives NaN, too
