@@ -1,5 +1,6 @@
 """What the data cannot carry, in plain words."""
 
+from collections.abc import Iterator
 from itertools import combinations
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from ..errors import DefinitionError
 from ..identify.multipliers.compare import compare_multipliers
 from ..identify.multipliers.estimate import roots_of
 from ..identify.series.fit import SeriesFit, refuse_order
-from ..identify.series.layout import Record, lay_out
+from ..identify.series.layout import Layout, Record, lay_out
 from ..identify.series.regression import Delayed, delayed_outputs, set_up
 from .data import SectionData
 from .spectra import input_band, input_spectrum
@@ -36,6 +37,8 @@ _BIASED = 2
 # Of N/2 cycles per period, the highest frequency of all, the share up to which an input must have
 # power. Doubled: the edge is named for all inputs.
 _WHOLE_BAND = 0.9
+# Numbers of strides whose standard errors are foretold.
+_STRIDES = (100, 300, 1000, 3000)
 
 
 def plain_regression(
@@ -86,84 +89,97 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
     intervals that reach the unit circle, an iteration that did not end.
     """
-    found = []
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
     layout = lay_out(data.records)
-    sampled = np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min()
+    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
+    delayed = delayed_outputs(problem, d)
+    sampled = int(np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min())
     unknown = R * nu + len(layout.y) * (d + 1)
+    plain = _plain(delayed)
+    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
+    band = input_band(data)
+    warnings = []
     if sampled - unknown < _FEW_LEFT_OVER * sampled:
-        found.append(
+        warnings.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
             "record more, take fewer sections, or excite fewer inputs."
         )
-    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
-    delayed = delayed_outputs(problem, d)
     try:
         refuse_order(delayed.rescale(fit.noise / problem.scale))
     except DefinitionError:
-        found.append(
+        warnings.append(
             f"Order: the data do not carry {d} multipliers. The weakest may be noise alone (or "
             "nearly zero in truth); neither its value nor its interval then means anything."
         )
+    warnings += _about_excitation(data, fit, band)
+    warnings += _about_outputs(layout, fit)
+    if bias > _BIASED * fit.standard_errors.max():
+        warnings.append(
+            f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
+            "use it here."
+        )
+    warnings += _about_the_fit(fit)
+    if data.missing > _MANY_MISSING:
+        warnings.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
+    # Variances go down with the number of strides that the unknowns leave over.
+    now = max(sampled - unknown, 1)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in _STRIDES], float)
+    with np.errstate(divide="ignore"):
+        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
+    return Advice(tuple(warnings), plain, bias, tuple(band), _STRIDES, expected)
+
+
+def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[str]:
+    """Whether the inputs had power where the multipliers are seen, and how far up."""
     f, power = input_spectrum(data)
     resonance = np.abs(np.angle(fit.multipliers)) / (2 * np.pi)
     for i, name in enumerate(fit.inputs):
         mean = power[:, i].mean()
-        for m, at in zip(fit.multipliers, resonance, strict=True):
+        for z, at in zip(fit.multipliers, resonance, strict=True):
             near = np.abs((f - at + 0.5) % 1 - 0.5) < _NEAR
             mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < _NEAR
-            if m.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK_POWER * mean:
-                found.append(
+            if z.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK_POWER * mean:
+                yield (
                     f"Weak excitation: {name} has next to no power at the frequencies "
-                    f"{at:.2f} + k cycles per period, where the multiplier {m:.3g} is seen."
+                    f"{at:.2f} + k cycles per period, where the multiplier {z:.3g} is seen."
                 )
-    band = input_band(data)
     for name, edge in zip(fit.inputs, band, strict=True):
         if edge < 1:
-            found.append(
+            yield (
                 f"Narrow excitation: {name} has power only up to {edge:.2g} cycles per period, so "
                 "that responses at different phases can hardly be told apart."
             )
-        elif edge < _WHOLE_BAND * N / 2:
-            found.append(
+        elif edge < _WHOLE_BAND * fit.n_sections / 2:
+            yield (
                 f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
                 f"where the power of {name} ends."
             )
+
+
+def _about_outputs(layout: Layout, fit: SeriesFit) -> Iterator[str]:
+    """Whether two of them are one number."""
     for i, j in combinations(range(layout.y.shape[3]), 2):
         if _correlation(layout.y[..., i], layout.y[..., j]) > _SAME_OUTPUTS:
-            found.append(
+            yield (
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "
                 "crossing to crossing (a `Crossing` as the phase, `--crossing`) may make "
                 "multipliers much surer."
             )
-    plain = _plain(delayed)
-    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
-    if bias > _BIASED * fit.standard_errors.max():
-        found.append(
-            f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
-            "use it here."
-        )
+
+
+def _about_the_fit(fit: SeriesFit) -> Iterator[str]:
+    """Whether it is stable for sure, and ended."""
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
         if z.imag >= 0 and abs(z) + 2 * error > 1:
-            found.append(
-                f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
-            )
+            yield f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
     if fit.result != Result.OK:
-        found.append(f"The fit did not end: {Result(fit.result).message}.")
-    if data.missing > _MANY_MISSING:
-        found.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
-    strides = (100, 300, 1000, 3000)
-    now = max(sampled - unknown, 1)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
-    with np.errstate(divide="ignore"):
-        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
-    return Advice(tuple(found), plain, bias, tuple(band), strides, expected)
+        yield f"The fit did not end: {Result(fit.result).message}."
 
 
 def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
-    """Its modulus, the median over the sections."""
+    """The modulus of the correlation at each section, the median over the sections."""
     seen = np.isfinite(x) & np.isfinite(y)
     both = np.where(seen, [x, y], 0.0)
     mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(seen.sum(axis=(0, 1)), 1)
@@ -172,5 +188,5 @@ def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -
     return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
 
 
-def _list(values) -> str:
+def _list(values: Complex[np.ndarray, " d"]) -> str:
     return ", ".join(f"{z:.4f}" for z in values)

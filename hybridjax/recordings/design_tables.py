@@ -14,6 +14,10 @@ from .read import read_columns
 from .recording import Recording
 
 
+# Rounding of times, in sections, where a held value changes. Doubled: nothing changes.
+_ROUNDING = 1e-9
+
+
 def write_design(
     path: str | os.PathLike,
     design: Design,
@@ -49,7 +53,7 @@ def write_design(
             raise DefinitionError(f"period and rate must be positive, not {period} and {rate}.")
         header = ["experiment", "time"]
         time = np.arange(int(n / N * period * rate)) / rate
-        u = u[:, np.minimum((time * N / period + 1e-9).astype(int), n - 1)]
+        u = u[:, np.minimum((time * N / period + _ROUNDING).astype(int), n - 1)]
         place = time[:, None]
     path = Path(path)
     temporary = path.with_name(f".{path.name}.part")

@@ -67,7 +67,9 @@ class Crossing(eqx.Module):
             return s.resolve_outputs(self.function).defined(a)
         return True
 
-    def level(self, s: Structure, a: int, t, q) -> Float[Array, ""]:
+    def level(
+        self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         """A function of one state of chart a that falls through zero at the section."""
         if isinstance(self.function, str | Output):
             value = s.resolve_outputs(self.function)(a, t, q, jnp.zeros(s.nu))[0]

@@ -61,7 +61,9 @@ class KinematicPhase(AbstractSections):
         s.resolve_outputs((self.position, self.velocity))
         check_anchor(self.anchor, s)
 
-    def plane(self, s: Structure, a: int, t, q) -> Float[Array, "2"]:
+    def plane(
+        self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
+    ) -> Float[Array, "2"]:
         """The coordinates (r_p, r_v) of one state of chart a in the scaled plane."""
         z = s.resolve_outputs((self.position, self.velocity))(a, t, q, jnp.zeros(s.nu))
         z = z if self.center is None else z - self.center

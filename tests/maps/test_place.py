@@ -6,7 +6,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import APEX
+from ..conftest import APEX, OUTPUTS
 
 
 AtEvent, Crossing = hj.AtEvent, hj.Crossing
@@ -149,6 +149,23 @@ def test_bad_families(define, message):
 def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
     with pytest.raises((hj.DefinitionError, TypeError), match=message):
         hj.place_sections(vanderpol_cycle, sections)
+
+
+def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
+    for use in (
+        lambda: hj.linearize(lossy_cycle, placed_isochrons),
+        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
+        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
+    ):
+        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+            use()
+
+
+def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
+    period = float(vanderpol_cycle.period)
+    moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
+    with pytest.raises(hj.ComputationError, match="depends on time"):
+        hj.place_sections(vanderpol_cycle, [moving])
 
 
 def test_bad_inputs_and_outputs(vanderpol_cycle, hopper_cycle, placed_isochrons):
