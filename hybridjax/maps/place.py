@@ -126,22 +126,22 @@ def _visit(
     patience = max(cycle.settings.max_steps, PATIENCE)
     settings = dataclasses.replace(cycle.settings, max_steps=patience)
     u = jnp.zeros((s.nu, 1))
-    anchored = isinstance(family.anchor, Crossing)
+    crossing = family.anchor if isinstance(family.anchor, Crossing) else None
 
     def step(carry, k):
         lanes, h, result, anchor = carry
         bound, i, first = _bind(s, cycle, family, anchor), k % N, k == 0
         time, event, levels = bound.time[i] + (k // N) * period, bound.event[i], bound.levels
-        if anchored:
+        if crossing is not None:
             time, event = jnp.where(first, jnp.inf, time), jnp.where(first, -1, event)
-            i, levels = jnp.where(first, N, i), _WithAnchor(levels, family.anchor, N)
+            i, levels = jnp.where(first, N, i), _WithAnchor(levels, crossing, N)
         limit = lanes.t + _LONGEST_WAY * period
         target = Target(
             time[None], i[None], event[None], limit, None, levels, Result.SECTION_MISSED
         )
         moved, tape = record(s, lanes, u, target, settings, h, result, tangents=True)
         end = moved.lanes
-        if anchored:
+        if crossing is not None:
             anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(first, x, y), end, anchor)
         return (end, moved.h, moved.result, anchor), _Visits(end, moved.result, tape)
 
@@ -189,17 +189,18 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes) -> Float[Array, "
     """Gradients of the levels with respect to (t, q)."""
     N = lanes.t.shape[0]
     out = jnp.zeros((1 + s.d, N))
-    if bound.levels is None:
+    levels = bound.levels
+    if levels is None:
         return out.T
     state_based = jnp.isinf(bound.time) & (bound.event < 0)
     for a in range(len(s.charts)):
-        if not bound.levels.present(s, a):
+        if not levels.present(s, a):
             continue
         n = s.dims[a]
         here = state_based & (lanes.chart == a)
 
         def gradient(i, t, q, a=a):
-            g = jax.grad(lambda t, q: bound.levels.level(s, a, i, t, q), argnums=(0, 1))(t, q)
+            g = jax.grad(lambda t, q: levels.level(s, a, i, t, q), argnums=(0, 1))(t, q)
             return jnp.concatenate([g[0][None], g[1]])
 
         def work(out, n=n, here=here, gradient=gradient):

@@ -44,7 +44,7 @@ def write_design(
     u = np.asarray(design.inputs(cycles or design.periods))
     S, n, _ = u.shape
     N = design.n_sections
-    if period is None:
+    if period is None or rate is None:
         header = ["experiment", "cycle", "section", "phase"]
         k = np.arange(n)
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)

@@ -62,19 +62,16 @@ def identify_recording(
 
     **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
     """
-    definition = phase
-    if not isinstance(phase, Phase):
-        phase = estimate_phase(recording, definition)
+    definition = None if isinstance(phase, Phase) else phase
+    found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
         moved = {outputs} if isinstance(outputs, str) else set(outputs)
-        if not isinstance(definition, Phase):
-            moved |= signals_of(definition)
-        recording = without_drift(recording, phase, sorted(moved), drift)
-        if not isinstance(definition, Phase):
-            phase = estimate_phase(recording, definition)
+        moved |= set() if definition is None else signals_of(definition)
+        recording = without_drift(recording, found, sorted(moved), drift)
+        found = found if definition is None else estimate_phase(recording, definition)
     data = section_data(
         recording,
-        phase,
+        found,
         inputs=inputs,
         outputs=outputs,
         n_sections=n_sections,
@@ -91,7 +88,7 @@ def identify_recording(
     fit = fit_series(data.records, order, check=False, distortion=False if known else None)
     return Identification(
         recording=recording,
-        phase=phase,
+        phase=found,
         data=data,
         fit=fit,
         held_out=held,

@@ -181,11 +181,7 @@ class Recording(eqx.Module):
         **Raises:** `DefinitionError` for a signal that is not there or never crosses the level, and
         a crossing of a function or in charts, which recordings do not have.
         """
-        signal, level = crossing.function, float(crossing.value)
-        if not isinstance(signal, str) or crossing.charts is not None:
-            raise DefinitionError(
-                "a recording holds samples: the Crossing of one names a signal, and no charts."
-            )
+        signal, level = signal_of(crossing), float(crossing.value)
         column, trials = self.column(signal), []
         sign = 1.0 if crossing.direction == "rising" else -1.0
         for trial in self.trials:
@@ -235,6 +231,18 @@ class Recording(eqx.Module):
         pairs = zip(self.signals, self.units, strict=True)
         names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
         return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
+
+
+def signal_of(crossing: Crossing) -> str:
+    """The name of the signal that crosses a level.
+
+    **Raises:** `DefinitionError` for a crossing of a function or in charts.
+    """
+    if not isinstance(crossing.function, str) or crossing.charts is not None:
+        raise DefinitionError(
+            "a recording holds samples: the Crossing of one names a signal, and no charts."
+        )
+    return crossing.function
 
 
 def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:

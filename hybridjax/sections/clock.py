@@ -39,8 +39,7 @@ class ClockPhase(AbstractSections):
         check_anchor(self.anchor, s)
 
     def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
-        anchored = isinstance(self.anchor, Crossing)
-        first = point.t if anchored else self.anchor * point.period
+        first = point.t if isinstance(self.anchor, Crossing) else self.anchor * point.period
         return BoundSections.at_times(
             first + jnp.arange(self.n_sections) * (point.period / self.n_sections)
         )

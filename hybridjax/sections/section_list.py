@@ -1,9 +1,8 @@
 """Sections one by one, and what else may stand for a family."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -21,9 +20,11 @@ class SectionList(AbstractSections):
     """
 
     label: ClassVar[str] = "sections"
-    items: tuple[Crossing | AtEvent, ...] = eqx.field(converter=tuple)
+    items: tuple[Crossing | AtEvent, ...]
 
-    def __check_init__(self):
+    def __init__(self, items: Iterable[Crossing | AtEvent]):
+        """**Raises:** `DefinitionError` for an empty list, and entries of another kind."""
+        self.items = tuple(items)
         check_n_sections(len(self.items))
         for item in self.items:
             if not isinstance(item, Crossing | AtEvent):

@@ -4,7 +4,7 @@ from ...errors import DefinitionError
 from ...sections.abstract import AbstractSections
 from ...sections.crossing import AtEvent, Crossing
 from ...sections.kinematic import KinematicPhase
-from ..recording import Recording
+from ..recording import Recording, signal_of
 from .angle import AngleFunction, from_angles, function_angles, kinematic_angles
 from .crossings import from_crossings, from_events
 from .winding import Phase
@@ -73,10 +73,10 @@ def estimate_phase(
 
 def signals_of(definition: PhaseDefinition) -> set[str]:
     """The signals from which the phase is found, as far as the definition names them."""
-    signals = set()
-    if isinstance(definition, KinematicPhase):
-        signals |= {definition.position, definition.velocity}
-        definition = definition.anchor
     if isinstance(definition, Crossing):
-        signals.add(definition.function)
-    return signals
+        return {signal_of(definition)}
+    if isinstance(definition, KinematicPhase):
+        anchor = definition.anchor
+        at_anchor = signals_of(anchor) if isinstance(anchor, Crossing) else set()
+        return {definition.position, definition.velocity} | at_anchor
+    return set()

@@ -47,7 +47,8 @@ class PhaseTracker:
         self.sense = math.copysign(1.0, rate)
         self.rate = abs(rate)
         self.gain = 2 * math.pi * (_LOOP_HARMONICS * abs(rate) if bandwidth is None else bandwidth)
-        self.time = self.phase = None
+        self.time: float | None = None
+        self.phase: float | None = None
         self._loop = 0.0
 
     def update(self, time: Number, position: Number, velocity: Number) -> float | None:
@@ -62,7 +63,7 @@ class PhaseTracker:
         if math.isnan(x + y):
             return self.phase
         measured = self.sense * (math.atan2(y, x) - self.anchor) / (2 * math.pi)
-        if self.time is None:
+        if self.time is None or self.phase is None:
             self.time, self.phase, self._loop = time, measured % 1.0, measured % 1.0
             return self.phase
         step = time - self.time
