@@ -87,6 +87,24 @@ def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     np.testing.assert_allclose(ldtp.multipliers(), [VDP], rtol=1e-9)
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_the_unit_of_a_level_does_not_matter(vanderpol_cycle, unit):
+    position, speed = (
+        hj.Output(name, lambda t, q, u, k=k: unit * q[k]) for k, name in enumerate(("X", "V"))
+    )
+    plain = [Crossing("x", "falling", value=0.3), Crossing("v", "rising", value=-0.2)]
+    scaled = [
+        Crossing(position, "falling", value=0.3 * unit),
+        Crossing(speed, "rising", value=-0.2 * unit),
+    ]
+    a, b = (hj.place_sections(vanderpol_cycle, x) for x in (plain, scaled))
+    np.testing.assert_allclose(b.lanes.q, a.lanes.q, atol=1e-11)
+    assert a.coordinates() == b.coordinates()
+    tangent = Crossing(position, "rising", value=2.00861986 * unit)
+    with pytest.raises(hj.ComputationError, match=r"\(X rising\) is tangent"):
+        hj.place_sections(vanderpol_cycle, [tangent, scaled[0]])
+
+
 TOP = Crossing("v", "falling")
 
 
