@@ -1,7 +1,9 @@
 """The flow does not depend on the units in which a system is written."""
 
 import functools as ft
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,8 @@ from hybridjax.engine.move import move, record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
+
+from ..toys import Field
 
 
 # Lengths and times in these units. Powers of two change no rounding: all decisions are the same.
@@ -93,3 +97,73 @@ def test_sizes_of_each_of_many_flows_and_derivatives():
     np.testing.assert_allclose(rates[0], rates[1], rtol=1e-9, atol=1e-9)
     reverse = jax.jit(jax.grad(lambda u: jnp.sum(along(SIZES)(u))))(0.1)
     np.testing.assert_allclose(reverse, jnp.sum(rates[0]), rtol=1e-9)
+
+
+# --- Single trajectories, whose usual sizes are not known -----------------------------------------
+
+
+def run(length, time):
+    system = hopper(length, time)
+    state = np.array([2.0, 1.9]) * sizes(length, time)[:2]
+    return hj.simulate(system, "stance", state, 3.0 * time)
+
+
+@pytest.mark.parametrize("length, time", UNITS)
+def test_a_trajectory_takes_the_same_steps_in_all_units_of_length(length, time):
+    """In units of time, too, but for the first step."""
+    usual, other = run(1.0, 1.0), run(length, time)
+    if time == 1.0:
+        np.testing.assert_array_equal(other.t, usual.t)
+    assert [e.name for e in other.events] == [e.name for e in usual.events]
+    ends = [x.after[-1] / sizes(*u) for x, u in ((usual, (1.0, 1.0)), (other, (length, time)))]
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9, atol=1e-9)
+    times = [[e.time for e in x.events] for x in (usual, other)]
+    np.testing.assert_allclose(np.array(times[1]) / time, times[0], rtol=1e-10)
+
+
+class Any(hj.HybridSystem):
+    """One chart with any field."""
+
+    function: Callable = eqx.field(static=True)
+    n: int = eqx.field(static=True)
+
+    def charts(self):
+        return {"x": Field(tuple(f"x{k}" for k in range(self.n)), self.function)}
+
+
+SPRING = lambda t, q, u: (q[1], 9.81 - 100.3 * (q[0] - 0.1))  # noqa: E731
+CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
+
+
+@pytest.mark.parametrize(
+    "function, start, end",
+    [
+        pytest.param(lambda t, q, u: (q[1], -q[0]), (0.0, 0.0), (0.0, 0.0), id="zero"),
+        pytest.param(lambda t, q, u: (-q[0], 0.0), (1.0, 0.0), (np.exp(-10), 0), id="a counter"),
+        pytest.param(
+            SPRING, (0.1 + 9.81 / 100.3, 0.0), (0.1 + 9.81 / 100.3, 0.0), id="rest up to rounding"
+        ),
+        pytest.param(
+            lambda t, q, u: (-q[0], 1e-17 * q[0]), (1.0, 0.0), (np.exp(-10), 0), id="rounding level"
+        ),
+        pytest.param(CHAIN, (0.0,) * 5, None, id="a chain of integrators from zero"),
+    ],
+)
+def test_states_at_rest_stop_nothing(function, start, end):
+    found = hj.simulate(Any(function, len(start)), "x", start, 10.0)
+    assert len(found.t) < 150
+    if end is None:
+        t = 10.0
+        end = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
+        np.testing.assert_allclose(found.after[-1][1:], end, rtol=1e-9)
+    else:
+        np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
+
+
+def test_a_weak_force_counts_where_it_is_all_there_is():
+    """From rest at zero under a force of 1e-9, to as many digits as under a force of 1."""
+    found = hj.simulate(
+        Any(lambda t, q, u: (q[1], -q[0] + 1e-9 * jnp.sin(t)), 2), "x", (0.0, 0.0), 10.0
+    )
+    exact = 0.5e-9 * (np.sin(10.0) - 10.0 * np.cos(10.0))
+    np.testing.assert_allclose(found.after[-1, 0], exact, rtol=1e-8)
