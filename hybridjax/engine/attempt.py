@@ -12,6 +12,7 @@ from .aim import Aim
 from .events import width
 from .hermite import NEAR, control_points, root_near_end
 from .lanes import Lanes, for_each_chart, only
+from .settings import Settings
 from .solver.step import Step, rk_step
 from .target import Target
 from .watch import Watch, chart_field, nothing, pick, settle, take, values, watched, write
@@ -73,8 +74,7 @@ def attempt(
     aim: Aim,
     u: Float[Array, "nu L"],
     target: Target,
-    rtol: Float[Array, "*#L"],
-    atol: Float[Array, "*#L"],
+    settings: Settings,
     span: Float[Array, " L"],
     unroll: bool,
     in_step: bool,
@@ -102,10 +102,10 @@ def attempt(
             lambda: rk_step(chart_field(s, a, uu), t, q, tau, unroll),
             lambda: Step(q, q, q, q),
         )
-        tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
+        tolerance = settings.tolerance(a, q, step.q)
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * jnp.cos(1.0 + jnp.arange(n))[:, None] * tolerance / rtol
+            aside = _ASIDE * jnp.cos(1.0 + jnp.arange(n))[:, None] * tolerance / settings.rtol
             field = chart_field(s, a, uu)
             near = jax.lax.cond(
                 some & tangents,

@@ -11,7 +11,8 @@ from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .lanes import Lanes
-from .move import Moved, Settings, constant, record, retrace
+from .move import Moved, constant, record, retrace
+from .settings import Settings
 from .tape import Tape
 from .target import Target
 

@@ -17,24 +17,10 @@ from ..systems.system import HybridSystem
 from .lanes import Lanes
 from .replay import replay
 from .search import Moved, search
+from .settings import Settings
 from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
-
-
-def _number(x) -> Array:
-    return jnp.asarray(x, float)
-
-
-class Settings(eqx.Module):
-    """Accuracy and effort of the flow."""
-
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
-    """Bound on a step's error estimate relative to each state's size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
-    """Bound on a step's error estimate, absolute."""
-    max_steps: int = eqx.field(static=True, default=256)
-    """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
 
 
 class _How(NamedTuple):
@@ -104,7 +90,7 @@ def retrace(
 
 def _defaults(system, lanes, u, target, settings, setout, result):
     if setout is None:
-        setout = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings.rtol)
+        setout = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
         setout = stride(setout)
     if result is None:
@@ -127,7 +113,6 @@ def _search(system, lanes, u, target, setout, result, settings, how: _How):
 
 
 def _run(system, levels, settings, how: _How, lanes, u, target, setout, result):
-    settings = shared(settings)
     return search(
         Structure(system),
         lanes,
@@ -135,9 +120,7 @@ def _run(system, levels, settings, how: _How, lanes, u, target, setout, result):
         dataclasses.replace(target, levels=levels),
         stride=setout,
         result=result,
-        rtol=settings.rtol,
-        atol=settings.atol,
-        max_steps=settings.max_steps,
+        settings=shared(settings),
         **how._asdict(),
     )
 

@@ -23,6 +23,7 @@ from .attempt import SLOW, Attempt, attempt
 from .events import apply_resets, arm, enabled, keep_pace, rearm, width
 from .hermite import CubicCrossing, first_crossing
 from .lanes import Lanes
+from .settings import Settings
 from .stride import Stride
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape, blank_tape, write_row
 from .target import Target
@@ -55,9 +56,7 @@ def search(
     *,
     stride: Stride,
     result: Int[Array, " L"],
-    rtol: Float[Array, "*#L"],
-    atol: Float[Array, "*#L"],
-    max_steps: int,
+    settings: Settings,
     tape: bool,
     glide: bool,
     new_input: bool,
@@ -87,7 +86,7 @@ def search(
         jnp.zeros(L, bool),
         jnp.zeros((), jnp.int32),
     )
-    blank = blank_tape(max_steps, lanes) if tape else None
+    blank = blank_tape(settings.max_steps, lanes) if tape else None
 
     def active(state):
         return ~state.arrived & (state.result == Result.OK)
@@ -97,14 +96,14 @@ def search(
         aim, way = take_aim(s, state, active(state), target, stride)
         ready = jnp.concatenate([state.lanes.armed, state.aimed[None]])
         here, where = (state.lanes, state.seen, ready, active(state)), (u, target)
-        new = attempt(s, *here, aim, *where, rtol, atol, span, unroll, in_step, tangents)
+        new = attempt(s, *here, aim, *where, settings, span, unroll, in_step, tangents)
         calm = new.calm & (new.error <= stride.slack) & ~state.approach.on & (way.schedule < 0)
         calm = calm & ~(new.lands & (aim.which < len(s.transitions)))
         return calm, aim, way, new
 
     def going(carry):
         state, _ = carry
-        return (state.i < max_steps) & active(state).any()
+        return (state.i < settings.max_steps) & active(state).any()
 
     def body(carry):
         state, tape = carry

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from ..systems.structure import Structure
 from .lanes import Lanes, for_each_chart, only
+from .settings import Settings
 from .watch import chart_field
 
 
@@ -27,15 +28,15 @@ def stride(h: Float[Array, " L"]) -> Stride:
     return Stride(h, jnp.zeros_like(h), jnp.ones_like(h))
 
 
-def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol):
+def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], settings: Settings):
     """A cautious first step: a fraction of the time in which the state changes by its size."""
 
     def work(a, here, out):
         q = only(here, lanes.q[: s.dims[a]])
         f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
-        ratio = jnp.linalg.norm(q, axis=0) / jnp.linalg.norm(f, axis=0)
-        ratio = jnp.where(jnp.isfinite(ratio) & (ratio > 0), ratio, jnp.inf)
-        h = jnp.minimum(0.1 * ratio * (100 * rtol) ** (1 / 7), 0.01 * span)
+        rate = jnp.max(jnp.abs(f) / settings.tolerance(a, q), axis=0, initial=0.0) * settings.rtol
+        ratio = jnp.where(jnp.isfinite(rate) & (rate > 0), 1 / rate, jnp.inf)
+        h = jnp.minimum(0.1 * ratio * (100 * settings.rtol) ** (1 / 7), 0.01 * span)
         return jnp.where(here, h, out)
 
     everywhere = jnp.ones(lanes.t.shape[0], bool)

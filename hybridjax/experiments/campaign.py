@@ -16,7 +16,7 @@ from .._core.garbage_collector import uncollected
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
 from .._core.threads import in_threads, meanwhile, thread_count
-from ..engine.move import Settings
+from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
@@ -36,7 +36,7 @@ from .single_precision import plan_single
 # cost of what is done once for all; and elsewhere.
 _BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
 # The accuracy where none is asked for.
-_ACCURACY = {"double": 1e-9, "single": 1e-4}
+_ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
 # Splitting fewer than this among workers gains nothing.
 _FEW = 32
 # Up to so many samples in all, a program that is compiled in half the time runs at most 0.03 s

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 from .._core.compile import quick_jit
 from .._core.memo import Memory
 from .._core.results import Result
-from ..engine.move import Settings, move
+from ..engine.move import move
+from ..engine.settings import Settings
 from ..engine.stride import Stride
 from ..engine.watch import watch
 from ..errors import DefinitionError

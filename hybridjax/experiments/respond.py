@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..engine.lanes import Lanes, for_each_chart, needed, only
-from ..engine.move import Settings, move
+from ..engine.move import move
+from ..engine.settings import Settings
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.precision import require_x64
-from ..engine.move import Settings
+from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
 from ..maps.place import as_placed
 from ..maps.placed import PlacedSections
@@ -71,7 +71,7 @@ def response_function(
     sections,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    accuracy: float = 1e-9,
+    accuracy: float = EXPERIMENT,
     scale: Mapping[str, float] | None = None,
 ) -> ResponseFunction:
     """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.

@@ -9,7 +9,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.events import start_lanes
-from hybridjax.engine.move import Settings, move
+from hybridjax.engine.move import move
+from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 

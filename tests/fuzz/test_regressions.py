@@ -10,7 +10,8 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.compile import quick_jit
 from hybridjax.engine.events import start_lanes
-from hybridjax.engine.move import Settings, move, record
+from hybridjax.engine.move import move, record
+from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from ..._core.compile import quick_jit
 from ...engine.lanes import Lanes
-from ...engine.move import Settings, constant, record, retrace
+from ...engine.move import constant, record, retrace
+from ...engine.settings import Settings
 from ...systems.structure import Structure
 from ...systems.system import HybridSystem
 from ..return_map import ReturnMap, across, departure, held, turn

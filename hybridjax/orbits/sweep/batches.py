@@ -16,7 +16,8 @@ from ..._core.garbage_collector import uncollected
 from ..._core.results import Result
 from ..._core.threads import in_threads
 from ...engine.lanes import Lanes
-from ...engine.move import Settings, move
+from ...engine.move import move
+from ...engine.settings import TRANSIENT, Settings
 from ...engine.target import toward, until
 from ...sections.families import AtEvent, ListLevels
 from ...systems.structure import Structure
@@ -293,7 +294,7 @@ def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
     """Where systems are after they have flowed freely for a while, at the guess's phase or
     section (NaN for those that do not get there), and their expected periods."""
     base = guess.base
-    patient = Settings(rtol=1e-6, atol=1e-6, max_steps=512 * _SETTLE)
+    patient = Settings(rtol=TRANSIENT, atol=TRANSIENT, max_steps=512 * _SETTLE)
 
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)

@@ -1,0 +1,91 @@
+"""The flow does not depend on the units in which a system is written."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import move, record
+from hybridjax.engine.settings import Settings
+from hybridjax.engine.target import until
+from hybridjax.systems.structure import Structure
+
+
+# Lengths and times in these units. Powers of two change no rounding: all decisions are the same.
+UNITS = [(2.0**20, 1.0), (2.0**-30, 1.0), (1.0, 2.0**10), (2.0**-20, 2.0**-8)]
+SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
+
+
+def hopper(length=1.0, time=1.0):
+    """The hopper with lengths and times multiplied."""
+    return hj.models.VerticalHopper(
+        l0=2.0 * length,
+        a=20.0 * length / time**2,
+        g=2.0 * length / time**2,
+        k=10.0 / time**2,
+        b=5.0 / time,
+        omega=2 * np.pi / time,
+    )
+
+
+def sizes(length, time):
+    """By which the hopper's states are multiplied."""
+    return length * jnp.array([1.0, 1 / time, 1.0, 1 / time])
+
+
+def begin(system, length, time):
+    """A lane at the top of a hop, and one on the ground."""
+    q = np.array([[2.2, 0.0, 0.3, 0.1], [2.0, 1.9, 0.0, 0.0]]) * sizes(length, time)
+    return start_lanes(Structure(system), jnp.zeros(2), jnp.array([0, 1], jnp.int32), q.T)
+
+
+@ft.partial(jax.jit, static_argnums=3)
+def flow(length, time, scale, tangents):
+    """Steps, codes and states (in the units of 1, 1) of a second and a half."""
+    system = hopper(length, time)
+    lanes, u = begin(system, length, time), jnp.zeros((1, 2))
+    settings = Settings(1e-10, 1e-10, 256, scale)
+    end = until(jnp.full(2, 1.5 * time))
+    moved, tape = record(system, lanes, u, end, settings, tangents=tangents)
+    return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
+
+
+@pytest.mark.parametrize("tangents", [False, True])
+def test_the_same_steps_in_all_units(tangents):
+    h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
+    np.testing.assert_array_equal(result, hj.Result.OK)
+    assert jnp.max(code) >= 0
+    for length, time in UNITS:
+        other = flow(length, time, SIZES * sizes(length, time), tangents)
+        for x, y in zip((h, code, q), other, strict=False):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_micrometers_and_milliseconds():
+    _, _, q, _ = flow(1.0, 1.0, SIZES, False)
+    for length, time in ((1e6, 1.0), (1e-9, 1.0), (1.0, 1e3), (1e-9, 1e9)):
+        _, _, other, _ = flow(length, time, SIZES * sizes(length, time), False)
+        np.testing.assert_allclose(other, q, rtol=1e-11, atol=1e-11)
+
+
+def test_settings_of_single_lanes_and_derivatives():
+    """Mapped over scales: a finer one is more accurate, and derivatives do not mind."""
+    system = hopper()
+    lanes = begin(system, 1.0, 1.0)
+
+    def end(u, scale):
+        target = until(jnp.full(2, 1.5))
+        settings = Settings(1e-13, 1.0, 256, scale)
+        return move(system, lanes, jnp.full((1, 2), u), target, settings).lanes.q
+
+    both = lambda scale: jax.jvp(lambda u: end(u, scale), (0.1,), (1.0,))  # noqa: E731
+    scales = SIZES * np.array([1e-13, 1e-12, 1e-2, 1.0])[:, None, None]
+    (truth, *found), (rate, *_) = jax.jit(jax.vmap(both))(scales)
+    errors = [np.max(np.abs(q - truth)) for q in found]
+    assert errors[0] < 1e-12 and 1e-8 < errors[2]
+    reverse = jax.jit(jax.grad(lambda u: jnp.sum(end(u, scales[0]))))(0.1)
+    np.testing.assert_allclose(reverse, jnp.sum(rate), rtol=1e-9)
