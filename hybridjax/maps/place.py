@@ -60,7 +60,7 @@ def as_placed(cycle: LimitCycle, sections) -> PlacedSections:
     other = sections.cycle
     if other is cycle:
         return sections
-    mine, theirs = ((c.system, c.start, c.period) for c in (cycle, other))
+    mine, theirs = ((c.system, c.anchor, c.period) for c in (cycle, other))
     if is_traced((mine, theirs)):
         return place_sections(cycle, sections.family)
     if not eqx.tree_equal(*jax.device_get((mine, theirs))):
@@ -129,7 +129,7 @@ def _place(cycle, sections) -> tuple[PlacedSections, Int[Array, ""]]:
             anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(first, x, y), end, anchor)
         return (end, moved.h, moved.result, anchor), (end, moved.result, tape)
 
-    begin = (cycle.start, (0.1 * period / N)[None], jnp.zeros(1, jnp.int32), cycle.start)
+    begin = (cycle.anchor, (0.1 * period / N)[None], jnp.zeros(1, jnp.int32), cycle.anchor)
     (*_, anchor), visited = jax.lax.scan(to_section, begin, jnp.arange(N + 1))
     bound = bind(anchor)
     visited, result, tape = jax.tree_util.tree_map(
