@@ -37,7 +37,7 @@ class LimitCycle(eqx.Module):
         `factors[n]` is [:dims[n+1], :dims[n]].
     - `residual`: largest distance between `anchor` and where it is after one period, in sizes of
         the states.
-    - `iterations`: Newton steps taken.
+    - `iterations`: Newton steps that found it.
     - `result`: a `Result` code.
     - `event_sequence`: transitions of one turn, by index, in order from the anchor.
     - `settings`: accuracy of the flow, with the sizes of the states.

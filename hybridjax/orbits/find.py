@@ -192,7 +192,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     again = solve(finer)
     if int(again.result) not in (Result.OK, Result.SINGULAR):
         return map, solution
-    return finer, again._replace(steps=again.steps + solution.steps)
+    return finer, again._replace(steps=solution.steps)
 
 
 def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:

@@ -83,7 +83,7 @@ class Turn(NamedTuple):
     """How often the turn met the section that it ended on, as far as its pieces show it."""
 
     @property
-    def closed(self) -> Bool[Array, "..."]:
+    def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
         """Whether it came back to where it began (also of many turns at once, on the host)."""
         return self.distance <= _CLOSED
 
@@ -143,7 +143,7 @@ class ReturnMap(eqx.Module):
         return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
 
     def departure(self, q: Float[Array, " d"]) -> Lanes:
-        """The lane at the beginning of a turn: right after an event, that event is not due again."""
+        """The lane at the beginning of a turn: an event that was just there is not due again."""
         s, anchor = self.structure, self.anchor
         lanes = start_lanes(s, anchor.t, anchor.chart, q[:, None])
         u, everywhere = jnp.zeros((s.nu, 1)), jnp.ones(1, bool)

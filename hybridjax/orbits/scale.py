@@ -6,7 +6,7 @@ the state in one period. Wherever rounding errors of the field move a state by m
 they do a state that a symmetry keeps at zero, the size is so large that they are tolerated.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -186,7 +186,7 @@ def _floor(seen: _Seen, time: float) -> Float[np.ndarray, "d K"]:
     return _TIMES_ROUNDING * time * seen.rounding
 
 
-def _by_name(s: Structure, chart: Iterable[int], size: Float[np.ndarray, "d K"]) -> Sizes:
+def _by_name(s: Structure, chart: Int[np.ndarray, " K"], size: Float[np.ndarray, "d K"]) -> Sizes:
     """The largest size of each state in any chart; 1 for one that is zero everywhere."""
     sizes = dict.fromkeys(s.state_names(), 0.0)
     for a, column in zip(chart, size.T, strict=True):

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float, Inexact
 
 from ..._core.compile import quick_jit
 from ..._core.results import Result
@@ -33,8 +33,8 @@ _SINGULAR = 1e-14
 # States that hardly move on the cycle count as if they moved by these parts of the largest move and
 # of their own size. Doubled, steps are up to twice as long.
 _FLOOR, _SHARE = 1e-3, 0.02
-# Nothing moves if the largest move is at most this part of the largest state, all in sizes. Doubled,
-# cycles twice as large are taken for an equilibrium.
+# Nothing moves if the largest move is at most this part of the largest state, all in sizes.
+# Doubled, cycles twice as large are taken for an equilibrium.
 _REST = 1e-6
 # A multiplier is complex, and two are conjugate, up to these differences. Doubled, real pairs with
 # the product 1 that are so close are taken for a Neimark-Sacker point.
@@ -97,7 +97,7 @@ class Point:
         return turn_product(self.turn.factors[None])[0, : self.dim, : self.dim]
 
     @ft.cached_property
-    def eigenvalues(self) -> Complex[np.ndarray, " m"]:
+    def eigenvalues(self) -> Inexact[np.ndarray, " m"]:
         return np.linalg.eigvals(self.monodromy)
 
     @ft.cached_property

@@ -25,8 +25,8 @@ from ..scale import given_sizes, scale_of
 from .batches import FULL, QUICK, Tiles
 
 
-# Up to so many systems, programs that are compiled in half the time run at most 3 s longer (doubled:
-# 6 s).
+# Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
+# Doubled, it is 6 s.
 _SMALL = 2000
 
 
