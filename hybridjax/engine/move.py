@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.lane_jvp import lane_jvp
-from .._core.per_lane import PerLane, shared
+from .._core.per_lane import shared
 from .._core.results import Result
 from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
 from .lanes import Lanes
 from .replay import replay
 from .search import Moved, search
@@ -33,7 +32,7 @@ class _How(NamedTuple):
 
 
 def move(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     u: Float[Array, "nu L"],
     target: Target,
@@ -53,12 +52,12 @@ def move(
     otherwise the lanes go on as they are. With `glide`, one step is thought to be enough for most.
     """
     how = _How(False, glide, new_input, False)
-    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, how)[0]
+    setout, result = _defaults(s, lanes, u, target, settings, setout, result)
+    return _move(s.source, lanes, u, target, setout, result, settings, how)[0]
 
 
 def record(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     u: Float[Array, "nu L"],
     target: Target,
@@ -73,24 +72,24 @@ def record(
     With `tangents`, steps are short enough for the derivatives, too, that a replay will have.
     """
     how = _How(True, False, new_input, tangents)
-    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, how)
+    setout, result = _defaults(s, lanes, u, target, settings, setout, result)
+    return _move(s.source, lanes, u, target, setout, result, settings, how)
 
 
 def retrace(
-    system: HybridSystem | PerLane,
+    s: Structure,
     lanes: Lanes,
     u: Float[Array, "nu L"],
     target: Target,
     tape: Tape,
 ) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
-    return replay(Structure(system), lanes, u, target, tape.h, tape.code)
+    return replay(s, lanes, u, target, tape.h, tape.code)
 
 
-def _defaults(system, lanes, u, target, settings, setout, result):
+def _defaults(s, lanes, u, target, settings, setout, result):
     if setout is None:
-        setout = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings)
+        setout = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
         setout = stride(setout)
     if result is None:

@@ -216,7 +216,7 @@ def _start(system, t, a, state, u, span, settings):
 @quick_jit
 def _piece(system, lanes, u, end, settings, h):
     settings = dataclasses.replace(settings, max_steps=_ROWS)
-    return record(system, lanes, u, until(end[None]), settings, h)
+    return record(Structure(system), lanes, u, until(end[None]), settings, h)
 
 
 def _slopes(system, t, chart, q, u) -> np.ndarray:

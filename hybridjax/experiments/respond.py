@@ -67,7 +67,7 @@ def respond(
         turns = (j == 0).astype(jnp.int32)
         target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.event_sequence)
-        moved = move(system, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
+        moved = move(s, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1

@@ -159,7 +159,9 @@ class ReturnMap(eqx.Module):
 
         def flow(lanes, target, h, result):
             u = jnp.zeros((self.structure.nu, 1))
-            moved = move(self.system, lanes, u, target, self.settings, h, result, new_input=False)
+            moved = move(
+                self.structure, lanes, u, target, self.settings, h, result, new_input=False
+            )
             return moved, None
 
         there, _ = self._round(q, flow)
@@ -182,8 +184,9 @@ class ReturnMap(eqx.Module):
 
         def flow(lanes, target, h, result):
             jacobian, moved, tape = flow_jacobian(
-                self.system, lanes, target, self.settings, h, result, True, False, wanted
-            )
+                s, lanes, target, self.settings, h, result, of_states=True, new_input=False,
+                wanted=wanted,
+            )  # fmt: skip
             factor = jacobian[0, 1 : n + 1]
             if direction is not None:
 
@@ -192,8 +195,8 @@ class ReturnMap(eqx.Module):
                     begin = eqx.tree_at(lambda x: x.t, lanes, lanes.t * grown)
                     time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
                     to = dataclasses.replace(target, time=time)
-                    system = _moved(self.system, direction, step)
-                    return retrace(system, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
+                    moved = Structure(_moved(self.system, direction, step))
+                    return retrace(moved, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
 
                 # The parameter as one more state, which stays what it is.
                 column = _derivative(end)[:, None]

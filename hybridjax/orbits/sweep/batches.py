@@ -314,14 +314,14 @@ def _settled(systems, map: ReturnMap, anchor: Lanes, period):
         own = _own(map, system, anchor, expected)
         s, anchor, expected = own.structure, own.anchor, own.expected
         u = jnp.zeros((s.nu, 1))
-        moved = move(system, anchor, u, until(anchor.t + _SETTLE * expected), patient)
+        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
         if base is not None:
             at_event = isinstance(base, AtEvent)
             event = s.transition_index(base.name) if at_event else -1
             target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
             if not at_event:
                 target = dataclasses.replace(target, levels=ListLevels((base,)))
-            moved = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
         anchor = eqx.tree_at(lambda x: (x.chart, x.q), anchor, (moved.lanes.chart, q))
         return anchor, expected
