@@ -35,6 +35,9 @@ _PATIENCE = 1000.0
 # A cycle is computed anew with the sizes that states have on it if one of them is off by more than
 # this factor. Doubled, accuracies are kept to within twice the factor.
 _OFF = 4.0
+# A state keeps its rough size if on the cycle it is smaller than this part of it: it rests. Doubled,
+# so do states that move twice as far.
+_VANISHING = 1e-6
 # Steps of Levenberg and Marquardt before a cycle is given up.
 _DAMPED_STEPS = 64
 # The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
@@ -182,8 +185,10 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     if int(solution.result) not in (Result.OK, Result.SINGULAR):
         return map, solution
     s, legs, period = map.structure, solution.turn.legs, float(solution.turn.period)
-    sizes = sizes_on(map.system, legs.t, legs.chart, legs.q, period) | given
-    if alike(sizes, sizes_of(s, map.settings.scale), _OFF):
+    rough = sizes_of(s, map.settings.scale)
+    sizes = sizes_on(map.system, legs.t, legs.chart, legs.q, period)
+    sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
+    if alike(sizes, rough, _OFF):
         return map, solution
     expected = map.expected if map.base is None else solution.turn.period
     finer = dataclasses.replace(

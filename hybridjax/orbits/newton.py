@@ -3,7 +3,6 @@
 Steps are taken, and convergence is judged, in sizes of the states.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -96,9 +95,8 @@ def _root_jvp(primals, tangents):
     where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""
     map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
     q, turn, steps = root(*primals)
-    t_map = dataclasses.replace(
-        t_map, settings=jax.tree_util.tree_map(lambda _: None, map.settings)
-    )
+    fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
+    t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
     _, by_parameters = eqx.filter_jvp(lambda map: map.turn(q).residual, (map,), (t_map,))
     jacobian = map.turn_with_jacobian(q).jacobian * sizes / sizes[:, None]
     jacobian = lx.MatrixLinearOperator(jacobian)

@@ -24,11 +24,17 @@ from ..systems.system import HybridSystem
 
 Sizes = dict[str, float]
 
-# A size is at least this many times the error by which rounding moves the state in one period, so
-# that an absolute tolerance of 1e-12 sizes is not below rounding. Doubled, it is half as strict.
-_TIMES_ROUNDING = 1e11
-# Numbers of rounding errors by which states are shifted to see those of the field.
-_SHIFTS = np.array([-3.0, -1.0, 2.0, 4.0])
+# A size is at least this many times the error by which rounding moves the state in one period.
+# Steps are judged by errors of 1e-12 sizes, and by the change of these errors where states are moved
+# by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to what
+# moves them are computed half as accurately.
+_TIMES_ROUNDING = 5e13
+# A period may be so many times that of the fastest mode at the guess. Doubled, sizes of states that
+# rest are guessed twice as large.
+_MODES = 20.0
+# Shifts of states by which rounding errors of the field are seen, in rounding errors of the states:
+# odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
+_SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
 # Points at which fields are seen in one call, so that one program serves guesses and cycles.
 _POINTS = 16
 
@@ -59,7 +65,7 @@ def sizes_near(
     near = _look(system, reached, np.full(len(reached), float(t)), points[reached].T)
     time = _time_scale(near) if period is None else period
     size = np.abs(near.q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, time))), time)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, _MODES * time))), time)
 
 
 def sizes_on(
@@ -123,7 +129,7 @@ class _Seen(NamedTuple):
     derivative: Float[np.ndarray, "d d K"]
     """Of the field by the state."""
     rounding: Float[np.ndarray, "d K"]
-    """By how much the field differs between states that rounding cannot tell apart."""
+    """By how much rounding errors change the field, seen at states that all but agree."""
 
 
 def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
@@ -142,16 +148,12 @@ def _field(system, chart, t, q):
     column = lambda e: jax.jvp(lambda q: at(t, q), (q,), (e[:, None] * jnp.ones(K),))[1]  # noqa: E731
     derivative = jax.vmap(column, out_axes=1)(jnp.eye(s.d))
     # Not all states by the same part, since a common factor may cancel.
-    shifts = np.stack([np.roll(_SHIFTS, k) for k in range(s.d + 1)]) * np.finfo(float).eps
-    many = lambda x, shift: (x[..., None] * (1 + shift)).reshape(*x.shape[:-1], K * S)  # noqa: E731
-    moved = slopes(
-        s,
-        many(t, shifts[-1]),
-        jnp.repeat(chart, S),
-        many(q, shifts[:-1, None]),
-        jnp.zeros((s.nu, K * S)),
-    )
-    rounding = jnp.max(jnp.abs(moved.reshape(s.d, K, S) - f[..., None]), axis=-1)
+    shifts = np.stack([np.roll(_SHIFTS, k) for k in range(s.d)]) * np.finfo(float).eps
+    moved = q[..., None] * (1 + shifts[:, None])
+    many = moved.reshape(s.d, K * S)
+    after = slopes(s, jnp.repeat(t, S), jnp.repeat(chart, S), many, jnp.zeros((s.nu, K * S)))
+    smooth = jnp.einsum("ijk,jks->iks", derivative, moved - q[..., None])
+    rounding = jnp.max(jnp.abs(after.reshape(s.d, K, S) - f[..., None] - smooth), axis=-1)
     return f, change, derivative, rounding
 
 
