@@ -35,8 +35,8 @@ _PATIENCE = 1000.0
 # A cycle is computed anew with the sizes that states have on it if one of them is off by more than
 # this factor. Doubled, accuracies are kept to within twice the factor.
 _OFF = 4.0
-# A state keeps its rough size if on the cycle it is smaller than this part of it: it rests. Doubled,
-# so do states that move twice as far.
+# A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
+# Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
 # Steps of Levenberg and Marquardt before a cycle is given up.
 _DAMPED_STEPS = 64

@@ -25,9 +25,9 @@ from ..systems.system import HybridSystem
 Sizes = dict[str, float]
 
 # A size is at least this many times the error by which rounding moves the state in one period.
-# Steps are judged by errors of 1e-12 sizes, and by the change of these errors where states are moved
-# by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to what
-# moves them are computed half as accurately.
+# Steps are judged by errors of 1e-12 sizes, and by the change of these errors where states are
+# moved by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to
+# what moves them are computed half as accurately.
 _TIMES_ROUNDING = 5e13
 # A period may be so many times that of the fastest mode at the guess. Doubled, sizes of states that
 # rest are guessed twice as large.
