@@ -35,7 +35,11 @@ NAMES = [*CASES, "branches"]
 def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     """The cycle, the exact HTF, and its estimate."""
     cycle = hj.find_limit_cycle(
-        case.system, case.guess, section=case.section, multiplicity=case.multiplicity, conserved=case.conserved
+        case.system,
+        case.guess,
+        section=case.section,
+        multiplicity=case.multiplicity,
+        conserved=case.conserved,
     )
     placed = hj.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
