@@ -36,7 +36,7 @@ class Case(NamedTuple):
     plane: tuple[str, str] | None
     section: object = None
     guess: hj.Guess | None = None
-    turns: int | None = None
+    multiplicity: int | None = None
     conserved: dict[str, float] | None = None
     start: str = "periodic"
 
@@ -113,7 +113,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "buck, period 2": lambda: Case(
         "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, anchor=0.03),
         "v", "reference voltage", 2e-6, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
-        _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), turns=2,
+        _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2,
     ),
     "Hopf": lambda: Case(
         "Hopf normal form", m.HopfOscillator(),

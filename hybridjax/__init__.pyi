@@ -51,7 +51,8 @@ from .maps.placed import PlacedSections as PlacedSections
 from .maps.section_map import section_map as section_map
 from .orbits.branches.branch import Branch as Branch
 from .orbits.branches.continuation import continuation as continuation
-from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
+from .orbits.cycle import LimitCycle as LimitCycle
+from .orbits.find import find_limit_cycle as find_limit_cycle
 from .orbits.sweep.limit_cycles import (
     LimitCycles as LimitCycles,
     find_limit_cycles as find_limit_cycles,

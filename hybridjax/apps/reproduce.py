@@ -31,7 +31,8 @@ from ..maps.linearize import linearize
 from ..maps.place import place_sections
 from ..maps.placed import PlacedSections
 from ..models.hopper import VerticalHopper
-from ..orbits.cycle import LimitCycle, find_limit_cycle
+from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
 from ..sections.clock import ClockPhase
 from ..sections.crossing import Crossing
 from ..sections.kinematic import KinematicPhase
@@ -207,11 +208,11 @@ def _identify(cycle, name, design, protocol, clock) -> Family:
 def _perturbed(cycle: LimitCycle) -> Trajectory:
     start = dict(cycle.state)
     start["yM"] += 0.05
-    chart = list(cycle.system.charts())[int(cycle.start.chart[0])]
+    chart = list(cycle.system.charts())[int(cycle.anchor.chart[0])]
     period = float(cycle.period)
     state = np.array(list(start.values()))
     return simulate(
-        cycle.system, chart, state, 12 * period, time=float(cycle.start.t[0]), throw=False
+        cycle.system, chart, state, 12 * period, time=float(cycle.anchor.t[0]), throw=False
     )
 
 

@@ -53,7 +53,7 @@ def respond(
     s = Structure(system)
     z = s.resolve_outputs(outputs)
     N, (S, n, _) = placed.n_sections, u.shape
-    one_turn = len(cycle.order)
+    one_turn = len(cycle.event_sequence)
     first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
     lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
@@ -66,7 +66,7 @@ def respond(
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
         target = placed.target(j[None], lanes.t, turns[None])
-        target = dataclasses.replace(target, order=cycle.order)
+        target = dataclasses.replace(target, order=cycle.event_sequence)
         moved = move(s, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn

@@ -71,7 +71,7 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     other = sections.cycle
     if other is cycle:
         return sections
-    mine, theirs = ((c.system, c.start, c.period) for c in (cycle, other))
+    mine, theirs = ((c.system, c.anchor, c.period) for c in (cycle, other))
     if is_traced((mine, theirs)):
         return place_sections(cycle, sections.family)
     if not eqx.tree_equal(*jax.device_get((mine, theirs))):
@@ -145,7 +145,7 @@ def _visit(
             anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(first, x, y), end, anchor)
         return (end, moved.h, moved.result, anchor), _Visits(end, moved.result, tape)
 
-    begin = (cycle.start, (0.1 * period / N)[None], jnp.zeros(1, jnp.int32), cycle.start)
+    begin = (cycle.anchor, (0.1 * period / N)[None], jnp.zeros(1, jnp.int32), cycle.anchor)
     (*_, anchor), visits = jax.lax.scan(step, begin, jnp.arange(N + 1))
     # From an axis of visits and one of a single lane to one of lanes.
     visits = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), visits)

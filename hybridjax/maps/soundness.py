@@ -100,7 +100,7 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     """How often one period of the cycle crosses each section, and how steeply: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
     event = np.asarray(placed.bound.event)
-    counts = np.array([placed.cycle.order.count(g) if g >= 0 else 1 for g in event])
+    counts = np.array([placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event])
     steepness = np.ones(placed.n_sections)
     if placed.bound.levels is None:
         return counts, steepness

@@ -57,5 +57,5 @@ def test_events_before_the_search_do_not_count(hopper_cycle):
     settled = hj.find_limit_cycle(
         hj.models.VerticalHopper(), hj.Guess("stance", (2.0, 1.9), 0.5), settle=20.0
     )
-    assert int(settled.start.events[0]) == 0
-    np.testing.assert_allclose(settled.start.q, hopper_cycle.start.q, atol=1e-11)
+    assert int(settled.anchor.events[0]) == 0
+    np.testing.assert_allclose(settled.anchor.q, hopper_cycle.anchor.q, atol=1e-11)
