@@ -108,12 +108,12 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
         np.testing.assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
     scaled = hj.KinematicPhase(
         SECTIONS, position="yM", velocity="vM", center=(1.9 * length, 0.0),
-        scale=(0.3 * length, 1.9 * length / time), start=APEX,
+        scale=(0.3 * length, 1.9 * length / time), anchor=APEX,
     )  # fmt: skip
     plain = hj.KinematicPhase(
-        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
     )
-    clock = hj.ClockPhase(SECTIONS, start=APEX)
+    clock = hj.ClockPhase(SECTIONS, anchor=APEX)
     for family, theirs in ((clock, clock), (plain, scaled)):
         model = hj.linearize(hopper_cycle, family, ("yM", "vM"))
         other = hj.linearize(cycle, theirs, ("yM", "vM"))
