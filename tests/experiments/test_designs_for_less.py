@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random, hopper as hopper
+from ..linear.conftest import blocks_at_random, hopper as hopper
 
 
 def own(design, experiment):

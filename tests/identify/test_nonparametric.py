@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 DESIGNS = {

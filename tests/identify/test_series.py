@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from hybridjax.identify.series.fit.layout import lay_out
-from hybridjax.identify.series.fit.regression import delayed_outputs, linearize, rescale, set_up
+from hybridjax.identify.series.layout import lay_out
+from hybridjax.identify.series.regression import delayed_outputs, linearize, rescale, set_up
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 from .test_uncertainty import covered
 
 
@@ -238,7 +238,7 @@ def test_bad_records(small):
         hj.fit_series(hj.Record(good.u * np.nan, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match=r"not \(400, 1\) and \(399, 2\)"):
         hj.Record(good.u, good.y[1:], n_sections=4)
-    with pytest.raises(hj.DefinitionError, match="start from 0 to sections - 1"):
+    with pytest.raises(hj.DefinitionError, match="start from 0 to n_sections - 1"):
         hj.Record(good.u, good.y, n_sections=4, start=4)
     with pytest.raises(hj.DefinitionError, match="y is infinite at sample 7"):
         y = good.y.copy()

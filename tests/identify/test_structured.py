@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.identify.multipliers.compare import compare_multipliers
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 @pytest.mark.parametrize("harmonics", [None, 0, (-1, 0, 1), 1, (1, 2), (-16, -2, 2)])

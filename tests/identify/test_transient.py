@@ -5,7 +5,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..periodic.conftest import hopper as hopper
+from ..linear.conftest import hopper as hopper
 
 
 @pytest.fixture(scope="module")

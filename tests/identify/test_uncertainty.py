@@ -6,7 +6,7 @@ from scipy import stats
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 def noisy(htf, variance, rng, correlation=0.0):

@@ -116,7 +116,7 @@ def test_amplitudes(small):
 
 def test_bad_requests(small, hopper):
     data = record(small, 4 * 50)
-    with pytest.raises(hj.DefinitionError, match="different sections: 32 and 4"):
+    with pytest.raises(hj.DefinitionError, match="different n_sections: 32 and 4"):
         hj.validate(hopper, data)
     with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
         hj.validate(small, record(small, 20))
