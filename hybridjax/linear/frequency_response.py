@@ -18,7 +18,7 @@ def all_harmonics(n_sections: int) -> tuple[int, ...]:
     return tuple(range(-(n_sections // 2), (n_sections + 1) // 2))
 
 
-def check_harmonics(harmonics: int | Iterable | None, n_sections: int) -> tuple[int, ...]:
+def check_harmonics(harmonics: int | Iterable[int] | None, n_sections: int) -> tuple[int, ...]:
     """`harmonics` as an ascending tuple; `None` means all of them.
 
     **Raises:** `DefinitionError` for harmonics that are out of range, repeated or no integers.

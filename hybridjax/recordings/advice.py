@@ -9,12 +9,20 @@ from jaxtyping import Complex, Float
 
 from .._core.results import Result
 from ..errors import DefinitionError
+from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..identify.multipliers.compare import compare_multipliers
-from ..identify.multipliers.estimate import roots_of
-from ..identify.series.fit import SeriesFit, fit_series, quick_fit, refuse_order
-from ..identify.series.layout import Record, lay_out, pieces_of
-from ..identify.series.prediction import predict
-from ..identify.series.regression import Delayed, delayed_outputs, initial, linearize, set_up
+from ..identify.multipliers.denominator import Denominator
+from ..identify.series.arx import (
+    delayed_outputs,
+    ordinary_least_squares,
+    refuse_order,
+    total_least_squares,
+)
+from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.fit import assemble, fit_series
+from ..identify.series.output_error import OutputErrorProblem, linearize
+from ..identify.series.series_fit import SeriesFit
+from ..identify.series.simulation import simulate_record
 from ..identify.series.validation import Validation, validate
 from .sampling import SectionData
 from .spectra import input_band, input_spectrum
@@ -28,21 +36,14 @@ ENOUGH = 1000  # cycles to choose an order from, and to try it on
 _TIE = 0.02  # relative difference of misfits that are as good as equal
 
 
-def plain_regression(
-    data: SectionData | tuple[Record, ...], order: int
-) -> Complex[np.ndarray, " d"]:
+def plain_regression(data: RecordedData, order: int) -> Complex[np.ndarray, " d"]:
     """Multipliers by least squares on chi y = B u (ARX), which noise in y biases towards zero.
 
     To see by how much: `fit_series` has no such bias.
     """
-    layout = lay_out(data.records if isinstance(data, SectionData) else data)
-    problem = set_up(layout, order, layout.y.shape[2], False)
-    return _plain(delayed_outputs(problem, order))
-
-
-def _plain(delayed: Delayed) -> Complex[np.ndarray, " d"]:
-    gram = delayed.gram.sum(axis=0)
-    return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
+    grid = CycleGrid.from_data(data)
+    problem = OutputErrorProblem.from_grid(grid, order, grid.n_sections, free_start=True)
+    return ordinary_least_squares(delayed_outputs(problem, order))
 
 
 def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
@@ -55,17 +56,17 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
     early, late = _split(data, share)
-    layout = lay_out(early)
-    rest = pieces_of(late).pieces
+    grid = CycleGrid.from_data(early)
+    rest = uninterrupted_records(late)
     misfits = []
     for d in range(1, most + 1):
-        problem = set_up(layout, d, layout.y.shape[2], False)
-        c = initial(delayed_outputs(problem, d))
+        problem = OutputErrorProblem.from_grid(grid, d, grid.n_sections, free_start=True)
+        c = total_least_squares(delayed_outputs(problem, d))
         found = linearize(problem, c)
         if (found.freedom <= 2 * d).any():
             break
-        fit = quick_fit(problem, c, found, layout)
-        error = np.concatenate([predict(fit, p, True) - p.y for p in rest])
+        fit = assemble(grid, problem, found, Denominator.of_unknown_accuracy(c))
+        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
         misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
     if not misfits:
         raise DefinitionError(
@@ -102,23 +103,9 @@ def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]
     for r in data.records:
         end = round(len(r.u) * enough)
         cut = round(end * (1 - share))
-        early.append(_part(r, slice(0, cut)))
-        late.append(_part(r, slice(cut, end)))
+        early.append(r.part(0, cut))
+        late.append(r.part(cut, end))
     return early, late
-
-
-def _part(record: Record, rows: slice) -> Record:
-    start = (record.start + rows.start) % record.n_sections
-    return Record(
-        record.u[rows],
-        record.y[rows],
-        n_sections=record.n_sections,
-        start=start,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        lead=record.lead,
-        drift=record.drift,
-    )
 
 
 class Advice(eqx.Module):
@@ -155,15 +142,16 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     found = []
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    layout = lay_out(data.records)
-    sampled = np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min()
-    unknown = R * nu + len(layout.y) * (d + 1)
+    grid = CycleGrid.from_data(data)
+    sampled = np.isfinite(grid.y).all(axis=3).sum(axis=(0, 1)).min()
+    unknown = R * nu + len(grid.y) * (d + 1)
     if sampled - unknown < _FEW * sampled:
         found.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
             "record more, take fewer sections, or excite fewer inputs."
         )
-    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
+    overhang = R - 1 - fit.lead - d * N
+    problem = OutputErrorProblem.from_grid(grid, d, overhang, free_start=True)
     delayed = delayed_outputs(problem, d)
     try:
         refuse_order(delayed.rescale(fit.noise / problem.scale))
@@ -196,15 +184,15 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
                 f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
                 f"where the power of {name} ends."
             )
-    for i, j in combinations(range(layout.y.shape[3]), 2):
-        if _correlation(layout.y[..., i], layout.y[..., j]) > _ALIKE:
+    for i, j in combinations(range(grid.y.shape[3]), 2):
+        if _correlation(grid.y[..., i], grid.y[..., j]) > _ALIKE:
             found.append(
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "
                 "crossing to crossing (`CrossingPhase`, `--crossing`) may make multipliers "
                 "much surer."
             )
-    plain = _plain(delayed)
+    plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     if bias > 2 * fit.standard_errors.max():
         found.append(

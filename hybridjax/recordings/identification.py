@@ -5,7 +5,8 @@ from typing import Any
 
 import equinox as eqx
 
-from ..identify.series.fit import SeriesFit, fit_series
+from ..identify.series.fit import fit_series
+from ..identify.series.series_fit import SeriesFit
 from .advice import ENOUGH, Advice, HeldOut, advise, choose_order, hold_out
 from .drift import without_drift
 from .impulse import ImpulseResponses, impulse_responses
@@ -75,7 +76,7 @@ def identify_recording(
     held = hold_out(data, order)
     # A long recording need not be asked again whether it has a part of second order that pays.
     known = data.cycles > ENOUGH and not held.fit.distortion
-    fit = fit_series(data.records, order, check=False, distortion=False if known else None)
+    fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
         recording,
         phase,

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..identify.series.layout import Record
+from ..experiments.record import Record
 from .phase import Definition, Phase, Winding, estimate_phase
 from .recording import Recording, Trial
 from .smoothing import gaps, inside, means, nearest, spline
@@ -79,7 +79,7 @@ class SectionData(eqx.Module):
         """
         N, parts = self.n_sections, []
         for r in self.records:
-            first = -r.start % N
+            first = -r.first_section % N
             parts.append((r.u[first:], r.y[first:]))
         cycles = min(len(u) for u, _ in parts) // N
         u = np.stack([u[: cycles * N] for u, _ in parts])
@@ -176,7 +176,7 @@ def section_data(
     lead = phase.lead * n_sections + (0 if np.isinf(bandwidth) else 1)
     about = {"n_sections": n_sections, "inputs": inputs, "outputs": names, "lead": lead}
     about["drift"] = np.inf if drift is None else drift
-    records = [Record(p.u, p.y, start=int(p.k[0]) % n_sections, **about) for p, _ in found]
+    records = [Record(p.u, p.y, first_section=int(p.k[0]) % n_sections, **about) for p, _ in found]
     units = [recording.unit(name) for name in (*inputs, *outputs)]
     weights = [len(p.k) for p, _ in found]
     cycle = np.average([mean for _, mean in found], axis=0, weights=weights)
