@@ -49,7 +49,8 @@ class HTF(eqx.Module):
       be seen; None where they do not.
     - `noise_variance` (M, F, ny, nu): the part of it that is noise, from repeated periods. The
       rest is nonlinear distortion, which random phases make random. None where it was not split.
-    - `variance_freedom` (F,): complex degrees of freedom of `variance`; None where it is known exactly.
+    - `variance_freedom` (F,): complex degrees of freedom of `variance`; None where it is known
+      exactly.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -254,8 +255,8 @@ class HTF(eqx.Module):
         n, nu = values.shape
         if n == 0 or n % self.n_sections or nu != len(self.inputs):
             raise DefinitionError(
-                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples and "
-                f"{len(self.inputs)} columns."
+                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples "
+                f"and {len(self.inputs)} columns."
             )
         mirror = self._mirror()
         if mirror is None:

@@ -20,11 +20,11 @@ from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
 
 
-# Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier that
-# is carried by so weak a direction counts as zero.
+# Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier
+# that is carried by so weak a direction counts as zero.
 _RANK_TOLERANCE = 1e-12
-# Distance of z^N from a multiplier, below which less than half of the digits are left of a response.
-# Doubled: responses twice as far from the resonance are refused.
+# Distance of z^N from a multiplier, below which less than half of the digits are left of a
+# response. Doubled: responses twice as far from the resonance are refused.
 _RESONANCE = 1e-8
 
 
@@ -297,8 +297,8 @@ class LDTP(eqx.Module):
         )
         if x0.shape[0] not in (d, true):
             raise DefinitionError(
-                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} has {true} "
-                f"coordinates ({d} with padding)."
+                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} has "
+                f"{true} coordinates ({d} with padding)."
             )
         return jnp.pad(x0, (0, d - x0.shape[0]))
 

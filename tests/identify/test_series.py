@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from hybridjax.identify.series.arx import delayed_outputs
-from hybridjax.identify.series.cycle_grid import CycleGrid
-from hybridjax.identify.series.output_error import OutputErrorProblem, linearize
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.identify.series.arx import delayed_outputs
+from hybridjax.identify.series.cycle_grid import CycleGrid
+from hybridjax.identify.series.output_error import OutputErrorProblem, linearize
 
 from ..linear.conftest import blocks_at_random
 from .test_uncertainty import covered

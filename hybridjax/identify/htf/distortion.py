@@ -9,7 +9,8 @@ from ...experiments.data import ExperimentData
 from ...experiments.design.partition import line_class
 
 
-# Part of the largest line of an input below which a line is not excited. Doubled: none but rounding.
+# Part of the largest line of an input below which a line is not excited. Doubled: none but
+# rounding.
 _SILENT_LINE = 1e-6
 
 

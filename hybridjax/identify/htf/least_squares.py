@@ -54,7 +54,7 @@ class LineEstimates(NamedTuple):
 
 
 def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimates:
-    r"""Least squares at some lines of the sums: `Y = H U + G conj(U)`, G = 0 unless the line meets itself.
+    r"""Least squares at some lines: `Y = H U + G conj(U)`, G = 0 unless the line meets itself.
 
     With p unknowns and G experiments the residuals have G - p complex degrees of freedom, and the
     variance of H is theirs times the diagonal of the inverse of the normal matrix. The noise of
@@ -131,8 +131,8 @@ def _why_not(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
         )
     if not sums.crest_test.random:
         return (
-            f"the phases are not random: {sums.crest_test.low} of {sums.crest_test.tested} signals have a "
-            "crest factor below that of 200 random draws. The scatter of optimized phases does not "
+            f"the phases are not random: {sums.crest_test.low} of {sums.crest_test.tested} signals "
+            "have a crest factor below that of 200 random draws. The scatter of optimized phases does not "
             "show the distortion of a class of signals: ask for variance='noise', or use random "
             "phases."
         )

@@ -1,7 +1,7 @@
 """What estimates of HTFs need of experiments: sums over them, for each line of the spectrum.
 
-Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the same
-memory for any number of experiments, and those of two sets of experiments add.
+Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the
+same memory for any number of experiments, and those of two sets of experiments add.
 """
 
 from collections.abc import Callable, Iterable

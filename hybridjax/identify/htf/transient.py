@@ -18,17 +18,19 @@ from ...experiments.data import ExperimentData
 from ...experiments.design.partition import line_class
 
 
-# The largest number of multipliers that is tried. Doubled: longer, and records must have 8 more cycles
-# to be told from everything that repeats.
+# The largest number of multipliers that is tried. Doubled: longer, and records must have 8 more
+# cycles to be told from everything that repeats.
 _LARGEST_ORDER = 4
-# Change of the input after P periods, relative to its largest value, that is rounding. Doubled: none
-# but rounding.
+# Change of the input after P periods, relative to its largest value, that is rounding. Doubled:
+# none but rounding.
 _REPEATS = 1e-6
-# Part of the largest line of an input below which a line is not excited. Doubled: none but rounding.
+# Part of the largest line of an input below which a line is not excited. Doubled: none but
+# rounding.
 _SILENT_LINE = 1e-6
 # Imaginary part that rounding leaves of coefficients. Doubled: none but rounding.
 _REAL = 1e-9
-# Scale of steps for coefficients that start near zero. Doubled: their first steps are twice as long.
+# Scale of steps for coefficients that start near zero. Doubled: their first steps are twice as
+# long.
 _SMALLEST_SCALE = 0.1
 
 

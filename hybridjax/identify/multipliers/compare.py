@@ -17,10 +17,11 @@ class MultiplierComparison(eqx.Module):
     The pairing is the one with the smallest sum of distances; if the numbers of multipliers
     differ, those left over are not listed. Printing it shows a table.
 
-    **Fields**, sorted by decreasing modulus of the true multiplier (by output first, where a fit has
-    multipliers of its own for each): `true` and `estimated` (k,); `outputs` (k,), the outputs' names
-    or (), where all outputs have the same multipliers. `error` (k,): the distance
-    `|estimated - true|`. `max_error`: the largest.
+    **Fields**, sorted by decreasing modulus of the true multiplier, where a fit has multipliers of
+    its own for each output after these:
+
+    - `true` and `estimated` (k,); `error` (k,), their distance, and `max_error`, the largest.
+    - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
     """
 
     true: Complex[np.ndarray, " k"]

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Inexact
 
 
-# Smallest eigenvalue of the curvature relative to its largest: below it, rounding may have made
-# it. Doubled: a coefficient known 1.4 times better relative to the best known is said to be unknown.
+# Smallest eigenvalue of the curvature relative to its largest: below it, rounding may have made it.
+# Doubled: a coefficient known 1.4 times better relative to the best known is said to be unknown.
 _SINGULAR = 1e-12
 # Part of a response that is left when it counts as forgotten (the number of cycles whose scores
 # are correlated). Doubled: fewer lags, and covariances that scatter less but miss more.

@@ -9,8 +9,8 @@ from ...errors import DefinitionError
 from ...linear.htf import HTF
 
 
-# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of rounding.
-# Doubled: outputs without noise count half as much beside noisy ones.
+# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
+# rounding. Doubled: outputs without noise count half as much beside noisy ones.
 ROUNDING = 1e-15
 # Alternations between the factors of frequency and of harmonic. Doubled: the same to 6 digits.
 _SMOOTHING_SWEEPS = 20

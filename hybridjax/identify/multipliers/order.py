@@ -166,7 +166,7 @@ class NoiseRatios(NamedTuple):
     """How much of $z^{-jN} H$, j = 0, ..., d, stands out of the noise."""
 
     values: Float[np.ndarray, " d1"]
-    """Squares of the singular values in units of the noise, ascending: 1 where there is but noise."""
+    """Squares of the singular values, ascending, in units of the noise: 1 where there is no more."""
     deviation: float
     """The standard deviation of each where it is noise."""
 

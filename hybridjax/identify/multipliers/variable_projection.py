@@ -143,7 +143,7 @@ class DelayedResponses(NamedTuple):
 
 
 def delayed_responses(groups: list[HTFGroup], c: Float[np.ndarray, " d"]) -> DelayedResponses:
-    """Of all groups together: chi is the combination of the columns that errors alone are left of."""
+    """Of all groups together. The coefficients of chi combine the columns to errors alone."""
     parts = [_delayed(group, c) for group in groups]
     columns = np.concatenate([part.columns for part in parts])
     return DelayedResponses(columns, sum(part.noise_gram for part in parts))

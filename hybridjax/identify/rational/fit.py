@@ -71,7 +71,7 @@ class RationalFit(eqx.Module):
     input: str = eqx.field(static=True)
 
     def htf(self, f: ArrayLike) -> HTF:
-        """The fitted functions at frequencies f (F,), cycles per period: one harmonic, one input."""
+        """The fitted functions at frequencies f (F,), cycles per period, of one harmonic and input."""
         f = np.atleast_1d(np.asarray(f, float))
         w = np.exp(-2j * np.pi * f / self.n_sections)[:, None]
         delay = w if self.form == "delayed" else 1.0

@@ -30,7 +30,8 @@ _ROUNDING = 1e-15
 # Smallest share of its own error that the fit leaves to a sample, so that dividing by it stays
 # finite. Doubled: samples that the fit all but passes through weigh half as much.
 _SMALLEST_REMAINDER = 1e-3
-# Largest correction of a covariance for the freedom that the minimum takes: to 1 / 0.5. Doubled: none.
+# Largest correction of a covariance for the freedom that the minimum takes: to 1 / 0.5. Doubled:
+# none.
 _SMALLEST_FREEDOM = 0.5
 
 

@@ -20,12 +20,13 @@ from .shared_state import ProductInputs, set_up, simulate_state, smallest_noise
 from .shared_state_fit import SharedStateFit, denominator_of, first_model, fit_shared_state
 
 
-# Parts of a cycle, the mean inputs of which take part in products. Doubled: two to four times as many
-# products, which follow the response more closely.
+# Parts of a cycle, the mean inputs of which take part in products. Doubled: two to four times as
+# many products, which follow the response more closely.
 _BLOCKS = 4
 # Share of the samples of a section that products must leave. Doubled: they are tried less often.
 _SHARE_LEFT = 1 / 3
-# Factor by which products must lower the variance of the misfit. Doubled: they are taken less often.
+# Factor by which products must lower the variance of the misfit. Doubled: they are taken less
+# often.
 _EXPLAINED = 2.0
 # Factor to which products must lower standard errors. Doubled (to beyond 1): they need not at all.
 _SURER = 0.9

@@ -67,7 +67,7 @@ class SeriesFit(MultiplierEstimate):
         return h[:, self.lead : self.lead + n_lags]
 
     def htf(self, f: ArrayLike, harmonics: int | Sequence[int] | None = None) -> HTF:
-        r"""The harmonic transfer functions at frequencies f (F,), cycles per period, with variances.
+        r"""The harmonic transfer functions at frequencies f (F,), cycles per period, and variances.
 
         Only where the inputs had power; elsewhere the variance is large, or there is none at
         all. It is that of white noise of the numerators, and of c as its covariance says.

@@ -21,8 +21,8 @@ from .cycle_grid import CycleGrid
 from .section_regression import RANK
 
 
-# Part of the rms of an output that no noise is taken to be smaller than: rounding. Doubled: sections
-# without noise count half as much beside noisy ones.
+# Part of the rms of an output that no noise is taken to be smaller than: rounding. Doubled:
+# sections without noise count half as much beside noisy ones.
 _ROUNDING = 1e-12
 # Part of an output's largest rms that its rms at a section is taken to be at least, for this.
 # Doubled: sections where an output is nearly zero count half as much, if they have no noise.
@@ -89,8 +89,11 @@ def set_up(
     free_start: bool,
     products: ProductInputs | None = None,
 ) -> SharedStateProblem:
-    """**Arguments:** `cycle_inputs`: w. `back`: k_n. `free_start`: whether the state at the start of
-    records is unknown, or zero. `products`: inputs besides."""
+    """The problem of some records.
+
+    **Arguments:** `cycle_inputs`: w. `back`: k_n. `free_start`: whether the state at the start of
+    records is unknown, or zero. `products`: inputs besides.
+    """
     S, T, N, ny = grid.y.shape
     cycle = np.arange(T)
     first = np.zeros(S, int)

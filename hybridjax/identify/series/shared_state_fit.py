@@ -22,16 +22,16 @@ HORIZON = 8  # cycles of inputs from which the first model is made; doubled: mor
 _LARGEST_FIRST_MODULUS = 0.99
 # Modulus of a multiplier beyond which a step is halved. Doubled: simulations overflow more often.
 _LARGEST_MODULUS = 1.2
-# Eigenvalues of the Hessian, relative to the largest, that belong to the choice of coordinates of x,
-# along which nothing changes. Doubled: directions known 1.4 times better are taken for these.
+# Eigenvalues of the Hessian, relative to the largest, that belong to the choice of coordinates of
+# x, along which nothing changes. Doubled: directions known 1.4 times better are taken for these.
 _NO_CURVATURE = 1e-11
 # Halvings of a step that raises the cost. Doubled: steps down to 6e-8 instead of 2e-4 are tried.
 _MAX_HALVINGS = 12
-# Squared length of a step, in units of its standard error, that is the last one. Doubled: the minimum
-# is missed by up to 0.14 instead of 0.1 standard errors.
+# Squared length of a step, in units of its standard error, that is the last one. Doubled: the
+# minimum is missed by up to 0.14 instead of 0.1 standard errors.
 _SETTLED_GAIN = 1e-2
-# If no halved step lowers the cost: the gain, relative to the cost, or the largest entry of the step,
-# that rounding explains. Doubled: iterations that stall count as converged more often.
+# If no halved step lowers the cost: the gain, relative to the cost, or the largest entry of the
+# step, that rounding explains. Doubled: iterations that stall count as converged more often.
 _STALLED_GAIN, _STALLED_STEP = 1e-6, 1e-8
 # Smallest share of its own error that the fit leaves to a sample, so that dividing by it stays
 # finite. Doubled: samples that the fit all but passes through weigh half as much.
@@ -104,8 +104,8 @@ def _minimize(
     """Gauss and Newton's iteration over A and B, and whether it came to its end.
 
     It is not that of `gauss_newton`, since coordinates of x are free: they are chosen anew for each
-    step, steps are those of least norm, and the Jacobian, too large to be kept, is only summed up to
-    a Hessian. It ends where a step is small beside its standard error.
+    step, steps are those of least norm, and the Jacobian, too large to be kept, is summed up to a
+    Hessian. It ends where a step is small beside its standard error.
     """
     d = len(model.A)
     for _ in range(max_steps):

@@ -139,7 +139,8 @@ def validate(
                  for i in range(len(outputs)))  # fmt: skip
     if fewest < _FEWEST_SAMPLES:
         raise DefinitionError(
-            f"a section was sampled {fewest} times only; the tests need {_FEWEST_SAMPLES} or more cycles."
+            f"a section was sampled {fewest} times only; the tests need {_FEWEST_SAMPLES} or more "
+            "cycles."
         )
     lags = min(N, int(fewest) // _SAMPLES_PER_LAG) if lags is None else lags
     if lags < 1:
