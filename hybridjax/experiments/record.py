@@ -6,9 +6,8 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from .._core.arguments import names
+from .._core.arguments import Numbers, names
 from ..errors import DefinitionError
 
 
@@ -40,8 +39,8 @@ class Record(eqx.Module):
 
     def __init__(
         self,
-        u: ArrayLike,
-        y: ArrayLike,
+        u: Numbers,
+        y: Numbers,
         *,
         n_sections: int,
         first_section: int = 0,
@@ -144,7 +143,7 @@ def _with_known_inputs(record: Record) -> Iterator[Record]:
         yield part
 
 
-def _columns(name: str, values: ArrayLike) -> Float[np.ndarray, "n columns"]:
+def _columns(name: str, values: Numbers) -> Float[np.ndarray, "n columns"]:
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or array.ndim != 2:
         raise DefinitionError(

@@ -1,19 +1,18 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from .._core.arguments import names, real_array, require_finite
+from .._core.arguments import Numbers, names, real_array, require_finite
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
-from .frequency_response import check_harmonics
+from .frequency_response import Harmonics, check_harmonics
 
 
 # Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
@@ -68,17 +67,17 @@ class HTF(eqx.Module):
 
     def __init__(
         self,
-        f: ArrayLike,
-        H: ArrayLike,
-        harmonics: int | Iterable[int],
+        f: Numbers,
+        H: Numbers,
+        harmonics: Harmonics,
         n_sections: int,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         source: str = "estimate",
         *,
-        variance: ArrayLike | None = None,
-        noise_variance: ArrayLike | None = None,
-        variance_freedom: ArrayLike | None = None,
+        variance: Numbers | None = None,
+        noise_variance: Numbers | None = None,
+        variance_freedom: Numbers | None = None,
     ):
         values = H if isinstance(H, jax.Array) else np.asarray(H)
         if not np.issubdtype(values.dtype, np.number) or values.ndim != 4:
@@ -130,14 +129,14 @@ class HTF(eqx.Module):
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         return self.harmonic(m)
 
-    def select(self, harmonics: int | Iterable[int]) -> "HTF":
+    def select(self, harmonics: Harmonics) -> "HTF":
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
         variance, noise = (None if v is None else v[rows] for v in self._variances)
         return self._with(self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom)
 
-    def at(self, f: ArrayLike) -> "HTF":
+    def at(self, f: Numbers) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
 
         **Raises:** `DefinitionError` for a frequency that was not measured.
@@ -183,7 +182,7 @@ class HTF(eqx.Module):
         quantile = freedom * jnp.expm1(-np.log1p(-level) / freedom)
         return jnp.sqrt(quantile[:, None, None] * self.variance)
 
-    def interpolate(self, f: ArrayLike) -> "HTF":
+    def interpolate(self, f: Numbers) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbors (host side).
 
         If the harmonics are symmetric about 0, the symmetry for real signals adds the negative
@@ -237,7 +236,7 @@ class HTF(eqx.Module):
         variance, noise = map(linear, self._variances)
         return self._with(wanted, H, self.harmonics, variance, noise, freedom)
 
-    def predict(self, u: ArrayLike) -> Float[Array, "time ny"]:
+    def predict(self, u: Numbers) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
 
         Harmonics that are not stored count as zero. Differentiable with respect to `H`.
@@ -354,7 +353,7 @@ class HTF(eqx.Module):
         return turns, np.tile(H, (1, 3, 1, 1))
 
 
-def _optional(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Array | None:
+def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:
     if value is None:
         return None
     array = real_array(name, value, ndim=len(shape))

@@ -1,21 +1,20 @@
 """Linear discrete-time periodic systems whose state dimension may vary over the period."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
-from numpy.typing import ArrayLike
 
-from .._core.arguments import names, real_array, require_finite
+from .._core.arguments import Numbers, names, real_array, require_finite
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from . import time_response
-from .frequency_response import check_harmonics, harmonic_transfer
+from .frequency_response import Harmonics, check_harmonics, harmonic_transfer
 from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
 
@@ -61,11 +60,11 @@ class LDTP(eqx.Module):
 
     def __init__(
         self,
-        A: ArrayLike,
-        B: ArrayLike,
-        C: ArrayLike,
-        D: ArrayLike | None = None,
-        dims: ArrayLike | None = None,
+        A: Numbers,
+        B: Numbers,
+        C: Numbers,
+        D: Numbers | None = None,
+        dims: Numbers | None = None,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
@@ -104,10 +103,10 @@ class LDTP(eqx.Module):
     @classmethod
     def from_blocks(
         cls,
-        A: Sequence[ArrayLike],
-        B: Sequence[ArrayLike],
-        C: Sequence[ArrayLike],
-        D: Sequence[ArrayLike] | None = None,
+        A: Sequence[Numbers],
+        B: Sequence[Numbers],
+        C: Sequence[Numbers],
+        D: Sequence[Numbers] | None = None,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
@@ -165,7 +164,7 @@ class LDTP(eqx.Module):
         )
 
     def states(
-        self, u: ArrayLike, x0: ArrayLike | None = None, first_section: int = 0
+        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
@@ -178,7 +177,7 @@ class LDTP(eqx.Module):
         return time_response.states(self.A, self.B, u, x0, self._sections_from(first_section, u))
 
     def simulate(
-        self, u: ArrayLike, x0: ArrayLike | None = None, first_section: int = 0
+        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
     ) -> Float[Array, "time ny"]:
         """The outputs (n, ny) that an input leads to; arguments as in `states`."""
         u = self._input(u)
@@ -197,7 +196,7 @@ class LDTP(eqx.Module):
             raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
         return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
-    def htf(self, f: ArrayLike, harmonics: int | Iterable[int] | None = None) -> HTF:
+    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
         """The exact harmonic transfer functions.
 
         **Arguments:**
@@ -254,7 +253,7 @@ class LDTP(eqx.Module):
         first = section % self.n_sections
         return product_rank([*blocks[first:], *blocks[:first]], rtol)
 
-    def periodic_state(self, u: ArrayLike, periods: int) -> Float[Array, " d"]:
+    def periodic_state(self, u: Numbers, periods: int) -> Float[Array, " d"]:
         r"""The state at section 0 from which the response to a repeated input is periodic.
 
         $x_0 = (I - \Phi^P)^{-1} x_f$, with $x_f$ the state that `u` reaches from rest.
@@ -297,8 +296,8 @@ class LDTP(eqx.Module):
         )
         if x0.shape[0] not in (d, true):
             raise DefinitionError(
-                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} has "
-                f"{true} coordinates ({d} with padding)."
+                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} "
+                f"has {true} coordinates ({d} with padding)."
             )
         return jnp.pad(x0, (0, d - x0.shape[0]))
 

@@ -1,7 +1,7 @@
 """How much of the output a linear periodic system explains."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
+from ...linear.frequency_response import Harmonics
 from .least_squares import solve_lines
 from .nonparametric import choose_harmonics
 from .spectral_sums import SumOptions, spectral_sums
@@ -35,7 +36,7 @@ class Coherence(eqx.Module):
 
 def estimate_coherence(
     data: ExperimentData | Iterable[ExperimentData],
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     repeats: int = 1,
     highest: int | None = None,

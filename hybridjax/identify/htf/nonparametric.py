@@ -1,7 +1,7 @@
 """Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
-from ...linear.frequency_response import check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from .least_squares import solve_lines
 from .spectral_sums import SumOptions, spectral_sums
@@ -18,7 +18,7 @@ from .spectral_sums import SumOptions, spectral_sums
 
 def estimate_htf(
     data: ExperimentData | Iterable[ExperimentData],
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     repeats: int = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
@@ -131,7 +131,7 @@ def missing_frequencies(
 
 
 def choose_harmonics(
-    harmonics: int | Sequence[int] | None, highest: int | None, n_sections: int
+    harmonics: Harmonics | None, highest: int | None, n_sections: int
 ) -> tuple[int, ...]:
     """The harmonics to estimate: those asked for, or all up to `highest`."""
     if highest is None:

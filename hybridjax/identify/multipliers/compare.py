@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
 
 
@@ -51,7 +51,7 @@ def _show(value: complex) -> str:
     return f"{value.real:+.9f} {value.imag:+.9f}i"
 
 
-def compare_multipliers(estimated: ArrayLike, true: ArrayLike) -> MultiplierComparison:
+def compare_multipliers(estimated: Numbers, true: Numbers) -> MultiplierComparison:
     """Pair estimated with true multipliers so that the sum of distances is smallest.
 
     **Raises:** `DefinitionError` if either is empty.
@@ -68,7 +68,7 @@ def compare_multipliers(estimated: ArrayLike, true: ArrayLike) -> MultiplierComp
 
 def compare_by_output(
     estimated: Sequence[Complex[np.ndarray, " p"]],
-    true: ArrayLike,
+    true: Numbers,
     outputs: Sequence[str],
     output: str | int | None = None,
 ) -> MultiplierComparison:

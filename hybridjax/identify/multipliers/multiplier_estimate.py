@@ -3,9 +3,9 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from numpy.typing import ArrayLike
 from scipy import stats
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
 from .compare import MultiplierComparison, compare_multipliers
 
@@ -45,7 +45,7 @@ class MultiplierEstimate(eqx.Module):
         """Root of the expected squared distance of each multiplier from the true one."""
         return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
 
-    def distance(self, true: ArrayLike) -> Float[np.ndarray, " k"]:
+    def distance(self, true: Numbers) -> Float[np.ndarray, " k"]:
         r"""Squared distance of the estimate from supposed multipliers, in units of its covariance.
 
         $\lambda$ is a multiplier if $p(\lambda) = 0$, which is linear in c: one real equation for
@@ -74,7 +74,7 @@ class MultiplierEstimate(eqx.Module):
             out[i] = p @ np.linalg.lstsq(cov, p)[0]
         return out
 
-    def contains(self, true: ArrayLike, level: float = 0.95) -> Bool[np.ndarray, " k"]:
+    def contains(self, true: Numbers, level: float = 0.95) -> Bool[np.ndarray, " k"]:
         """Whether supposed multipliers lie in the confidence region of this level.
 
         A conjugate pair is one statement, not two.
@@ -105,7 +105,7 @@ class MultiplierEstimate(eqx.Module):
         x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
         return self.multipliers[index] + x + 1j * y
 
-    def compare(self, true: ArrayLike) -> MultiplierComparison:
+    def compare(self, true: Numbers) -> MultiplierComparison:
         """The multipliers beside the true ones, paired; printing it shows a table."""
         return compare_multipliers(self.multipliers, true)
 

@@ -1,7 +1,6 @@
 """How many multipliers do the data carry?"""
 
 import functools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +9,7 @@ import scipy.linalg
 from jaxtyping import Float, Int
 
 from ...errors import DefinitionError
+from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
 from .denominator import chi
 from .error_weights import ROUNDING, check_values, error_weights, require_frequencies
@@ -95,7 +95,7 @@ class OrderSelection(eqx.Module):
 def select_order(
     htf: HTF,
     max_order: int = 5,
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     overhang: int | None = None,
     max_steps: int = 50,
@@ -166,7 +166,7 @@ class NoiseRatios(NamedTuple):
     """How much of $z^{-jN} H$, j = 0, ..., d, stands out of the noise."""
 
     values: Float[np.ndarray, " d1"]
-    """Squares of the singular values, ascending, in units of the noise: 1 where there is no more."""
+    """Squares of the singular values, ascending, in units of the noise: 1 if there is no more."""
     deviation: float
     """The standard deviation of each where it is noise."""
 

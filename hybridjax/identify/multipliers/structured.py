@@ -1,16 +1,15 @@
 """Floquet multipliers from the exact structure of the harmonic transfer functions."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from numpy.typing import ArrayLike
 
+from ..._core.arguments import Numbers
 from ..._core.results import Result
 from ...errors import DefinitionError
-from ...linear.frequency_response import check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .denominator import chi, multipliers_of
@@ -60,7 +59,7 @@ class StructuredFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def htf(self, f: ArrayLike, harmonics: int | Sequence[int] | None = None) -> HTF:
+    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
         """The fitted HTFs at frequencies f (F,), cycles per period, inside the band of the data.
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
@@ -96,7 +95,7 @@ class StructuredFit(MultiplierEstimate):
 def fit_multipliers(
     htf: HTF,
     order: int | LDTP,
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     overhang: int | None = None,
     errors: Literal["residuals", "variance"] = "residuals",

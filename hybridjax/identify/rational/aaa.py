@@ -3,9 +3,9 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from numpy.typing import ArrayLike
 from scipy.interpolate import AAA
 
+from ..._core.arguments import Numbers
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.htf import HTF
@@ -40,7 +40,7 @@ class AAAFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def compare(self, true: ArrayLike, output: str | int | None = None) -> MultiplierComparison:
+    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
         """For each output (or one alone) the multipliers that come closest to the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int
-from numpy.typing import ArrayLike
 
+from ..._core.arguments import Numbers
 from ..._core.compile import quick_jit
 from ..._core.precision import require_x64
 from ..._core.results import Result
@@ -70,8 +70,8 @@ class RationalFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def htf(self, f: ArrayLike) -> HTF:
-        """The fitted functions at frequencies f (F,), cycles per period, of one harmonic and input."""
+    def htf(self, f: Numbers) -> HTF:
+        """The fitted functions at frequencies f (F,), cycles per period: one harmonic and input."""
         f = np.atleast_1d(np.asarray(f, float))
         w = np.exp(-2j * np.pi * f / self.n_sections)[:, None]
         delay = w if self.form == "delayed" else 1.0
@@ -84,7 +84,7 @@ class RationalFit(eqx.Module):
         harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
         return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
 
-    def compare(self, true: ArrayLike, output: str | int | None = None) -> MultiplierComparison:
+    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
         """The multipliers of each output's fit (or of one alone) beside the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.

@@ -6,8 +6,8 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
@@ -65,8 +65,8 @@ class AmplitudeSweep(eqx.Module):
 def amplitude_sweep(
     run: Callable[[Float[np.ndarray, "S n nu"]], ExperimentData],
     model: LDTP,
-    u: ArrayLike,
-    amplitudes: ArrayLike,
+    u: Numbers,
+    amplitudes: Numbers,
     *,
     start: Literal["free", "cycle"] = "cycle",
 ) -> AmplitudeSweep:

@@ -1,7 +1,7 @@
 r"""The linear problem $\chi y = B u$ (periodic ARX): where fits start, and what tells the order.
 
-What inputs leave of the outputs 0, 1, ..., d cycles earlier is linearly dependent but for noise: the
-coefficients of that combination are those of $\chi$.
+What inputs leave of the outputs 0, 1, ..., d cycles earlier is linearly dependent but for noise:
+the coefficients of that combination are those of $\chi$.
 """
 
 from typing import NamedTuple

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
-from numpy.typing import ArrayLike
 
-from ..._core.arguments import names
+from ..._core.arguments import Numbers, names
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
@@ -29,7 +28,7 @@ _SMALLEST_ERROR = 1e-15
 
 
 def realize(
-    source: HTF | SeriesFit | ArrayLike,
+    source: HTF | SeriesFit | Numbers,
     dims: int | Sequence[int] | Int[np.ndarray, " N"] | None = None,
     *,
     order: int = 1,

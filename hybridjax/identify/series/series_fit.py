@@ -1,15 +1,13 @@
 """A periodic system with one denominator, fitted to recorded series."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from numpy.typing import ArrayLike
 
+from ..._core.arguments import Numbers
 from ..._core.results import Result
 from ...errors import DefinitionError
-from ...linear.frequency_response import check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ..multipliers.denominator import chi
 from ..multipliers.multiplier_estimate import MultiplierEstimate
@@ -66,7 +64,7 @@ class SeriesFit(MultiplierEstimate):
                 h[:, r] -= c * h[:, r - j * N]
         return h[:, self.lead : self.lead + n_lags]
 
-    def htf(self, f: ArrayLike, harmonics: int | Sequence[int] | None = None) -> HTF:
+    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
         r"""The harmonic transfer functions at frequencies f (F,), cycles per period, and variances.
 
         Only where the inputs had power; elsewhere the variance is large, or there is none at
