@@ -148,6 +148,22 @@ def test_experiments_are_used_from_their_start(hopper, multipliers):
         assert "SeriesFit(multipliers -0.2489" in repr(fit)
 
 
+def test_all_data_are_made_of_records(hopper, small):
+    """A record, experiments, and mixtures of these are the same data."""
+    data = hj.experiments.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
+    fits = [
+        hj.fit_series(same, 2, start="cycle", distortion=False)
+        for same in (data, data.records, [data], iter(data.records))
+    ]
+    for fit in fits[1:]:
+        np.testing.assert_array_equal(fit.coefficients, fits[0].coefficients)
+    whole = record(small, 100, first_section=1)
+    assert whole.records == (whole,) and isinstance(data, hj.experiments.HasRecords)
+    part = whole.part(10, 20)
+    assert part.first_section == 3 and part.outputs == whole.outputs
+    np.testing.assert_array_equal(part.y, whole.y[10:20])
+
+
 def test_a_chirp_will_do(hopper, multipliers):
     n = np.arange(32 * 400)
     u = 0.02 * np.cos(np.pi * 0.6 * n**2 / n[-1])[:, None]

@@ -74,11 +74,11 @@ def test_identified_beside_held_out_data(hopper):
 @pytest.mark.parametrize("start", ["free", "cycle"])
 def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     """Neither residuals nor p-values of the true model change, however large the drift is."""
-    plain = record(small, 4 * 150, 0, 0.3, start=1)
+    plain = record(small, 4 * 150, 0, 0.3, first_section=1)
     plain.y[5:9, 0] = np.nan
     cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
     wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
-    about = dict(n_sections=4, start=1, outputs=plain.outputs, drift=50)
+    about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
     still, moved = (
         hj.validate(small, hj.Record(plain.u, plain.y + x, **about), start=start)
         for x in (0.0, wave[:, None] * [1.0, -2.0])

@@ -132,8 +132,8 @@ def _why_not(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     if not sums.crest_test.random:
         return (
             f"the phases are not random: {sums.crest_test.low} of {sums.crest_test.tested} signals "
-            "have a crest factor below that of 200 random draws. The scatter of optimized phases does "
-            "not show the distortion of a class of signals: ask for variance='noise', or use "
+            "have a crest factor below that of 200 random draws. The scatter of optimized phases "
+            "does not show the distortion of a class of signals: ask for variance='noise', or use "
             "random phases."
         )
     return ""

@@ -67,7 +67,7 @@ def compare_multipliers(estimated: Numbers, true: Numbers) -> MultiplierComparis
 
 
 def compare_by_output(
-    estimated: Sequence[Complex[np.ndarray, " p"]],
+    estimated: Sequence[Complex[np.ndarray, " _"]],
     true: Numbers,
     outputs: Sequence[str],
     output: str | int | None = None,
