@@ -24,9 +24,9 @@ def sections():
     """The paper's two families."""
     apex = hj.Crossing("vM", "falling")
     return {
-        "isochron": hj.ClockPhase(32, start=apex),
+        "isochron": hj.ClockPhase(32, anchor=apex),
         "kinematic": hj.KinematicPhase(
-            32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+            32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
         ),
     }
 

@@ -17,7 +17,7 @@ from ._core.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
 from .apps.recording_report import write_report as write_report
-from .engine.move import Settings as Settings
+from .engine.settings import Settings as Settings
 from .engine.trajectory import Trajectory as Trajectory, simulate as simulate
 from .errors import (
     ComputationError as ComputationError,
@@ -59,13 +59,10 @@ from .orbits.sweep.limit_cycles import (
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
-from .sections.families import (
-    AtEvent as AtEvent,
-    ClockPhase as ClockPhase,
-    Crossing as Crossing,
-    KinematicPhase as KinematicPhase,
-    SectionList as SectionList,
-)
+from .sections.clock import ClockPhase as ClockPhase
+from .sections.crossing import AtEvent as AtEvent, Crossing as Crossing
+from .sections.kinematic import KinematicPhase as KinematicPhase
+from .sections.section_list import SectionList as SectionList
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
 from .systems.system import (

@@ -44,7 +44,7 @@ SECTIONS, OUTPUTS = 8, ("yM", "vM")
 truth = hj.models.VerticalHopper()
 cycle = hj.find_limit_cycle(truth)
 apex = hj.Crossing("vM", "falling")
-sections = hj.ClockPhase(SECTIONS, start=apex)
+sections = hj.ClockPhase(SECTIONS, anchor=apex)
 design = hj.multisine(SECTIONS, periods=16, f_max=3.0, amplitude=0.02, seed=0).realizations(4)
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
 data = hj.experiments.add_noise(data, snr=20, seed=0)
@@ -150,7 +150,7 @@ def true_law(v):
 # %%
 PERIODS = 4
 real = hj.find_limit_cycle(Hopper(damping=true_law))
-phases = hj.ClockPhase(SECTIONS, start=0.5)
+phases = hj.ClockPhase(SECTIONS, anchor=0.5)
 force = 0.5 * np.random.default_rng(0).normal(size=(8, PERIODS * SECTIONS, 1))
 records = hj.run_experiments(real, phases, force, OUTPUTS, start="cycle", discard=0)
 records = hj.experiments.add_noise(records, snr=40, seed=0)

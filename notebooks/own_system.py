@@ -156,7 +156,7 @@ print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
 _, *orbit = cycle.trajectory()("y", "v")
 center = [(np.min(x) + np.max(x)) / 2 + 0.1 * np.ptp(x) for x in orbit]
 scale = [(np.max(x) - np.min(x)) / 2 for x in orbit]
-phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, start=apex)
+phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, anchor=apex)
 model = hj.linearize(cycle, phase, outputs=("y", "v"))
 design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
 data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))

@@ -125,9 +125,9 @@ print(cycle)
 # %%
 apex = hj.Crossing("vM", "falling")
 families = {
-    "isochron": hj.ClockPhase(SECTIONS, start=apex),
+    "isochron": hj.ClockPhase(SECTIONS, anchor=apex),
     "kinematic": hj.KinematicPhase(
-        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
     ),
 }
 placed = {name: hj.place_sections(cycle, family) for name, family in families.items()}

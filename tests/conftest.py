@@ -15,9 +15,9 @@ hypothesis.settings.load_profile("untimed")
 DATA = pathlib.Path(__file__).parent / "data"
 
 APEX = hj.Crossing("vM", "falling")
-ISOCHRONS = hj.ClockPhase(32, start=APEX)
+ISOCHRONS = hj.ClockPhase(32, anchor=APEX)
 KINEMATIC = hj.KinematicPhase(
-    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
 OUTPUTS = ("yM", "vM")
 

@@ -110,12 +110,12 @@ def cycle(model: str) -> hj.LimitCycle:
 def sections(model: str, family: str) -> hj.ClockPhase | hj.KinematicPhase:
     """32 sections, section 0 where the body is highest."""
     position, velocity = OUTPUTS[model]
-    start = hj.Crossing(velocity, "falling")
+    anchor = hj.Crossing(velocity, "falling")
     if family == "isochron":
-        return hj.ClockPhase(N, start=start)
+        return hj.ClockPhase(N, anchor=anchor)
     center, scale = CENTERS[model]
     return hj.KinematicPhase(
-        N, position=position, velocity=velocity, center=center, scale=scale, start=start
+        N, position=position, velocity=velocity, center=center, scale=scale, anchor=anchor
     )
 
 

@@ -32,7 +32,9 @@ from ..maps.place import place_sections
 from ..maps.placed import PlacedSections
 from ..models.hopper import VerticalHopper
 from ..orbits.cycle import LimitCycle, find_limit_cycle
-from ..sections.families import ClockPhase, Crossing, KinematicPhase
+from ..sections.clock import ClockPhase
+from ..sections.crossing import Crossing
+from ..sections.kinematic import KinematicPhase
 from .paper_report import OUTPUTS, summarize, table
 
 
@@ -169,9 +171,9 @@ def _find(hopper: VerticalHopper) -> LimitCycle:
 def _sections(name: str, count: int):
     apex = Crossing("vM", "falling")
     if name == "isochron":
-        return ClockPhase(count, start=apex)
+        return ClockPhase(count, anchor=apex)
     return KinematicPhase(
-        count, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+        count, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
     )
 
 

@@ -16,7 +16,7 @@ from .._core.garbage_collector import uncollected
 from .._core.precision import require_x64, single, single_precision
 from .._core.results import Result
 from .._core.threads import in_threads, meanwhile, thread_count
-from ..engine.move import Settings
+from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
@@ -28,7 +28,7 @@ from ..systems.structure import Outputs, Structure
 from .data import ExperimentData
 from .design.design import Design
 from .plan import Plan, check_accuracy, plan_flow
-from .respond import observe, respond
+from .respond import respond
 from .single_precision import plan_single
 
 
@@ -36,7 +36,7 @@ from .single_precision import plan_single
 # cost of what is done once for all; and elsewhere.
 _BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
 # The accuracy where none is asked for.
-_ACCURACY = {"double": 1e-9, "single": 1e-4}
+_ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
 # Splitting fewer than this among workers gains nothing.
 _FEW = 32
 # Up to so many samples in all, a program that is compiled in half the time runs at most 0.03 s
@@ -106,7 +106,7 @@ class Campaign:
                     part = _once_compiled(program, single(arguments))
             return [np.asarray(x)[: S - k] for x in part]
 
-        base = np.asarray(_on_cycle(self.placed, tuple(self.outputs.items)))
+        base = np.asarray(self.placed.observe(self.outputs.items))
         y, rest = np.empty((S, u.shape[1] // N, *base.shape)), []
         parts = in_threads(work, range(0, S, size), self.workers)
         bar = tqdm(parts, "experiments", -(-S // size), disable=not progress)
@@ -140,8 +140,7 @@ class Campaign:
 
     def _start(self, u) -> Float[np.ndarray, "n S"]:
         """Times and states in which the experiments begin, at section 0."""
-        lanes = self.placed.lanes
-        on_cycle = np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
+        on_cycle = np.asarray(self.placed.section_zero)[:, None]
         if self.model is None:
             return np.repeat(on_cycle, len(u), axis=1)
         embed = np.asarray(self.placed.frames()[0][0])[:, : self.model.A.shape[1]]
@@ -337,10 +336,3 @@ def _source(design, N: int, nu: int, start: str, discard, periods):
             f"for estimation; got periods = {periods}."
         )
     return u, len(u), cycles, int(periods)
-
-
-@quick_jit
-def _on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
-    s = Structure(placed.cycle.system)
-    u = jnp.zeros((s.nu, placed.n_sections))
-    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T

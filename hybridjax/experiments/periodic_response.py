@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..engine.settings import STEADY_START
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
 from .response_function import ResponseFunction
@@ -21,7 +22,7 @@ def steady_start(
     u: Float[ArrayLike, "S n nu"],
     system: HybridSystem | None = None,
     *,
-    accuracy: float = 1e-10,
+    accuracy: float = STEADY_START,
 ) -> Float[Array, "m S"]:
     r"""Where experiments must start so that their responses repeat with their inputs.
 

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int
 from .._core.compile import quick_jit
 from .._core.memo import Memory
 from .._core.results import Result
-from ..engine.move import Settings, move
+from ..engine.move import move
+from ..engine.settings import Settings
 from ..engine.stride import Stride
 from ..engine.watch import watch
 from ..errors import DefinitionError
@@ -136,7 +137,8 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     slack = np.array([*[np.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
     by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
     rtol = jnp.where(by_estimate, settings.rtol, _TIGHT)
-    u = jnp.zeros((len(placed.cycle.system.inputs), N))
+    s = Structure(placed.cycle.system)
+    u = jnp.zeros((s.nu, N))
 
     def block(xs):
         nudge, divide, slack, rtol = xs
@@ -144,7 +146,7 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
         lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
         start = Stride(longest / divide, lead, jnp.full(N, slack))
         tolerance = Settings(rtol, settings.atol * rtol / settings.rtol, patience)
-        moved = move(placed.cycle.system, lanes, u, target, tolerance, start)
+        moved = move(s, lanes, u, target, tolerance, start)
         ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
         return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
 

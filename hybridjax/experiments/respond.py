@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
-from ..engine.lanes import Lanes, for_each_chart, needed, only
-from ..engine.move import Settings, move
+from ..engine.move import move
+from ..engine.settings import Settings
+from ..maps.outputs import observe
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
-from ..systems.structure import Outputs, Structure
+from ..systems.structure import Structure
 from .plan import Plan
 
 
@@ -66,7 +67,7 @@ def respond(
         turns = (j == 0).astype(jnp.int32)
         target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.order)
-        moved = move(system, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
+        moved = move(s, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1
@@ -88,16 +89,3 @@ def respond(
     turns = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = ROUNDING + jnp.max(turns, axis=0)
     return Response(jnp.transpose(y, (2, 0, 1)), result, failed_at, error)
-
-
-def observe(s: Structure, z: Outputs, lanes: Lanes, u) -> Float[Array, "ny L"]:
-    """Outputs of every lane, NaN where its chart does not define them."""
-    L = lanes.t.shape[0]
-
-    def work(a, here, out):
-        point = needed(here, [only(here, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
-        values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
-        return jnp.where(here, values, out)
-
-    nothing = jnp.full((len(z.names), L), jnp.nan)
-    return for_each_chart(s, lanes.chart, jnp.ones(L, bool), work, nothing)

@@ -9,10 +9,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.precision import require_x64
-from ..engine.move import Settings
+from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
 from ..maps.place import as_placed
-from ..maps.placed import PlacedSections
+from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from ..systems.structure import Structure
@@ -60,18 +60,16 @@ class ResponseFunction(eqx.Module):
         if system is not None:
             placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
         if start is None:
-            lanes = placed.lanes
-            first = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
-            start = jnp.broadcast_to(first, (len(first), len(u)))
+            start = jnp.tile(placed.section_zero[:, None], len(u))
         return respond(placed, self.plan, start, u, self.outputs, self.settings)
 
 
 def response_function(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    accuracy: float = 1e-9,
+    accuracy: float = EXPERIMENT,
     scale: Mapping[str, float] | None = None,
 ) -> ResponseFunction:
     """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.

@@ -1,6 +1,5 @@
 """A ball that bounces on fixed ground: one chart, one event."""
 
-
 from ..systems.chart import Chart
 from ..systems.system import HybridSystem, Parameter, parameter
 from ..systems.transition import Transition

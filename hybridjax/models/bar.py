@@ -7,6 +7,8 @@ period, and each touchdown changes the speed at which the other foot comes down.
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -51,23 +53,23 @@ class TwoLeggedBar(HybridSystem):
     A: Parameter = parameter(0.2, unit="m", doc="amplitude of the table")
     T: Parameter = parameter(1.0, unit="s", doc="period of the table")
 
-    def hip(self, leg):
+    def hip(self, leg: str) -> Parameter:
         """Position of a leg's hip along the bar."""
         return self.hind if leg == "hind" else self.front
 
-    def length(self, leg, t, state):
+    def length(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Length of a standing leg less its rest length: the foot's height while in the air."""
         y, _, q, _ = state
         table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
         return y + self.hip(leg) * q - table - self.l0
 
-    def speed(self, leg, t, state):
+    def speed(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Rate of `length`."""
         _, v, _, p = state
         rate = 2 * jnp.pi / self.T
         return v + self.hip(leg) * p - self.A * rate * jnp.cos(rate * t)
 
-    def force(self, leg, t, state):
+    def force(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Force of a standing leg on the bar."""
         return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
 

@@ -5,6 +5,8 @@ E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans. Circuits
 """
 
 import equinox as eqx
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -41,7 +43,7 @@ class BuckConverter(HybridSystem):
     upper: Parameter = parameter(8.2, unit="V", doc="end of the ramp")
     T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
 
-    def control(self, t, q, u):
+    def control(self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]
 

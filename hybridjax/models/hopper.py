@@ -7,6 +7,8 @@ CDC-ECC 2011, and HSCC 2013, whose parameters these are.
 import math
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -52,7 +54,7 @@ class VerticalHopper(HybridSystem):
     omega: Parameter = parameter(2 * math.pi, unit="rad/s", doc="rate of the actuator")
     retention: Parameter = parameter(1.0, doc="speed of the body kept at touchdown")
 
-    def leg(self, t, yM, ym):
+    def leg(self, t: ArrayLike, yM: ArrayLike, ym: ArrayLike) -> Array:
         """Force of the leg on the body."""
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
 

@@ -5,6 +5,8 @@ Vibration 84, 1982.
 """
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -35,7 +37,7 @@ class PaddleJuggler(HybridSystem):
     def rate(self):
         return 2 * jnp.pi / self.T
 
-    def paddle(self, t):
+    def paddle(self, t: ArrayLike) -> tuple[Array, Array]:
         """Height and speed of the paddle."""
         phase = self.rate * t
         return self.A * jnp.sin(phase), self.A * self.rate * jnp.cos(phase)

@@ -8,6 +8,8 @@ stability, J. Theoretical Biology 232, 2005.
 import math
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
 from ..systems.output import Output
@@ -51,7 +53,7 @@ class SLIPRunner(HybridSystem):
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
     angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
-    def energy(self, t, q, u):
+    def energy(self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q
         spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0

@@ -15,7 +15,8 @@ from ..engine.move import move
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError, DefinitionError
-from ..sections.families import AtEvent, Crossing, ListLevels
+from ..sections.crossing import AtEvent, Crossing
+from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import Guess
 from ..systems.transition import Scheduled
@@ -141,7 +142,7 @@ def _go(system, lanes, section, target, settings):
     """One lane to a time, or to one section, however many steps it takes."""
     s = Structure(system)
     settings = dataclasses.replace(settings, max_steps=1_000_000)
-    return move(system, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
+    return move(s, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
 
 
 def _to_section(section, target: Target) -> Target:

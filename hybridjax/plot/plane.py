@@ -1,9 +1,10 @@
 """Floquet multipliers, poles and zeros in the complex plane."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
@@ -26,13 +27,15 @@ from .look import (
 )
 
 
+Numbers = ArrayLike | Sequence[complex | float]
+
 _MARKERS = "osD^vP*X"
 _RATIO = 2.4  # width of a panel of poles_zeros, in heights
 
 
 def multipliers(
-    true: Any,
-    estimates: Mapping[str, Any] | None = None,
+    true: LimitCycle | LDTP | MultiplierEstimate | Numbers,
+    estimates: Mapping[str, RationalFit | MultiplierEstimate | Numbers] | None = None,
     *,
     zoom: bool = True,
     labels: Mapping[str, str] | None = None,

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Complex
 
 from ..identify.series.series_fit import SeriesFit
+from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
-from ..recordings.phase import Phase
-from ..recordings.sampling import SectionData
+from ..recordings.phase.winding import Phase
 from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.engine.move import Settings
+from hybridjax.engine.settings import Settings
 from hybridjax.experiments.plan import make_plan
 from hybridjax.experiments.respond import respond
 
@@ -28,9 +28,9 @@ N = 4
 def experiment(request, lossy_cycle):
     """A function (parameters, inputs (n, nu)) -> (outputs, result) of one experiment."""
     family = {
-        "isochron": hj.ClockPhase(N, start=APEX),
+        "isochron": hj.ClockPhase(N, anchor=APEX),
         "kinematic": hj.KinematicPhase(
-            N, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+            N, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
         ),
     }[request.param]
     placed = hj.place_sections(lossy_cycle, family)

@@ -7,7 +7,7 @@ from ..conftest import APEX, OUTPUTS
 
 
 HOPPER = ("m", "M", "k", "b", "l0", "a", "g")
-SECTIONS = hj.ClockPhase(8, start=APEX)
+SECTIONS = hj.ClockPhase(8, anchor=APEX)
 
 
 class Charge(hj.Chart):

@@ -144,7 +144,7 @@ def test_multipliers_outside_the_disc_and_without_estimates():
     assert "= 0" in list(labeled(ax))[1]
 
 
-@pytest.mark.parametrize("bad", [[], ["a"]])
+@pytest.mark.parametrize("bad", [[], np.array(["a"])])
 def test_multipliers_of_nothing(bad):
     with pytest.raises(hj.DefinitionError, match="multiplier"):
         hj.plot.multipliers(bad)

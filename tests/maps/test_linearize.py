@@ -8,7 +8,7 @@ import pytest
 import hybridjax as hj
 
 from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS
-from . import hopper_scipy
+from ..orbits import hopper_scipy
 
 
 LAMBDA = -0.248983334735609 + 0.699333251798004j
@@ -107,7 +107,7 @@ def lossy_sections(kind, count):
 def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
     # With 32 kinematic sections the jump at touchdown would throw the cycle back over one.
     N = 32 if kind == "isochron" else 8
-    family = ISOCHRONS if kind == "isochron" else dataclasses.replace(KINEMATIC, count=N)
+    family = ISOCHRONS if kind == "isochron" else dataclasses.replace(KINEMATIC, n_sections=N)
     ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
     np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
     sections, points = lossy_sections(kind, N)

@@ -6,7 +6,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import APEX
+from ..conftest import APEX, OUTPUTS
 
 
 AtEvent, Crossing = hj.AtEvent, hj.Crossing
@@ -45,10 +45,10 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
 
 
 def test_a_number_as_the_anchor(hopper_cycle):
-    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, start=0.1))
+    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=0.1))
     np.testing.assert_allclose(clock.lanes.t % 1, [0.1, 0.1 + 1 / 3, 0.1 + 2 / 3], atol=1e-12)
     family = hj.KinematicPhase(
-        4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=0.3
+        4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=0.3
     )
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
@@ -60,7 +60,7 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset)
     """On which side of it is no matter; it was taken for a section that is touched."""
     center, scale = (1.9, float(offset)), (0.3, 1.9)
     family = hj.KinematicPhase(
-        4, position="yM", velocity="vM", center=center, scale=scale, start=APEX
+        4, position="yM", velocity="vM", center=center, scale=scale, anchor=APEX
     )
     placed = hj.place_sections(hopper_cycle, family)
     np.testing.assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
@@ -69,7 +69,7 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset)
 
 def test_sections_follow_the_cycle_of_another_hopper(hopper_cycle, lossy_cycle):
     """A family is a definition, bound to no cycle: its anchor moves with the apex."""
-    family = hj.ClockPhase(32, start=APEX)
+    family = hj.ClockPhase(32, anchor=APEX)
     for cycle in (hopper_cycle, lossy_cycle):
         placed = hj.place_sections(cycle, family)
         assert abs(placed.lanes.q[1, 0]) < 1e-11
@@ -78,13 +78,31 @@ def test_sections_follow_the_cycle_of_another_hopper(hopper_cycle, lossy_cycle):
 
 def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     """Time has no origin there: a multiplier of 1 beside the true one."""
-    ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, start=Crossing("v", "falling")))
+    ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling")))
     assert ldtp.outputs == ("x", "v") and ldtp.coordinates[0] == ("x", "v")
     np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
-    family = hj.KinematicPhase(8, position="x", velocity="v", start=Crossing("v", "falling"))
+    family = hj.KinematicPhase(8, position="x", velocity="v", anchor=Crossing("v", "falling"))
     ldtp = hj.linearize(vanderpol_cycle, family, "x")
     np.testing.assert_array_equal(ldtp.dims, np.ones(8))
     np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_the_unit_of_a_level_does_not_matter(vanderpol_cycle, unit):
+    position, speed = (
+        hj.Output(name, lambda t, q, u, k=k: unit * q[k]) for k, name in enumerate(("X", "V"))
+    )
+    plain = [Crossing("x", "falling", value=0.3), Crossing("v", "rising", value=-0.2)]
+    scaled = [
+        Crossing(position, "falling", value=0.3 * unit),
+        Crossing(speed, "rising", value=-0.2 * unit),
+    ]
+    a, b = (hj.place_sections(vanderpol_cycle, x) for x in (plain, scaled))
+    np.testing.assert_allclose(b.lanes.q, a.lanes.q, atol=1e-11)
+    assert a.coordinates() == b.coordinates()
+    tangent = Crossing(position, "rising", value=2.00861986 * unit)
+    with pytest.raises(hj.ComputationError, match=r"\(X rising\) is tangent"):
+        hj.place_sections(vanderpol_cycle, [tangent, scaled[0]])
 
 
 TOP = Crossing("v", "falling")
@@ -102,9 +120,9 @@ TOP = Crossing("v", "falling")
             [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
             r"section 1 \(xv falling\) is crossed 2 times in one period",
         ),
-        (hj.ClockPhase(4, start=Crossing("x", "rising", value=9.0)), "no point where x rising"),
+        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
         (
-            hj.KinematicPhase(4, position="x", velocity="v", center=(9.0, 0.0), start=TOP),
+            hj.KinematicPhase(4, position="x", velocity="v", center=(9.0, 0.0), anchor=TOP),
             r"section 1 \(kinematic phase 1/4 after section 0\) is not reached from section 0",
         ),
     ],
@@ -137,18 +155,35 @@ def test_bad_families(define, message):
 @pytest.mark.parametrize(
     "sections, message",
     [
-        ("x", "sections are a family such as ClockPhase"),
-        (None, "sections are a family such as ClockPhase"),
+        ("x", "sections are a family such as ClockPhase|'sections'"),
+        (None, "sections are a family such as ClockPhase|'sections'"),
         ([AtEvent("bounce")], "there is no event 'bounce'"),
         ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
         ([Crossing("x", "falling", charts=("a",))], "there is no chart 'a'"),
         (hj.KinematicPhase(4, position="x", velocity="w"), "there is no output 'w'"),
-        (hj.ClockPhase(4, start=Crossing("w", "falling")), "there is no output 'w'"),
+        (hj.ClockPhase(4, anchor=Crossing("w", "falling")), "there is no output 'w'"),
     ],
 )
 def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises((hj.DefinitionError, TypeError), match=message):
         hj.place_sections(vanderpol_cycle, sections)
+
+
+def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
+    for use in (
+        lambda: hj.linearize(lossy_cycle, placed_isochrons),
+        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
+        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
+    ):
+        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+            use()
+
+
+def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
+    period = float(vanderpol_cycle.period)
+    moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
+    with pytest.raises(hj.ComputationError, match="depends on time"):
+        hj.place_sections(vanderpol_cycle, [moving])
 
 
 def test_bad_inputs_and_outputs(vanderpol_cycle, hopper_cycle, placed_isochrons):

@@ -46,5 +46,5 @@ def synthetic_ldtp() -> LDTP:
     here is right. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there
     is a structural zero beside them.
     """
-    blocks = ([np.array(x, float) for x in matrices] for matrices in (_A, _B, _C, _D))
-    return LDTP.from_blocks(*blocks)
+    A, B, C, D = ([np.array(x, float) for x in matrices] for matrices in (_A, _B, _C, _D))
+    return LDTP.from_blocks(A, B, C, D)

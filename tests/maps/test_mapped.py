@@ -16,7 +16,7 @@ from ..conftest import APEX
 # Compiled in a third of the time, to slower programs.
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 compiled = ft.partial(jax.jit, compiler_options=QUICK)
-SECTIONS = hj.ClockPhase(4, start=APEX)
+SECTIONS = hj.ClockPhase(4, anchor=APEX)
 STIFFNESS = jnp.array([[9.8, 10.0], [10.1, 10.3]])
 
 

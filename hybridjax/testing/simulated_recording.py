@@ -1,4 +1,4 @@
-"""Recordings of simulated systems, whose truth is known, and the dirt of real ones."""
+"""Recordings of simulated systems, whose truth is known."""
 
 from collections.abc import Sequence
 
@@ -6,46 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import signal
 
-from ..errors import DefinitionError
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
-from ..sections.families import ClockPhase
+from ..sections.clock import ClockPhase
 from ..systems.output import Output
-
-
-def random_force(
-    duration: int | float,
-    rate: int | float,
-    bandwidth: int | float,
-    *,
-    rms: int | float = 1.0,
-    inputs: int = 1,
-    seed: int = 0,
-) -> Float[np.ndarray, "n nu"]:
-    """A random perturbation with power up to `bandwidth`: white noise, low-passed.
-
-    The filter is Butterworth's of order 4, run forwards and backwards. It needs no phase, so that
-    any hardware that plays a file can apply it.
-
-    **Arguments:** `duration` in seconds, `rate` in samples per second, `bandwidth` in Hz (half of
-    the amplitude), `rms`, number of `inputs`, `seed`.
-
-    **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
-    """
-    if not 0 < bandwidth < rate / 2:
-        raise DefinitionError(
-            f"the bandwidth must lie between 0 and half of the {rate:g} samples per second, but is "
-            f"{bandwidth:g}."
-        )
-    n = round(duration * rate)
-    sos = signal.butter(4, bandwidth, fs=rate, output="sos")
-    pad = round(4 * rate / bandwidth)
-    white = np.random.default_rng(seed).normal(size=(n + 2 * pad, inputs))
-    force = signal.sosfiltfilt(sos, white, axis=0)[pad : pad + n]
-    return rms * force / np.sqrt(np.mean(force**2, axis=0))
 
 
 def simulate_recording(

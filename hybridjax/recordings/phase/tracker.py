@@ -5,10 +5,14 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import DefinitionError
+from ...errors import DefinitionError
 
 
 Number = int | float
+
+# Bandwidth of the loop in cycles per cycle. Doubled: changes of the rate are followed twice as
+# fast, with more of the noise.
+_LOOP_HARMONICS = 5
 
 
 class PhaseTracker:
@@ -25,12 +29,12 @@ class PhaseTracker:
         scale: tuple[Number, Number],
         rate: Number,
         *,
-        start: Number = 0.0,
+        anchor: Number = 0.0,
         bandwidth: Number | None = None,
     ):
-        """**Arguments:** `center`, `scale`, `start` as in `AnglePhase`; `rate`: cycles per second
-        to begin with, negative if the angle decreases; `bandwidth` of the loop in Hz, by default
-        five times the rate.
+        """**Arguments:** `center`, `scale` and `anchor` (rad) as in `KinematicPhase`; `rate`:
+        cycles per second to begin with, negative if the angle decreases; `bandwidth` of the loop in
+        Hz, by default five times the rate.
 
         **Raises:** `DefinitionError` for a rate of zero, or scales that are not positive.
         """
@@ -39,11 +43,12 @@ class PhaseTracker:
                 "a tracker needs a rate other than 0 and positive scales and bandwidth, not "
                 f"{rate}, {scale} and {bandwidth}."
             )
-        self.center, self.scale, self.start = center, scale, start
+        self.center, self.scale, self.anchor = center, scale, anchor
         self.sense = math.copysign(1.0, rate)
         self.rate = abs(rate)
-        self.gain = 2 * math.pi * (5 * abs(rate) if bandwidth is None else bandwidth)
-        self.time = self.phase = None
+        self.gain = 2 * math.pi * (_LOOP_HARMONICS * abs(rate) if bandwidth is None else bandwidth)
+        self.time: float | None = None
+        self.phase: float | None = None
         self._loop = 0.0
 
     def update(self, time: Number, position: Number, velocity: Number) -> float | None:
@@ -57,8 +62,8 @@ class PhaseTracker:
         y = (velocity - self.center[1]) / self.scale[1]
         if math.isnan(x + y):
             return self.phase
-        measured = self.sense * (math.atan2(y, x) - self.start) / (2 * math.pi)
-        if self.time is None:
+        measured = self.sense * (math.atan2(y, x) - self.anchor) / (2 * math.pi)
+        if self.time is None or self.phase is None:
             self.time, self.phase, self._loop = time, measured % 1.0, measured % 1.0
             return self.phase
         step = time - self.time
