@@ -27,6 +27,7 @@ from .errors import (
 from .experiments.data import ExperimentData as ExperimentData
 from .experiments.design.design import Design as Design
 from .experiments.design.multisine import multisine as multisine, paper_design as paper_design
+from .experiments.record import Record as Record
 from .experiments.response_function import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model
@@ -40,7 +41,6 @@ from .identify.multipliers.order import select_order as select_order
 from .identify.multipliers.structured import fit_multipliers as fit_multipliers
 from .identify.rational.fit import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
-from .identify.series.layout import Record as Record
 from .identify.series.validation import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF

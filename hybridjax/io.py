@@ -29,10 +29,10 @@ from ._core.tracing import is_traced
 from .errors import DefinitionError, FileFormatError, HybridJaxError
 from .experiments.data import ExperimentData
 from .experiments.design.design import Design
+from .experiments.record import Record
 from .identify.multipliers.structured import StructuredFit
 from .identify.rational.fit import RationalFit
-from .identify.series.fit import SeriesFit
-from .identify.series.layout import Record
+from .identify.series.series_fit import SeriesFit
 from .linear.htf import HTF
 from .linear.ldtp import LDTP
 

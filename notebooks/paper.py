@@ -146,7 +146,7 @@ for name, model in models.items():
     print(name, model)
     print("   dimensions", *np.asarray(model.dims))
     print("   on section 0:", model.coordinates[0], "rank of the return map:", model.rank())
-    print("   multipliers", model.multipliers())
+    print("   multipliers", model.multipliers)
 
 # %% [markdown]
 # ## A design (Sec. V)
@@ -201,9 +201,9 @@ figure = hj.plot.harmonics(pairs)
 rational = {name: hj.fit_rational(estimate) for name, estimate in estimates.items()}
 for name, fit in rational.items():
     biased = hj.fit_rational(exact[name])
-    for k, output in enumerate(outputs):
-        error = fit.compare(cycle.multipliers)[k].max_error
-        bias = biased.compare(cycle.multipliers)[k].max_error
+    for output in outputs:
+        error = fit.compare(cycle.multipliers, output).max_error
+        bias = biased.compare(cycle.multipliers, output).max_error
         print(f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}")
 figure = hj.plot.bodes(pairs, fits=rational)
 

@@ -55,7 +55,7 @@ def things(ldtp):
     htf = hj.estimate_htf(data)
     plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
     fits = hj.fit_rational(htf), hj.fit_multipliers(htf, ldtp, overhang=2)
-    record = hj.Record(data.u[0], data.y[0], n_sections=2, start=1)
+    record = hj.Record(data.u[0], data.y[0], n_sections=2, first_section=1)
     series = hj.fit_series(data, ldtp, overhang=2)
     return [design, data, htf, ldtp, plain, *fits, record, series]
 

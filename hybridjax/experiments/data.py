@@ -15,6 +15,7 @@ from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from .design.design import Design
 from .noise import draw_process_noise
+from .record import Record
 
 
 class ExperimentData(eqx.Module):
@@ -129,6 +130,12 @@ class ExperimentData(eqx.Module):
     def ok(self) -> Bool[np.ndarray, " S"]:
         """Which experiments ran to their end."""
         return self.result == Result.OK
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The experiments that ran to their end, each with all of its cycles."""
+        about = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
+        return tuple(Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok))
 
     @property
     def window(self) -> slice:

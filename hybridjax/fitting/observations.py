@@ -16,7 +16,7 @@ from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.respond import respond
 from ..experiments.response_function import response_function
-from ..identify.multipliers.weights import check_values, weights_of
+from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..maps.linearize import linearize
 from ..maps.place import place_sections
@@ -82,7 +82,7 @@ class ObservedHTF(AbstractObservation):
                 f"the HTFs belong to {htf.n_sections} sections, the family has "
                 f"{self.sections.n_sections}."
             )
-        self.weights = jnp.asarray(weights_of(htf, check_values(htf)))
+        self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:

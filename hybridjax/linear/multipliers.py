@@ -17,6 +17,10 @@ Matrix = Float[np.ndarray, "_ _"]
 
 # Rounds of balancing. Doubled, units that differ by more are evened out.
 _BALANCING = 8
+# QR sweeps for one eigenvalue; two or three are usual. Doubled: failure is noticed later.
+_MOST_SWEEPS = 60
+# After so many sweeps in vain the shift is chosen otherwise. Doubled: a cycle of shifts ends later.
+_EXCEPTIONAL_EVERY = 10
 
 
 def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
@@ -174,9 +178,9 @@ def _periodic_schur(factors):
         while low > 0 and not small[low - 1]:
             low -= 1
         stalled += 1
-        if stalled > 60:
+        if stalled > _MOST_SWEEPS:
             raise ComputationError("The periodic QR algorithm did not converge.")
-        shift = _shift(factors, low, high, exceptional=stalled % 10 == 0)
+        shift = _shift(factors, low, high, exceptional=stalled % _EXCEPTIONAL_EVERY == 0)
         start = (hessenberg[low, low] - shift, hessenberg[low + 1, low])
         _rotate(factors, low, _rotation(*start))
         for k in range(low + 1, high):

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle
 
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import compare_multipliers
-from ..identify.multipliers.estimate import MultiplierEstimate
+from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -56,7 +56,7 @@ def multipliers(
 
     **Raises:** `DefinitionError` if there are no multipliers.
     """
-    true = _values(true.multipliers() if isinstance(true, LDTP) else true)
+    true = _values(true.multipliers if isinstance(true, LDTP) else true)
     if true.size == 0:
         raise DefinitionError("there is no multiplier to draw.")
     series = _series(estimates or {}, labels)

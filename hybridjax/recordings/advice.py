@@ -9,11 +9,12 @@ from jaxtyping import Complex, Float
 
 from .._core.results import Result
 from ..errors import DefinitionError
+from ..experiments.record import RecordedData
 from ..identify.multipliers.compare import compare_multipliers
-from ..identify.multipliers.estimate import roots_of
-from ..identify.series.fit import SeriesFit, refuse_order
-from ..identify.series.layout import Layout, Record, lay_out
-from ..identify.series.regression import Delayed, delayed_outputs, set_up
+from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
+from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.output_error import OutputErrorProblem
+from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
 from .spectra import input_band, input_spectrum
 
@@ -41,21 +42,14 @@ _WHOLE_BAND = 0.9
 _STRIDES = (100, 300, 1000, 3000)
 
 
-def plain_regression(
-    data: SectionData | tuple[Record, ...], order: int
-) -> Complex[np.ndarray, " d"]:
+def plain_regression(data: RecordedData, order: int) -> Complex[np.ndarray, " d"]:
     """Multipliers by least squares on chi y = B u (ARX), which noise in y biases towards zero.
 
     To see by how much: `fit_series` has no such bias.
     """
-    layout = lay_out(data.records if isinstance(data, SectionData) else data)
-    problem = set_up(layout, order, layout.y.shape[2], False)
-    return _plain(delayed_outputs(problem, order))
-
-
-def _plain(delayed: Delayed) -> Complex[np.ndarray, " d"]:
-    gram = delayed.gram.sum(axis=0)
-    return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
+    grid = CycleGrid.from_data(data)
+    problem = OutputErrorProblem.from_grid(grid, order, grid.n_sections, free_start=True)
+    return ordinary_least_squares(delayed_outputs(problem, order))
 
 
 class Advice(eqx.Module):
@@ -91,12 +85,13 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    layout = lay_out(data.records)
-    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
+    grid = CycleGrid.from_data(data)
+    overhang = R - 1 - fit.lead - d * N
+    problem = OutputErrorProblem.from_grid(grid, d, overhang, free_start=True)
     delayed = delayed_outputs(problem, d)
-    sampled = int(np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min())
-    unknown = R * nu + len(layout.y) * (d + 1)
-    plain = _plain(delayed)
+    sampled = int(np.isfinite(grid.y).all(axis=3).sum(axis=(0, 1)).min())
+    unknown = R * nu + len(grid.y) * (d + 1)
+    plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     band = input_band(data)
     warnings = []
@@ -113,7 +108,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
             "nearly zero in truth); neither its value nor its interval then means anything."
         )
     warnings += _about_excitation(data, fit, band)
-    warnings += _about_outputs(layout, fit)
+    warnings += _about_outputs(grid, fit)
     if bias > _BIASED * fit.standard_errors.max():
         warnings.append(
             f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
@@ -157,10 +152,10 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
             )
 
 
-def _about_outputs(layout: Layout, fit: SeriesFit) -> Iterator[str]:
+def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[str]:
     """Whether two of them are one number."""
-    for i, j in combinations(range(layout.y.shape[3]), 2):
-        if _correlation(layout.y[..., i], layout.y[..., j]) > _SAME_OUTPUTS:
+    for i, j in combinations(range(grid.y.shape[3]), 2):
+        if _correlation(grid.y[..., i], grid.y[..., j]) > _SAME_OUTPUTS:
             yield (
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "

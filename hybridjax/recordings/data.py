@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..experiments.data import ExperimentData
-from ..identify.series.layout import Record
+from ..experiments.record import Record
 
 
 class SectionData(eqx.Module):
@@ -69,7 +69,7 @@ class SectionData(eqx.Module):
         """
         N, parts = self.n_sections, []
         for r in self.records:
-            first = -r.start % N
+            first = -r.first_section % N
             parts.append((r.u[first:], r.y[first:]))
         cycles = min(len(u) for u, _ in parts) // N
         u = np.stack([u[: cycles * N] for u, _ in parts])

@@ -5,10 +5,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import DefinitionError
-from ..identify.series.fit import SeriesFit, fit_series, quick_fit
-from ..identify.series.layout import Record, lay_out, pieces_of
-from ..identify.series.prediction import predict
-from ..identify.series.regression import delayed_outputs, initial, linearize, set_up
+from ..experiments.record import Record, uninterrupted_records
+from ..identify.multipliers.denominator import Denominator
+from ..identify.series.arx import delayed_outputs, total_least_squares
+from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.fit import assemble, fit_series
+from ..identify.series.output_error import OutputErrorProblem, linearize
+from ..identify.series.series_fit import SeriesFit
+from ..identify.series.simulation import simulate_record
 from ..identify.series.validation import Validation, validate
 from .data import SectionData
 
@@ -30,17 +34,17 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
     early, late = _split(data, share)
-    layout = lay_out(early)
-    rest = pieces_of(late).pieces
+    grid = CycleGrid.from_data(early)
+    rest = uninterrupted_records(late)
     misfits = []
     for d in range(1, most + 1):
-        problem = set_up(layout, d, layout.y.shape[2], False)
-        c = initial(delayed_outputs(problem, d))
+        problem = OutputErrorProblem.from_grid(grid, d, grid.n_sections, free_start=True)
+        c = total_least_squares(delayed_outputs(problem, d))
         found = linearize(problem, c)
         if (found.freedom <= 2 * d).any():
             break
-        fit = quick_fit(problem, c, found, layout)
-        error = np.concatenate([predict(fit, p, True) - p.y for p in rest])
+        fit = assemble(grid, problem, found, Denominator.of_unknown_accuracy(c))
+        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
         misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
     if not misfits:
         raise DefinitionError(
@@ -77,20 +81,6 @@ def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]
     for r in data.records:
         end = round(len(r.u) * enough)
         cut = round(end * (1 - share))
-        early.append(_part(r, slice(0, cut)))
-        late.append(_part(r, slice(cut, end)))
+        early.append(r.part(0, cut))
+        late.append(r.part(cut, end))
     return early, late
-
-
-def _part(record: Record, rows: slice) -> Record:
-    start = (record.start + rows.start) % record.n_sections
-    return Record(
-        record.u[rows],
-        record.y[rows],
-        n_sections=record.n_sections,
-        start=start,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        lead=record.lead,
-        drift=record.drift,
-    )

@@ -5,7 +5,8 @@ from typing import Literal
 
 import equinox as eqx
 
-from ..identify.series.fit import SeriesFit, fit_series
+from ..identify.series.fit import fit_series
+from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
 from .data import SectionData
 from .drift import without_drift
@@ -85,7 +86,7 @@ def identify_recording(
     # Where the held-out fit saw only the beginning of a long recording and found no part of second
     # order that pays, the whole is not asked again.
     known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
-    fit = fit_series(data.records, order, check=False, distortion=False if known else None)
+    fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
         recording=recording,
         phase=found,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import DefinitionError
-from ..identify.series.fit import SeriesFit
+from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
 from .spectra import input_band
 

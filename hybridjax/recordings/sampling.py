@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
-from ..identify.series.layout import Record
+from ..experiments.record import Record
 from .data import SectionData
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
@@ -108,7 +108,7 @@ def section_data(
             part.u,
             part.y,
             n_sections=N,
-            start=int(part.k[0]) % N,
+            first_section=int(part.k[0]) % N,
             inputs=inputs,
             outputs=outputs,
             lead=lead,

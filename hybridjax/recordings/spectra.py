@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import signal
 
-from ..identify.series.layout import pieces_of
+from ..experiments.record import uninterrupted_records
 from .data import SectionData
 
 
@@ -19,14 +19,14 @@ def input_spectrum(
     data: SectionData,
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Frequencies in cycles per period, and power spectral densities there (Welch 1967)."""
-    pieces, N, inputs, *_ = pieces_of(data.records)
-    length = N * max(1, min(_WINDOW, max(len(p.u) for p in pieces) // (2 * N)))
-    total, weight = np.zeros((length // 2 + 1, len(inputs))), 0
+    records, N = uninterrupted_records(data), data.n_sections
+    length = N * max(1, min(_WINDOW, max(len(r.u) for r in records) // (2 * N)))
+    total, weight = np.zeros((length // 2 + 1, len(data.inputs))), 0
     f = np.fft.rfftfreq(length, 1 / N)
-    for piece in pieces:
-        if len(piece.u) >= length:
-            _, power = signal.welch(piece.u, N, nperseg=length, axis=0)
-            total, weight = total + len(piece.u) * power, weight + len(piece.u)
+    for r in records:
+        if len(r.u) >= length:
+            _, power = signal.welch(r.u, N, nperseg=length, axis=0)
+            total, weight = total + len(r.u) * power, weight + len(r.u)
     return f, total / max(weight, 1)
 
 

@@ -12,7 +12,7 @@ def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
         hj.run_experiments(vanderpol_cycle, family, design, "x")
     # Between such sections the multiplier 1 is there, and makes whole frequencies resonant.
     model = hj.linearize(vanderpol_cycle, family, "x")
-    assert abs(model.multipliers()[0] - 1) < 1e-9
+    assert abs(model.multipliers[0] - 1) < 1e-9
     with pytest.raises(hj.DefinitionError, match="use sections that depend on the state"):
         model.htf([1.0])
     model.htf([0.5])

@@ -5,7 +5,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random, simulate_blocks
+from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 DESIGNS = {
@@ -111,10 +111,10 @@ def test_a_lost_phase_loses_the_frequency(hopper):
 
 def record(*cosines, n_sections=8, periods=8, cycles=8):
     """One experiment per argument, a list of (f, phase); the output repeats the input."""
-    n = np.arange(sections * cycles)
-    u = [sum(np.cos(2 * np.pi * f * n / sections + phase) for f, phase in c) for c in cosines]
+    n = np.arange(n_sections * cycles)
+    u = [sum(np.cos(2 * np.pi * f * n / n_sections + phase) for f, phase in c) for c in cosines]
     u = np.stack(u)[..., None]
-    return hj.ExperimentData(u, u, sections=sections, periods=periods)
+    return hj.ExperimentData(u, u, n_sections=n_sections, periods=periods)
 
 
 def test_half_integers_need_two_phases():

@@ -39,7 +39,7 @@ def model():
 def test_multipliers(model):
     assert list(model.dims) == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
-    np.testing.assert_allclose(model.multipliers(), [pair, pair.conjugate()], rtol=1e-13)
+    np.testing.assert_allclose(model.multipliers, [pair, pair.conjugate()], rtol=1e-13)
 
 
 @pytest.mark.parametrize("f, m", TRUTH)

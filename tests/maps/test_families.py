@@ -72,7 +72,7 @@ def test_a_family_of_clock_phases(hopper_cycle):
     placed = hj.place_sections(hopper_cycle, ChosenPhases([0.1, 0.25, 0.8]))
     np.testing.assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
-    np.testing.assert_allclose(ldtp.multipliers(), hopper_cycle.multipliers, atol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
 
 
 def test_a_family_of_levels(vanderpol_cycle):

@@ -45,7 +45,7 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     ldtp = request.getfixturevalue(family)
     truth = np.array([LAMBDA, np.conj(LAMBDA)])
     np.testing.assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
-    np.testing.assert_allclose(ldtp.multipliers(), truth, atol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
         monodromy = np.asarray(ldtp.monodromy(i))
         found = sorted(np.linalg.eigvals(monodromy), key=abs)
@@ -109,7 +109,7 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
     N = 32 if kind == "isochron" else 8
     family = ISOCHRONS if kind == "isochron" else dataclasses.replace(KINEMATIC, n_sections=N)
     ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
-    np.testing.assert_allclose(ldtp.multipliers(), [LOSSY, np.conj(LOSSY)], atol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
     sections, points = lossy_sections(kind, N)
     dims = [len(p) for p in points]
     changes = [i for i in range(N) if dims[i] != dims[(i + 1) % N]]
@@ -125,5 +125,5 @@ def test_a_jump_that_goes_back_over_a_section_is_reported(lossy_cycle):
 def test_a_cycle_that_is_rest():
     """Where the state stands still, only its derivatives say how short steps must be."""
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
-    found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers()
+    found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
     np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)

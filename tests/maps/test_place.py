@@ -40,7 +40,7 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
     ldtp = hj.linearize(hopper_cycle, placed, ("yM", "vM"))
     assert tuple(" ".join(x) for x in ldtp.coordinates) == names
     np.testing.assert_array_equal(ldtp.dims, [len(names) for names in ldtp.coordinates])
-    np.testing.assert_allclose(ldtp.multipliers(), [LAMBDA, np.conj(LAMBDA)], atol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, [LAMBDA, np.conj(LAMBDA)], atol=1e-9)
     assert [ldtp.rank(i) for i in range(6)] == [2] * 6
 
 
@@ -80,11 +80,11 @@ def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     """Time has no origin there: a multiplier of 1 beside the true one."""
     ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling")))
     assert ldtp.outputs == ("x", "v") and ldtp.coordinates[0] == ("x", "v")
-    np.testing.assert_allclose(ldtp.multipliers(), [1.0, VDP], rtol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
     family = hj.KinematicPhase(8, position="x", velocity="v", anchor=Crossing("v", "falling"))
     ldtp = hj.linearize(vanderpol_cycle, family, "x")
     np.testing.assert_array_equal(ldtp.dims, np.ones(8))
-    np.testing.assert_allclose(ldtp.multipliers(), [VDP], rtol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])

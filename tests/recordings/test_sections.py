@@ -29,7 +29,7 @@ def test_a_circle(wave):
     np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
-        (record.u + data.cycle_inputs[(record.start + np.arange(len(times))) % 8])[:-1, 0],
+        (record.u + data.cycle_inputs[(record.first_section + np.arange(len(times))) % 8])[:-1, 0],
         np.diff(area) / 3 / np.diff(times), atol=2e-3,
     )  # fmt: skip
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
@@ -109,9 +109,9 @@ def test_designs_as_tables(tmp_path, wave):
     told = hj.recordings.add_command(wave, phase, {"u": table["u"][:1]}, 8)
     data = sample(told, phase, inputs="u", sampled="middle")
     u = data.records[0].u[:, 0] + data.cycle_inputs[:, 0][
-        (data.records[0].start + np.arange(len(data.records[0].u))) % 8
+        (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
     ]  # fmt: skip
-    first = -data.records[0].start % 8
+    first = -data.records[0].first_section % 8
     np.testing.assert_allclose(u[first : first + 150], table["u"][0, :150], atol=1e-9)
     with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):
         hj.recordings.add_command(wave, phase, table, 8)

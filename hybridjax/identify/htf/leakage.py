@@ -6,13 +6,14 @@ from jaxtyping import Float
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData, simulate_experiments
 from ...experiments.design.design import Design
+from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .nonparametric import estimate_htf
 
 
 def predict_leakage(
-    design: Design, model: LDTP | HTF, harmonics: tuple[int, ...] | None = None
+    design: Design, model: LDTP | HTF, harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M ny"]:
     """The error of every harmonic that comes from those which the design takes as zero.
 

@@ -6,18 +6,29 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...errors import DefinitionError
-from .line_sums import Sums
+from .spectral_sums import SpectralSums
 
 
-class Solution(NamedTuple):
-    """H at some lines; the variances as in `HTF`."""
+# Part of the power of a line by which |sum of U^2| may fall short of the sum of |U|^2 where all
+# phases are the same. Doubled: phases that differ by 0.08 degrees count as the same, not 0.06.
+_SAME_PHASES = 1e-6
+
+
+class NoiseVariance(NamedTuple):
+    """What repeated windows tell; None where there was one window."""
+
+    variance: Float[np.ndarray, "M F ny nu"] | None
+    freedom: Float[np.ndarray, " F"] | None
+
+
+class LineEstimates(NamedTuple):
+    """H at F lines; the variances as in `HTF`."""
 
     H: Complex[np.ndarray, "M F ny nu"]
     variance: Float[np.ndarray, "M F ny nu"] | None
     noise_variance: Float[np.ndarray, "M F ny nu"] | None
-    freedom: Float[np.ndarray, " F"] | None
-    noise: tuple
-    """Variance of noise and its freedom, from repeated windows; or two None."""
+    variance_freedom: Float[np.ndarray, " F"] | None
+    noise: NoiseVariance
     realizations: Int[np.ndarray, " F"]
     """How many experiments there are beyond those that the unknowns need."""
     coherence: Float[np.ndarray, "M F ny"]
@@ -25,9 +36,10 @@ class Solution(NamedTuple):
     why_not: str
     """Why realizations do not tell the distortion, or nothing."""
 
-    def of_noise(self) -> "Solution":
+    def of_noise(self) -> "LineEstimates":
         """The same with the variance of noise alone."""
-        return self._replace(variance=self.noise[0], noise_variance=None, freedom=self.noise[1])
+        variance, freedom = self.noise
+        return self._replace(variance=variance, noise_variance=None, variance_freedom=freedom)
 
     def require_total(self, f: Float[np.ndarray, " F"]) -> None:
         """**Raises:** `DefinitionError` if the scatter over realizations is not known."""
@@ -41,14 +53,14 @@ class Solution(NamedTuple):
             )
 
 
-def solve(sums: Sums, rows: Int[np.ndarray, " F"]) -> Solution:
-    r"""Least squares at each line: `Y = H U + G conj(U)`, G = 0 unless the line meets itself.
+def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimates:
+    r"""Least squares at some lines: `Y = H U + G conj(U)`, G = 0 unless the line meets itself.
 
     With p unknowns and G experiments the residuals have G - p complex degrees of freedom, and the
     variance of H is theirs times the diagonal of the inverse of the normal matrix. The noise of
     each experiment, from repeated windows, goes the same way.
     """
-    nu, shape = len(sums.about.inputs), sums.direct.shape[2:]
+    nu, shape = len(sums.setup.inputs), sums.direct.shape[2:]
     H = np.zeros((len(rows), nu, *shape), complex)
     spread = np.zeros((len(rows), nu))
     left = np.zeros((len(rows), *shape))
@@ -74,17 +86,17 @@ def solve(sums: Sums, rows: Int[np.ndarray, " F"]) -> Solution:
 
     count = sums.count[rows]
     realizations = count - unknowns
-    noise = (None, None)
+    noise = NoiseVariance(None, None)
     repeated = sums.repeats > 1
     if repeated:
         mean = sums.noise[rows] / count[:, None, None]
-        noise = variance(mean), count * (sums.repeats - 1.0)
+        noise = NoiseVariance(variance(mean), count * (sums.repeats - 1.0))
     why_not = _why_not(sums, rows)
     total, of_noise, freedom = None, None, None
     if (realizations > 0).any() and not why_not:
         residual = left / np.maximum(realizations, 1)[:, None, None]
         residual[realizations < 1] = np.inf
-        total, of_noise = variance(residual), noise[0]
+        total, of_noise = variance(residual), noise.variance
         freedom = np.maximum(realizations, 1).astype(float)
     elif repeated:
         total, freedom = noise
@@ -94,25 +106,34 @@ def solve(sums: Sums, rows: Int[np.ndarray, " F"]) -> Solution:
         coherence = 1 - lost / (sums.energy[rows] / count[:, None, None])
     coherence = np.where((realizations > 0)[:, None, None], np.maximum(coherence, 0), np.nan)
     coherence = coherence.transpose(1, 0, 2)
-    return Solution(H, total, of_noise, freedom, noise, realizations, coherence, why_not)
+    return LineEstimates(
+        H=H,
+        variance=total,
+        noise_variance=of_noise,
+        variance_freedom=freedom,
+        noise=noise,
+        realizations=realizations,
+        coherence=coherence,
+        why_not=why_not,
+    )
 
 
-def _why_not(sums: Sums, rows: Int[np.ndarray, " F"]) -> str:
+def _why_not(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     """Why the scatter over experiments is not that over realizations of random phases."""
     power = np.einsum("kii->k", sums.ran.power[rows]).real
-    alike = np.abs(np.einsum("kii->k", sums.ran.square[rows])) > (1 - 1e-6) * power
-    several = sums.count[rows] > len(sums.about.inputs)
+    alike = np.abs(np.einsum("kii->k", sums.ran.square[rows])) > (1 - _SAME_PHASES) * power
+    several = sums.count[rows] > len(sums.setup.inputs)
     if several.any() and (alike & several).sum() > several.sum() / 2:
         return (
             "the experiments repeat the same phases, so that their scatter is noise alone and does "
             "not show the distortion: apply realizations with new random phases "
             "(`Design.realizations`)."
         )
-    if not sums.phases.random:
+    if not sums.crest_test.random:
         return (
-            f"the phases are not random: {sums.phases.low} of {sums.phases.tested} signals have a "
-            "crest factor below that of 200 random draws. The scatter of optimized phases does not "
-            "show the distortion of a class of signals: ask for variance='noise', or use random "
-            "phases."
+            f"the phases are not random: {sums.crest_test.low} of {sums.crest_test.tested} signals "
+            "have a crest factor below that of 200 random draws. The scatter of optimized phases "
+            "does not show the distortion of a class of signals: ask for variance='noise', or use "
+            "random phases."
         )
     return ""

@@ -5,8 +5,9 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy import stats
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
-from .compare import MultiplierComparison, Multipliers, compare_multipliers
+from .compare import MultiplierComparison, compare_multipliers
 
 
 class MultiplierEstimate(eqx.Module):
@@ -44,7 +45,7 @@ class MultiplierEstimate(eqx.Module):
         """Root of the expected squared distance of each multiplier from the true one."""
         return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
 
-    def distance(self, true: Multipliers) -> Float[np.ndarray, " k"]:
+    def distance(self, true: Numbers) -> Float[np.ndarray, " k"]:
         r"""Squared distance of the estimate from supposed multipliers, in units of its covariance.
 
         $\lambda$ is a multiplier if $p(\lambda) = 0$, which is linear in c: one real equation for
@@ -54,13 +55,13 @@ class MultiplierEstimate(eqx.Module):
         multipliers are close to each other (Fieller 1954). Zero where the covariance is infinite:
         then nothing is known.
         """
-        true = np.atleast_1d(np.asarray(true, complex)).ravel()
+        known = np.atleast_1d(np.asarray(true, complex)).ravel()
         if not np.isfinite(self.covariance).all():
-            return np.zeros(len(true))
-        powers = true[:, None] ** np.arange(len(self.coefficients), -1, -1)
+            return np.zeros(len(known))
+        powers = known[:, None] ** np.arange(len(self.coefficients), -1, -1)
         value = powers @ np.concatenate([[1.0], self.coefficients])
-        out = np.empty(len(true))
-        for i, z in enumerate(true):
+        out = np.empty(len(known))
+        for i, z in enumerate(known):
             rows = [powers[i, 1:].real, powers[i, 1:].imag][: 1 if z.imag == 0 else 2]
             p = np.array([value[i].real, value[i].imag])[: len(rows)]
             cov = np.array(rows) @ self.covariance @ np.array(rows).T
@@ -73,15 +74,15 @@ class MultiplierEstimate(eqx.Module):
             out[i] = p @ np.linalg.lstsq(cov, p)[0]
         return out
 
-    def contains(self, true: Multipliers, level: float = 0.95) -> Bool[np.ndarray, " k"]:
+    def contains(self, true: Numbers, level: float = 0.95) -> Bool[np.ndarray, " k"]:
         """Whether supposed multipliers lie in the confidence region of this level.
 
         A conjugate pair is one statement, not two.
 
         **Raises:** `DefinitionError` if `level` is not between 0 and 1.
         """
-        true = np.atleast_1d(np.asarray(true, complex)).ravel()
-        return self.distance(true) <= self._radius(level, np.where(true.imag == 0, 1, 2))
+        known = np.atleast_1d(np.asarray(true, complex)).ravel()
+        return self.distance(known) <= self._radius(level, np.where(known.imag == 0, 1, 2))
 
     def ellipse(
         self, index: int = 0, level: float = 0.95, points: int = 100
@@ -104,7 +105,7 @@ class MultiplierEstimate(eqx.Module):
         x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
         return self.multipliers[index] + x + 1j * y
 
-    def compare(self, true: Multipliers) -> MultiplierComparison:
+    def compare(self, true: Numbers) -> MultiplierComparison:
         """The multipliers beside the true ones, paired; printing it shows a table."""
         return compare_multipliers(self.multipliers, true)
 
@@ -124,11 +125,3 @@ class MultiplierEstimate(eqx.Module):
             return stats.chi2.ppf(level, degrees)
         rest = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
         return degrees * self.covariance_freedom / rest * stats.f.ppf(level, degrees, rest)
-
-
-def roots_of(coefficients: Float[np.ndarray, " d"]) -> Complex[np.ndarray, " d"]:
-    """The multipliers, by decreasing modulus, of a pair that with positive imaginary part first."""
-    roots = np.roots([1.0, *coefficients]).astype(complex)
-    if len(roots) < len(coefficients):  # numpy drops roots at zero
-        roots = np.concatenate([roots, np.zeros(len(coefficients) - len(roots))])
-    return roots[np.lexsort((-roots.imag, -np.abs(roots)))]
