@@ -35,7 +35,9 @@ class Execution:
 
     def __post_init__(self):
         if self.batch is not None and self.batch < 1:
-            raise DefinitionError(f"batch is the number of lanes of one compiled call, not {self.batch}.")
+            raise DefinitionError(
+                f"batch is the number of lanes of one compiled call, not {self.batch}."
+            )
         if self.workers is not None and self.workers < 1:
             raise DefinitionError(f"workers is the number of threads, not {self.workers}.")
         if self.precision not in get_args(Precision):
