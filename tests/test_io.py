@@ -50,7 +50,7 @@ def ldtp():
 
 @pytest.fixture(scope="module")
 def things(ldtp):
-    design = hj.multisine(n_sections=2, periods=16, f_max=1.0, inputs=("force", "torque é"))
+    design = hj.multisine(n_sections=2, periods=16, band=(0, 1.0), inputs=("force", "torque é"))
     data = hj.experiments.simulate_experiments(ldtp, design)
     htf = hj.estimate_htf(data)
     plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
@@ -71,7 +71,8 @@ def test_failed_experiments_and_cycle_outputs(folder):
     y[1, 3:] = np.nan
     data = hj.ExperimentData(
         np.zeros((2, 6, 1)), y, n_sections=3, periods=1, result=[0, hj.Result.GRAZING],
-        failed_at=[-1, 3], cycle_outputs=np.arange(3.0)[:, None], family="by hand",
+        simulated=hj.experiments.Simulated(np.array([-1, 3])),
+        cycle_outputs=np.arange(3.0)[:, None], label="by hand",
     )  # fmt: skip
     object.__setattr__(data, "periods", np.int64(1))  # as where nobody checks annotations
     back = trip(folder, data)

@@ -32,7 +32,8 @@ def _honest(task: Problem, accuracy: float, name: str, show) -> None:
 
 def show_honesty(task: Problem, data, accuracy: float, name: str, show) -> None:
     """The share of experiments that ran well, and the errors of these."""
-    scale = prepare(task.cycle, task.placed, task.u, task.outputs, discard=0).scales[:, 1:3]
+    campaign = prepare(task.cycle, task.placed, task.u, task.outputs, discard=0)
+    scale = campaign.stepping.scales[:, 1:3]
     scale = np.resize(scale, task.exact.shape[1:])
     assert scale.shape[0] % N == 0
     true = np.abs(record(data) - task.exact) / scale

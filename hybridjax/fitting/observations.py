@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from ..engine.move import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.plan import Plan
-from ..experiments.respond import observe, respond
+from ..experiments.flow_batch import flow_batch, observe
 from ..experiments.response_function import response_function
+from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.weights import check_values, weights_of
 from ..linear.htf import HTF
 from ..maps.linearize import linearize
@@ -155,7 +155,7 @@ class ObservedSeries(AbstractObservation):
         first = jnp.concatenate([placed.lanes.t[None], placed.lanes.q])[:, :1]
         start = jnp.broadcast_to(first, (len(first), len(self.u)))
         plan, settings = self.flow
-        y = respond(placed, plan, start, self.u, self.outputs, settings).y
+        y = flow_batch(placed, plan, start, self.u, self.outputs, settings).y
         if not self.absolute:
             y = y - jnp.tile(
                 _at_sections(placed, self.outputs), (y.shape[1] // placed.n_sections, 1)
@@ -169,7 +169,10 @@ class ObservedSeries(AbstractObservation):
             )
         response = response_function(cycle, self.sections, self.outputs)
         return eqx.tree_at(
-            lambda o: o.flow, self, (response.plan, response.settings), is_leaf=lambda x: x is None
+            lambda o: o.flow,
+            self,
+            (response.stepping.plan, response.stepping.settings),
+            is_leaf=lambda x: x is None,
         )
 
 

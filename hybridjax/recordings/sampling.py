@@ -84,7 +84,7 @@ class SectionData(eqx.Module):
         cycles = min(len(u) for u, _ in parts) // N
         u = np.stack([u[: cycles * N] for u, _ in parts])
         y = np.stack([y[: cycles * N] for _, y in parts])
-        about = {"inputs": self.inputs, "outputs": self.outputs, "family": "recorded"}
+        about = {"inputs": self.inputs, "outputs": self.outputs, "label": "recorded"}
         return ExperimentData(u, y, n_sections=N, periods=periods, **about)
 
     def __repr__(self) -> str:

@@ -10,7 +10,8 @@ import hybridjax as hj
 
 
 SECTIONS = hj.KinematicPhase(4, position="x", velocity="v")
-DESIGN = hj.multisine(4, 3, 1.2, 0.05, seed=1)
+DESIGN = hj.multisine(4, 3, (0, 1.2), 0.05, seed=1)
+ALONE = hj.Execution(workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_experiments_start_in_their_periodic_response(vanderpol_cycle):
     n = DESIGN.inputs().shape[1]
     for start, least, most in (("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)):
         data = hj.run_experiments(
-            vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start=start, discard=3, workers=1
+            vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start=start, discard=3, execution=ALONE
         )
         transient = np.abs(data.y[:, :n] - data.y[:, n:]).max()
         assert least <= transient < most
@@ -45,7 +46,7 @@ def test_the_response_repeats_from_the_first_sample_on(vanderpol_cycle, settled)
     n = u.shape[1]
     np.testing.assert_allclose(y[:, :n], y[:, n:], atol=1e-8)
     data = hj.run_experiments(
-        vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="steady", discard=3, workers=1
+        vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="steady", discard=3, execution=ALONE
     )
     np.testing.assert_allclose(data.y + np.tile(data.cycle_outputs, (6, 1)), y, atol=1e-8)
 
@@ -73,10 +74,11 @@ def test_process_noise_acts_but_is_not_recorded(vanderpol_cycle):
     def run(noise):
         return hj.run_experiments(
             vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="periodic", discard=3,
-            process_noise=noise, workers=1,
+            process_noise=None if noise is None else hj.experiments.ProcessNoise(noise),
+            execution=ALONE,
         )  # fmt: skip
 
-    still, noisy, again = run(0.0), run(1e-3), run(1e-3)
+    still, noisy, again = run(None), run(1e-3), run(1e-3)
     np.testing.assert_array_equal(noisy.u, DESIGN.inputs(6))
     np.testing.assert_array_equal(noisy.y, again.y)
     change = np.std(noisy.y - still.y)
