@@ -11,6 +11,8 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 import hybridjax as hj
 
+from .conftest import unchecked
+
 
 def same(a, b):
     """Equal types, names, dtypes and bits."""
@@ -159,7 +161,7 @@ def rewrite(path, header=None, arrays=None):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"header": {"format_version": 2, "package_version": "9.0"}}, "version 2 .hybridjax 9.0"),
+        ({"header": {"format_version": 9, "package_version": "9.0"}}, "version 9 .hybridjax 9.0"),
         ({"header": {"format": "other"}}, "not written by hybridjax.save"),
         ({"header": {"kind": "os.system"}}, "holds a 'os.system'; load knows Design"),
         ({"header": {"kind": ["HTF"]}}, "load knows"),
@@ -218,7 +220,7 @@ def test_other_files(folder):
 )
 def test_other_objects(folder, thing):
     with pytest.raises(hj.DefinitionError, match="save takes Design"):
-        hj.save(folder / "x.npz", thing)
+        unchecked(hj.save)(folder / "x.npz", thing)
 
 
 def test_where_nothing_can_be_written_or_read(folder, things):
