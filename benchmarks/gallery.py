@@ -93,7 +93,7 @@ def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | Non
             loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4,
         )  # fmt: skip
         figure.suptitle(f"{case.title}: {case.push} to {case.output}", fontsize=8)
-        save(figure, path)
+        save(path, figure)
 
 
 def branches(path: Path) -> None:
@@ -120,10 +120,10 @@ def branches(path: Path) -> None:
         for ax, (output, some) in zip(axes, panels, strict=True):
             hj.plot.branch(*some, output=output, ax=ax)
             print(*some, sep="\n")
-        save(figure, path)
+        save(path, figure)
 
 
-def save(figure, path: Path) -> None:
+def save(path: Path, figure) -> None:
     """As a small file: a palette is enough."""
     figure.savefig(path, dpi=90)
     pyplot.close(figure)

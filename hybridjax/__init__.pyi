@@ -69,7 +69,12 @@ from .sections.families import (
 )
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
-from .systems.system import Guess as Guess, HybridSystem as HybridSystem, parameter as parameter
+from .systems.system import (
+    Guess as Guess,
+    HybridSystem as HybridSystem,
+    Parameter as Parameter,
+    parameter as parameter,
+)
 from .systems.transition import Scheduled as Scheduled, Transition as Transition
 
 __version__: str

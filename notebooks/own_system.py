@@ -72,12 +72,12 @@ class Stance(hj.Chart):
 class Robot(hj.HybridSystem):
     """Mass on a leg that thrusts while it gets longer. Input `u`: a force on the mass."""
 
-    m: jax.Array = hj.parameter(1.0, unit="kg", doc="mass")
-    g: jax.Array = hj.parameter(9.81, unit="m/s^2", doc="gravity")
-    l0: jax.Array = hj.parameter(0.5, unit="m", doc="length of the leg")
-    k: jax.Array = hj.parameter(800.0, unit="N/m", doc="stiffness of the leg")
-    b: jax.Array = hj.parameter(12.0, unit="N s/m", doc="damping of the leg")
-    thrust: jax.Array = hj.parameter(30.0, unit="N", doc="force of the cylinder")
+    m: hj.Parameter = hj.parameter(1.0, unit="kg", doc="mass")
+    g: hj.Parameter = hj.parameter(9.81, unit="m/s^2", doc="gravity")
+    l0: hj.Parameter = hj.parameter(0.5, unit="m", doc="length of the leg")
+    k: hj.Parameter = hj.parameter(800.0, unit="N/m", doc="stiffness of the leg")
+    b: hj.Parameter = hj.parameter(12.0, unit="N s/m", doc="damping of the leg")
+    thrust: hj.Parameter = hj.parameter(30.0, unit="N", doc="force of the cylinder")
 
     def charts(self):
         return {

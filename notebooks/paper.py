@@ -21,7 +21,6 @@
 # %%
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -64,13 +63,13 @@ class Stance(hj.Chart):
 
 
 class Hopper(hj.HybridSystem):
-    m: jax.Array = hj.parameter(1.0, unit="kg")
-    M: jax.Array = hj.parameter(2.0, unit="kg")
-    k: jax.Array = hj.parameter(10.0, unit="N/m")
-    b: jax.Array = hj.parameter(5.0, unit="N s/m")
-    l0: jax.Array = hj.parameter(2.0, unit="m")
-    a: jax.Array = hj.parameter(20.0, unit="N")
-    g: jax.Array = hj.parameter(2.0, unit="m/s^2")
+    m: hj.Parameter = hj.parameter(1.0, unit="kg")
+    M: hj.Parameter = hj.parameter(2.0, unit="kg")
+    k: hj.Parameter = hj.parameter(10.0, unit="N/m")
+    b: hj.Parameter = hj.parameter(5.0, unit="N s/m")
+    l0: hj.Parameter = hj.parameter(2.0, unit="m")
+    a: hj.Parameter = hj.parameter(20.0, unit="N")
+    g: hj.Parameter = hj.parameter(2.0, unit="m/s^2")
 
     def leg(self, t, yM, ym):
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(2 * jnp.pi * t)

@@ -162,5 +162,5 @@ found = hj.identify_recording(
     recording, hj.recordings.AnglePhase("yM", "vM"), inputs="u", outputs=("yM", "vM"), order=2
 )
 with tempfile.TemporaryDirectory() as folder:
-    page = hj.write_report(found, Path(folder) / "results")
+    page = hj.write_report(Path(folder) / "results", found)
     print(sorted(path.name for path in page.parent.iterdir()), page.stat().st_size // 1000, "kB")

@@ -119,7 +119,7 @@ def _identify(options) -> None:
         time=options.time_of_crossing, drift=options.drift,
     )  # fmt: skip
     print(found)
-    print(write_report(found, options.out))
+    print(write_report(options.out, found))
 
 
 def _reproduce(options) -> None:

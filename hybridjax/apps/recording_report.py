@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from .. import __version__, plot
 from ..errors import DefinitionError
@@ -27,7 +26,7 @@ _PAGE = "report.html"
 _POINTS = 240  # frequencies at which transfer functions are written
 
 
-def write_report(found: Identification, folder: str | os.PathLike) -> Path:
+def write_report(folder: str | os.PathLike, found: Identification) -> Path:
     """Write all results of a recording into a folder, which appears complete or not at all.
 
     - `report.html`: everything in one page that needs no other file.
@@ -48,10 +47,10 @@ def write_report(found: Identification, folder: str | os.PathLike) -> Path:
 
         htf = _htf(found)
         images = {}
-        for name, figure in _figures(found, htf).items():
-            image, _ = look.save(figure, temporary / "figures" / name)
+        for name, drawn in _figures(found, htf).items():
+            image, _ = look.save(temporary / "figures" / name, drawn)
             images[name] = base64.b64encode(image.read_bytes()).decode()
-            pyplot.close(figure)
+            pyplot.close(drawn.figure)
         save(temporary / "htf.npz", htf)
         save(temporary / "fit.npz", found.fit)
         _write_sections(found, temporary)
@@ -115,7 +114,7 @@ def _htf(found: Identification) -> HTF:
     return found.fit.htf(np.arange(1, _POINTS + 1) * (edge / _POINTS))
 
 
-def _figures(found: Identification, htf: HTF) -> dict[str, Figure]:
+def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
     import matplotlib
 
     with matplotlib.rc_context({"backend": "agg"}):
@@ -129,14 +128,11 @@ def _figures(found: Identification, htf: HTF) -> dict[str, Figure]:
         for i, name in enumerate(htf.inputs):
             suffix = f"_{name}" if len(htf.inputs) > 1 else ""
             figures[f"bode{suffix}"] = plot.bode(htf, input=i)
-            with look.style():
-                figure, axes = look.new_figure(
-                    len(htf.outputs), 1, width=look.COLUMN, height=0.3 + 1.6 * len(htf.outputs)
-                )
+            size = {"width": look.COLUMN, "height": 0.3 + 1.6 * len(htf.outputs)}
+            with look.panels(None, len(htf.outputs), 1, **size) as axes:
                 for k, output in enumerate(htf.outputs):
                     plot.magnitude(htf, output=output, input=i, decades=3, ax=axes[k, 0])
-            figures[f"harmonics{suffix}"] = figure
-    figures["multipliers"] = figures["multipliers"].get_figure(root=True)
+            figures[f"harmonics{suffix}"] = look.Plot(axes)
     return figures
 
 

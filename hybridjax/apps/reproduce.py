@@ -301,6 +301,6 @@ def _figures(out, cycle, families: Mapping[str, Family], perturbed):
         "poles_zeros": lambda: plot.poles_zeros(rational, labels=SYMBOLS),
     }
     for name, draw in drawings.items():
-        plot.save(draw(), out / name)
+        plot.save(out / name, draw())
         pyplot.close("all")
         yield name

@@ -279,7 +279,7 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if the two differ in frequencies, harmonics, sections, inputs
         or outputs, or have no `H_0`.
         """
-        for name in ("sections", "harmonics", "inputs", "outputs"):
+        for name in ("n_sections", "harmonics", "inputs", "outputs"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:
                 raise DefinitionError(

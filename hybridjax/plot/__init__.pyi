@@ -6,7 +6,14 @@ from .frequency import (
     harmonics as harmonics,
     magnitude as magnitude,
 )
-from .look import COLORS as COLORS, COLUMN as COLUMN, PAGE as PAGE, save as save, style as style
+from .look import (
+    COLORS as COLORS,
+    COLUMN as COLUMN,
+    PAGE as PAGE,
+    Plot as Plot,
+    save as save,
+    style as style,
+)
 from .orbit import cycle as cycle
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
 from .recorded import (

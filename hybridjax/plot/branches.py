@@ -4,12 +4,11 @@ import itertools
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from ..errors import DefinitionError
 from ..orbits.branches.branch import KINDS, Branch
 from ..systems.structure import Structure
-from .look import COLORS, CYCLE, axes_or_new, label_of
+from .look import COLORS, CYCLE, AxesLike, Plot, label_of, panels
 
 
 _MARKS = dict(
@@ -21,15 +20,15 @@ def branch(
     *branches: Branch,
     output: str | None = None,
     labels: Mapping[str, str] | None = None,
-    ax: Axes | None = None,
-) -> Axes:
+    ax: AxesLike | None = None,
+) -> Plot:
     """Branches of limit cycles, with marks where their stability changes.
 
     Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
 
     **Arguments:**
 
-    - `branches`: from `follow`, all along the same parameter.
+    - `branches`: from `continuation`, all along the same parameter.
     - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
         default the first state of the chart in which the cycle begins.
     - `labels`: texts for the axes by name, e.g. `{"Vin": "supply (V)"}`.
@@ -43,7 +42,8 @@ def branch(
         raise DefinitionError(
             f"branches to be drawn together need the same parameter; these have {sorted(names)}."
         )
-    with axes_or_new(ax) as ax:
+    with panels(ax) as axes:
+        ax = axes[0, 0]
         shown = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
             name = _first_state(b) if output is None else output
@@ -63,7 +63,7 @@ def branch(
         ax.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
         ax.locator_params(axis="x", nbins=6)
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
-    return ax
+    return Plot(axes)
 
 
 def _first_state(branch: Branch) -> str:

@@ -4,18 +4,21 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
 from ..identify.series.amplitude import AmplitudeSweep
 from ..identify.series.validation import Validation
-from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
+from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
 def validation(
-    found: Validation, *, cycles: int = 4, labels: Mapping[str, str] | None = None
-) -> Figure:
+    found: Validation,
+    *,
+    cycles: int = 4,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
     """Measured and simulated outputs, and correlations of the residuals; one row per output.
 
     Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
@@ -28,8 +31,7 @@ def validation(
     shown = slice(max(len(found.measured) - cycles * N, 0), None)
     time = (found.start + np.arange(len(found.measured)))[shown] / N
     limit = stats.norm.isf(0.005)
-    with style():
-        figure, axes = new_figure(ny, 3, width=PAGE, height=0.6 + 1.6 * ny)
+    with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
         for i, name in enumerate(found.outputs):
             signal, auto, cross = axes[i]
             signal.plot(time, found.simulated[shown, i], color=CYCLE[0], label="simulated")
@@ -48,11 +50,11 @@ def validation(
             cross.set_title(f"with the input: p = {found.independence[i]:.2g}")
         axes[0, 0].legend(loc="best")
         axes[-1, 0].set_xlabel("time (cycles)")
-        for ax in axes[-1, 1:]:
-            ax.set_xlabel("lag (sections)")
-        figure.align_ylabels(axes[:, 0])
+        for lags in axes[-1, 1:]:
+            lags.set_xlabel("lag (sections)")
+        axes[0, 0].get_figure(root=True).align_ylabels(axes[:, 0])
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
@@ -71,13 +73,14 @@ def amplitude(
     *,
     misfit: float | None = None,
     labels: Mapping[str, str] | None = None,
-    ax: Axes | None = None,
-) -> Axes:
+    ax: AxesLike | None = None,
+) -> Plot:
     """The misfit of a linear model against the amplitude of the input, on logarithmic axes.
 
     **Arguments:** `misfit`: one that is allowed; the amplitude up to which it is kept is marked.
     """
-    with axes_or_new(ax) as ax:
+    with panels(ax) as axes:
+        ax = axes[0, 0]
         for i, name in enumerate(sweep.outputs):
             line = dict(marker="o", color=CYCLE[i % len(CYCLE)], label=label_of(name, labels))
             ax.loglog(sweep.amplitudes, sweep.misfit[:, i], **line)
@@ -90,4 +93,4 @@ def amplitude(
         ax.set_xlabel("amplitude of the input")
         ax.set_ylabel("misfit / output (rms)")
         ax.legend()
-    return ax
+    return Plot(axes)

@@ -4,14 +4,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
 from ..identify.rational.fit import RationalFit
 from ..linear.htf import HTF
-from .look import COLORS, COLUMN, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
 Fit = RationalFit | StructuredFit
@@ -27,8 +26,8 @@ def magnitude(
     harmonics: Sequence[int] = (0, 1, -1),
     decades: int | float = 5,
     labels: Mapping[str, str] | None = None,
-    ax: Axes | None = None,
-) -> Axes:
+    ax: AxesLike | None = None,
+) -> Plot:
     """|H_m| of one output against the input frequency, on a logarithmic scale.
 
     One color per |m|, dashed for negative m. Exact HTFs lie as broad pale lines under the
@@ -42,7 +41,8 @@ def magnitude(
     """
     if not htfs:
         raise DefinitionError("there is no HTF to draw.")
-    with axes_or_new(ax, height=2.2) as ax:
+    with panels(ax, height=2.2) as axes:
+        ax = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
             i, j = _index(htf.outputs, output), _index(htf.inputs, input)
             f, order = _sorted(htf)
@@ -57,7 +57,7 @@ def magnitude(
         top = max(np.nanmax(line.get_ydata()) for line in ax.get_lines())
         ax.set_ylim(top * 10.0**-decades, top * 2)
         _legend(ax, htfs)
-    return ax
+    return Plot(axes)
 
 
 def harmonics(
@@ -67,7 +67,8 @@ def harmonics(
     input: str | int = 0,
     decades: int | float = 5,
     labels: Mapping[str, str] | None = None,
-) -> Figure:
+    ax: AxesLike | None = None,
+) -> Plot:
     """The paper's Fig. 3: |H_m|, one row per output and one column per section family.
 
     **Arguments:** `families`: by name, an HTF or several (estimate and exact), all with the same
@@ -76,11 +77,8 @@ def harmonics(
     """
     columns = _columns(families)
     outputs = columns[0][1][0].outputs
-    with style():
-        figure, axes = new_figure(
-            len(outputs), len(columns), width=_width(columns), height=0.4 + 1.7 * len(outputs),
-            sharex=True, sharey="row",
-        )  # fmt: skip
+    size = {"width": _width(columns), "height": 0.4 + 1.7 * len(outputs)}
+    with panels(ax, len(outputs), len(columns), **size, sharex=True, sharey="row") as axes:
         for i, output in enumerate(outputs):
             limits = []
             for k, (_, htfs) in enumerate(columns):
@@ -94,7 +92,7 @@ def harmonics(
         for k, (family, _) in enumerate(columns):
             axes[0, k].set_title(family)
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 def bode(
@@ -104,8 +102,8 @@ def bode(
     outputs: Sequence[str] | str | None = None,
     input: str | int = 0,
     labels: Mapping[str, str] | None = None,
-    axes: Sequence[Axes] | np.ndarray | None = None,
-) -> Figure:
+    ax: AxesLike | None = None,
+) -> Plot:
     """Magnitude and phase of one harmonic for several outputs, with fits in black on top.
 
     **Arguments:**
@@ -115,24 +113,21 @@ def bode(
       it is known, which it is not where the band reaches down to zero.
     - `fits`: of this harmonic, drawn over the band of the HTFs.
     - `outputs`: names; by default all. One color each.
-    - `axes`: two Axes, for magnitude and phase; by default a new figure.
-
-    **Returns:** the figure.
+    - `ax`: two Axes, for magnitude and phase; by default a new figure.
 
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
     if not htfs:
         raise DefinitionError("there is no HTF to draw.")
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
-    if axes is None:
-        with style():
-            figure, grid = new_figure(2, 1, height=3.4, sharex=True)
-            bode(
-                *htfs, fits=fits, harmonic=harmonic, outputs=outputs, input=input, labels=labels,
-                axes=grid[:, 0],
-            )  # fmt: skip
-            grid[0, 0].set_xlabel("")
-        return figure
+    with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
+        _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
+        if ax is None:
+            axes[0, 0].set_xlabel("")
+    return Plot(axes)
+
+
+def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
     upper, lower = axes
     names = htfs[0].outputs if outputs is None else np.atleast_1d(outputs)
     for number, name in enumerate(names):
@@ -162,7 +157,6 @@ def bode(
     _frequency_limits(lower, f)
     lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
     _legend(upper, htfs)
-    return upper.get_figure(root=True)
 
 
 def bodes(
@@ -172,7 +166,8 @@ def bodes(
     harmonic: int = 0,
     input: str | int = 0,
     labels: Mapping[str, str] | None = None,
-) -> Figure:
+    ax: AxesLike | None = None,
+) -> Plot:
     """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
 
     **Arguments:** `families` and `fits`: by the same names; the others as in `bode`.
@@ -183,20 +178,18 @@ def bodes(
     for name in fits:
         if name not in families:
             raise DefinitionError(f"there are fits of '{name}', but the HTFs are {list(families)}.")
-    with style():
-        figure, axes = new_figure(
-            2, len(columns), width=_width(columns), height=3.4, sharex=True, sharey="row"
-        )
+    size = {"width": _width(columns), "height": 3.4}
+    with panels(ax, 2, len(columns), **size, sharex=True, sharey="row") as axes:
         for k, (family, htfs) in enumerate(columns):
             bode(
                 *htfs, fits=fits.get(family, ()), harmonic=harmonic, input=input, labels=labels,
-                axes=axes[:, k],
+                ax=axes[:, k],
             )  # fmt: skip
             axes[0, k].set_title(family)
-            for ax in axes[:, k]:
-                _tidy(ax, axes)
+            for one in axes[:, k]:
+                _tidy(one, axes)
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 _FIT_NAMES = {RationalFit: "rational fit", StructuredFit: "structured fit"}

@@ -1,8 +1,9 @@
 """One look for all figures: sizes of a two-column paper, colors, fonts; and saving."""
 
 import contextlib
+import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,14 +85,50 @@ def new_figure(
     return figure, axes
 
 
+AxesLike = Axes | np.ndarray | Sequence
+"""Axes to draw on: one, or a grid of them."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Plot:
+    """What every function of `hybridjax.plot` returns: where it has drawn.
+
+    **Fields:** `axes`, the grid of panels, (rows, columns); `figure`, in which they are.
+    """
+
+    axes: np.ndarray
+
+    @property
+    def figure(self) -> Figure:
+        return self.axes[0, 0].get_figure(root=True)
+
+    @property
+    def ax(self) -> Axes:
+        """The first panel, and the only one of many plots."""
+        return self.axes[0, 0]
+
+    def __repr__(self) -> str:
+        rows, columns = self.axes.shape
+        return f"Plot({rows} x {columns} panels)"
+
+
 @contextlib.contextmanager
-def axes_or_new(ax: Axes | None, **options):
-    """`ax` as it is, or new Axes in the package's style."""
-    if ax is not None:
-        yield ax
+def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
+    """The grid of Axes that is given, or a new one in the package's style, (rows, columns).
+
+    **Raises:** `DefinitionError` for another number of Axes.
+    """
+    if ax is None:
+        with style():
+            yield new_figure(rows, columns, **options)[1]
         return
-    with style():
-        yield new_figure(**options)[1][0, 0]
+    axes = np.asarray(ax, dtype=object)
+    if axes.size != rows * columns:
+        raise DefinitionError(
+            f"this plot has {rows} x {columns} panels, but `ax` holds {axes.size}: make as many, "
+            "e.g. by `matplotlib.pyplot.subplots`."
+        )
+    yield axes.reshape(rows, columns)
 
 
 def label_of(name: str, labels: Mapping[str, str] | None) -> str:
@@ -105,18 +142,18 @@ def letters(axes: Any) -> None:
         ax.set_title(letter, loc="left", fontweight="bold")
 
 
-def save(figure: Figure | Axes, path: str | os.PathLike, dpi: int = 150) -> tuple[Path, Path]:
+def save(path: str | os.PathLike, plot: Plot | Figure | Axes, dpi: int = 150) -> tuple[Path, Path]:
     """Write a figure as PNG and as PDF.
 
-    **Arguments:** `figure`, or some Axes of it; `path` without suffix (one of `.png`, `.pdf` is
-    dropped); `dpi` of the PNG.
+    **Arguments:** `path` without suffix (one of `.png`, `.pdf` is dropped); `plot`, or any figure
+    or Axes of matplotlib; `dpi` of the PNG.
 
     **Returns:** the paths of the PNG and of the PDF.
 
     **Raises:** `DefinitionError` if they cannot be written.
     """
-    if isinstance(figure, Axes):
-        figure = figure.get_figure(root=True)
+    figure = plot.get_figure(root=True) if isinstance(plot, Axes) else plot
+    figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix in (".png", ".pdf"):
         path = path.with_suffix("")

@@ -12,7 +12,7 @@ from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
-from .look import COLORS, axes_or_new, label_of
+from .look import COLORS, AxesLike, Plot, label_of, panels
 
 
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
@@ -29,8 +29,8 @@ def cycle(
     perturbed: Trajectory | None = None,
     labels: Mapping[str, str] | None = None,
     numbers: int | None = None,
-    ax: Axes | None = None,
-) -> Axes:
+    ax: AxesLike | None = None,
+) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
 
     Events are marked by dots, resets that move the point by dashed lines, sections by short bars:
@@ -55,7 +55,8 @@ def cycle(
         if system is not None and Structure(system).names != s.names:
             raise DefinitionError(f"`{what}` and the cycle belong to different systems.")
     orbit = cycle.trajectory(_TURN)
-    with axes_or_new(ax, height=3.0) as ax:
+    with panels(ax, height=3.0) as axes:
+        ax = axes[0, 0]
         if perturbed is not None:
             pieces = _pieces(perturbed, x, y)
             for _, px, py in pieces:
@@ -81,7 +82,7 @@ def cycle(
         ax.set_xlabel(label_of(x, labels))
         ax.set_ylabel(label_of(y, labels))
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
-    return ax
+    return Plot(axes)
 
 
 def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from ..errors import DefinitionError
@@ -19,11 +18,11 @@ from .look import (
     COLUMN,
     CYCLE,
     PAGE,
-    axes_or_new,
+    AxesLike,
+    Plot,
     label_of,
     letters,
-    new_figure,
-    style,
+    panels,
 )
 
 
@@ -37,8 +36,8 @@ def multipliers(
     *,
     zoom: bool = True,
     labels: Mapping[str, str] | None = None,
-    ax: Axes | None = None,
-) -> Axes:
+    ax: AxesLike | None = None,
+) -> Plot:
     """Floquet multipliers in the unit disc: the true ones as crosses, estimates as open markers.
 
     The legend gives each estimate's largest distance |Δλ| from the true ones, and an inset
@@ -60,7 +59,8 @@ def multipliers(
     series = _series(estimates or {}, labels)
     borders = _borders(estimates or {})
     own = ax is None
-    with axes_or_new(ax, height=3.5 + 0.15 * len(series)) as ax:
+    with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
+        ax = axes[0, 0]
         _unit_circle(ax)
         boxes = [ax]
         far = max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
@@ -85,12 +85,15 @@ def multipliers(
             ax.get_figure(root=True).legend(*shown, loc="outside lower center")
         elif series:
             ax.legend()
-    return ax
+    return Plot(axes)
 
 
 def poles_zeros(
-    fits: Mapping[str, RationalFit], *, labels: Mapping[str, str] | None = None
-) -> Figure:
+    fits: Mapping[str, RationalFit],
+    *,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
     """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
 
     The upper row shows them all, the lower one the surroundings of the poles. A family of
@@ -103,20 +106,19 @@ def poles_zeros(
     if not fits or len({fit.outputs for fit in fits.values()}) != 1:
         raise DefinitionError("poles_zeros needs one or more fits with the same outputs.")
     outputs = next(iter(fits.values())).outputs
-    with style():
-        width = COLUMN if len(outputs) == 1 else PAGE
-        figure, axes = new_figure(2, len(outputs), width=width, height=4.0)
+    width = COLUMN if len(outputs) == 1 else PAGE
+    with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
         for i, output in enumerate(outputs):
             upper, lower = axes[:, i]
-            for ax in (upper, lower):
-                _unit_circle(ax)
+            for panel in (upper, lower):
+                _unit_circle(panel)
                 for k, (family, fit) in enumerate(fits.items()):
                     # Equal ones stay visible: each family is smaller than the one before.
                     line = {"ls": "", "mfc": "none", "ms": 8 - 2.5 * (k % 3), "mew": 1.0}
                     line["color"] = CYCLE[k % len(CYCLE)]
                     p, z = fit.poles[i], fit.zeros[i]
-                    ax.plot(p.real, p.imag, marker="x", label=f"poles, {family}", **line)
-                    ax.plot(z.real, z.imag, marker="o", label=f"zeros, {family}", **line)
+                    panel.plot(p.real, p.imag, marker="x", label=f"poles, {family}", **line)
+                    panel.plot(z.real, z.imag, marker="o", label=f"zeros, {family}", **line)
             poles = np.concatenate([fit.poles[i] for fit in fits.values()])
             zeros = np.concatenate([fit.zeros[i] for fit in fits.values()])
             _limits(lower, *_near(poles, zeros[np.isfinite(zeros)]))
@@ -129,12 +131,12 @@ def poles_zeros(
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
-        figure.legend(
+        axes[0, 0].get_figure(root=True).legend(
             *axes[0, 0].get_legend_handles_labels(), loc="outside upper center",
             ncols=4 if len(outputs) > 1 else 2,
         )  # fmt: skip
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,21 +4,18 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Complex
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify.series.fit import SeriesFit
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase import Phase
 from ..recordings.sampling import SectionData
 from ..recordings.spectra import input_spectrum
-from .look import COLORS, CYCLE, PAGE, axes_or_new, label_of, letters, new_figure, style
+from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
-def phase(found: Phase) -> Figure:
+def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
     """Periods of the cycles, one after the other, and how they are distributed."""
-    with style():
-        figure, axes = new_figure(1, 2, width=PAGE, height=2.2, width_ratios=(3, 1))
+    with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
         left, right = axes[0]
         first = 0
         for k, periods in enumerate(found.periods):
@@ -34,23 +31,24 @@ def phase(found: Phase) -> Figure:
         right.tick_params(labelleft=False)
         right.set(xlabel="cycles")
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
-def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) -> Figure:
+def section_data(
+    data: SectionData, *, labels: Mapping[str, str] | None = None, ax: AxesLike | None = None
+) -> Plot:
     """For each signal the average cycle, the deviations from it, and the input's spectrum.
 
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
     deviation. Right: the power of inputs against frequency, for outputs the deviation from cycle to
     cycle, at the section where it is largest.
     """
-    N = data.sections
+    N = data.n_sections
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     f, power = input_spectrum(data)
     at_phase = np.arange(N) / N
-    with style():
-        figure, axes = new_figure(len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names))
+    with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
         for i, name in enumerate(names):
             average, spread, last = axes[i]
             unit = f" ({data.units[i]})" if data.units[i] else ""
@@ -79,22 +77,25 @@ def section_data(data: SectionData, *, labels: Mapping[str, str] | None = None) 
                 y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]
                 last.plot(np.concatenate(y), lw=0.5, color=CYCLE[1])
                 last.set(xlabel="cycle", ylabel=rf"$\delta$ {label}{unit}")
-        for ax in axes[-1, :2]:
-            ax.set_xlabel("phase (cycles)")
-        figure.align_ylabels(axes)
+        for panel in axes[-1, :2]:
+            panel.set_xlabel("phase (cycles)")
+        axes[0, 0].get_figure(root=True).align_ylabels(axes)
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 def impulse_responses(
-    found: ImpulseResponses, *, input: int = 0, labels: Mapping[str, str] | None = None
-) -> Figure:
+    found: ImpulseResponses,
+    *,
+    input: int = 0,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: some of them with
     bands of 95 %."""
     ny, N = len(found.outputs), len(found.phase)
     chosen = [0, N // 4, N // 2, 3 * N // 4]
-    with style():
-        figure, axes = new_figure(ny, 2, width=PAGE, height=0.4 + 1.9 * ny)
+    with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
             plane, curves = axes[i]
             values = found.values[:, :, i, input]
@@ -103,7 +104,7 @@ def impulse_responses(
                 found.lag, found.phase, values, cmap="RdBu_r", vmin=-top, vmax=top,
                 rasterized=True, shading="nearest",
             )  # fmt: skip
-            figure.colorbar(image, ax=plane, label=label_of(name, labels))
+            plane.get_figure().colorbar(image, ax=plane, label=label_of(name, labels))
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys(chosen)):
                 band = 1.96 * found.errors[m, :, i, input]
@@ -115,18 +116,19 @@ def impulse_responses(
             curves.axhline(0, color="black", lw=0.4)
             curves.set_ylabel(f"{label_of(name, labels)} / impulse")
         axes[0, 1].legend(loc="upper right")
-        for ax in axes[-1]:
-            ax.set_xlabel("time since the push (cycles)")
+        for panel in axes[-1]:
+            panel.set_xlabel("time since the push (cycles)")
         letters(axes)
-    return figure
+    return Plot(axes)
 
 
 def multiplier_regions(
-    fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: Axes | None = None
-) -> Axes:
+    fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: AxesLike | None = None
+) -> Plot:
     """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
     are small; beside them those of plain regression, if given."""
-    with axes_or_new(ax, height=3.4) as ax:
+    with panels(ax, height=3.4) as axes:
+        ax = axes[0, 0]
         circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
         leading = fit.multipliers[0]
         reach = 0.0
@@ -160,4 +162,4 @@ def multiplier_regions(
         ax.set(xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$")
         ax.locator_params(nbins=5)
         ax.legend(loc="upper left")
-    return ax
+    return Plot(axes)

@@ -3,17 +3,20 @@
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from .look import COLORS, COLUMN, CYCLE, label_of, new_figure, style
+from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, label_of, panels
 
 
 def experiment(
-    data: ExperimentData, index: int = 0, *, labels: Mapping[str, str] | None = None
-) -> Figure:
+    data: ExperimentData,
+    index: int = 0,
+    *,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
     """Inputs and deviations of the outputs of one experiment, against time in cycles.
 
     One row per signal; cycles before the window that estimates use are shaded, and a failed
@@ -28,27 +31,25 @@ def experiment(
     time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
     rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
-    with style():
-        figure, axes = new_figure(
-            len(rows), 1, width=COLUMN, height=0.5 + 0.85 * len(rows), sharex=True
-        )
-        for ax, (name, values, is_input) in zip(axes[:, 0], rows, strict=True):
+    size = {"width": COLUMN, "height": 0.5 + 0.85 * len(rows)}
+    with panels(ax, len(rows), 1, **size, sharex=True) as axes:
+        for panel, (name, values, is_input) in zip(axes[:, 0], rows, strict=True):
             if is_input:
-                ax.step(time, values, where="post", lw=0.5, color=COLORS["black"])
+                panel.step(time, values, where="post", lw=0.5, color=COLORS["black"])
             else:
-                ax.plot(time, values, lw=0.5, color=CYCLE[0])
+                panel.plot(time, values, lw=0.5, color=CYCLE[0])
             text = label_of(name, labels)
-            ax.set_ylabel(text if is_input else rf"$\delta$ {text}")
+            panel.set_ylabel(text if is_input else rf"$\delta$ {text}")
             if data.window.start:
-                ax.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
+                panel.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
             if not data.ok[index] and data.failed_at[index] >= 0:
-                ax.axvline(time[data.failed_at[index]], color=COLORS["red"], lw=0.8)
-            ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
-            ax.margins(x=0)
+                panel.axvline(time[data.failed_at[index]], color=COLORS["red"], lw=0.8)
+            panel.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
+            panel.margins(x=0)
         axes[-1, 0].set_xlabel("time (cycles)")
         title = f"experiment {index}"
         if not data.ok[index]:
             title += f": {Result(int(data.result[index])).message}"
         axes[0, 0].set_title(title, wrap=True)
-        figure.align_ylabels()
-    return figure
+        axes[0, 0].get_figure(root=True).align_ylabels(axes)
+    return Plot(axes)

@@ -61,7 +61,7 @@ def impulse_responses(
 
     **Raises:** `DefinitionError` if fit and data have different sections or names.
     """
-    for name in ("sections", "inputs", "outputs"):
+    for name in ("n_sections", "inputs", "outputs"):
         if getattr(fit, name) != getattr(data, name):
             raise DefinitionError(
                 f"fit and data have different {name}: {getattr(fit, name)} and "

@@ -5,7 +5,6 @@ s the paddle's acceleration at the impact (Holmes 1982): all three kinds of poin
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -115,7 +114,7 @@ def test_bad_input(juggling):
 
 
 class Spring(eqx.Module):
-    k: jax.Array = hj.parameter(1.5)
+    k: hj.Parameter = hj.parameter(1.5)
 
 
 class Pushed(hj.HybridSystem):

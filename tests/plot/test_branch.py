@@ -11,7 +11,7 @@ def branch():
 
 
 def test_stable_cycles_have_full_lines(branch):
-    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude (m)"})
+    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude (m)"}).ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v")
     lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
     fold, flip = branch.points

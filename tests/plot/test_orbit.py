@@ -14,7 +14,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     perturbed = hj.simulate(hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0]))
     ax = hj.plot.cycle(
         hopper_cycle, sections=placed_kinematic, perturbed=perturbed, labels={"yM": "$y_M$ (m)"}
-    )
+    ).ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y_M$ (m)", "vM")
     lines = labeled(ax)
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
@@ -31,7 +31,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
 
 
 def test_chart_colours_meet_at_the_events(hopper_cycle):
-    ax = hj.plot.cycle(hopper_cycle)
+    ax = hj.plot.cycle(hopper_cycle).ax
     liftoff = hopper_cycle.trajectory().events[0].before
     lines = labeled(ax)
     np.testing.assert_allclose(lines["flight"].get_xydata()[0], [liftoff["yM"], liftoff["vM"]])
@@ -39,7 +39,7 @@ def test_chart_colours_meet_at_the_events(hopper_cycle):
 
 
 def test_resets_that_jump_are_dashed(hopper_cycle):
-    ax = hj.plot.cycle(hopper_cycle, "ym", "vm")
+    ax = hj.plot.cycle(hopper_cycle, "ym", "vm").ax
     (jump,) = [x for x in ax.get_lines() if x.get_linestyle() == "--"]
     touchdown = hopper_cycle.trajectory().events[1].before
     np.testing.assert_allclose(jump.get_xydata(), [[0, touchdown["vm"]], [0, 0]], atol=1e-12)
@@ -47,7 +47,7 @@ def test_resets_that_jump_are_dashed(hopper_cycle):
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     placed = hj.place_sections(vanderpol_cycle, hj.ClockPhase(6))
-    ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed, numbers=0)
+    ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed, numbers=0).ax
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x") and not ax.texts
     bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
     np.testing.assert_allclose(bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9)

@@ -21,7 +21,7 @@ def texts(ax):
 
 
 def test_magnitude_draws_the_values(estimate, exact):
-    ax = hj.plot.magnitude(estimate, exact, output="vM")
+    ax = hj.plot.magnitude(estimate, exact, output="vM").ax
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
@@ -35,21 +35,21 @@ def test_magnitude_draws_the_values(estimate, exact):
 
 def test_exact_lies_under_the_estimate_in_any_order(estimate, exact):
     for htfs in ((estimate, exact), (exact, estimate)):
-        ax = hj.plot.magnitude(*htfs, harmonics=(0,))
+        ax = hj.plot.magnitude(*htfs, harmonics=(0,)).ax
         wide, thin = (x for x in ax.get_lines() if len(x.get_xdata()))
         assert wide.get_zorder() < thin.get_zorder() and wide.get_linewidth() > 2
         np.testing.assert_array_equal(thin.get_ydata(), np.abs(estimate[0][:, 0, 0]))
 
 
 def test_only_exact(exact):
-    assert "exact" in labeled(hj.plot.magnitude(exact))
+    assert "exact" in labeled(hj.plot.magnitude(exact).ax)
     hj.plot.bode(exact)
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
     figure = hj.plot.harmonics(
         {"isochron": (estimate, exact), "again": exact}, labels={"vM": r"$\dot y_M$"}
-    )
+    ).figure
     assert isinstance(figure, Figure)
     grid = np.reshape(figure.axes, (2, 2))
     assert [ax.get_title() for ax in grid[0]] == ["isochron", "again"]
@@ -60,7 +60,7 @@ def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
 
 
 def test_bode_with_fits(estimate, exact, rational, structured):
-    figure = hj.plot.bode(estimate, exact, fits=[rational, structured])
+    figure = hj.plot.bode(estimate, exact, fits=[rational, structured]).figure
     upper, lower = figure.axes
     assert list(labeled(upper)) == ["yM", "vM", "rational fit", "structured fit", "exact"]
     assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
@@ -73,7 +73,7 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 
 
 def test_bode_of_another_harmonic_and_one_output(estimate, structured, rational):
-    figure = hj.plot.bode(estimate, fits=structured, harmonic=-1, outputs="vM")
+    figure = hj.plot.bode(estimate, fits=structured, harmonic=-1, outputs="vM").figure
     assert list(labeled(figure.axes[0])) == ["vM", "structured fit"]
     with pytest.raises(hj.DefinitionError, match="the rational fit is of H_0, not of H_1"):
         hj.plot.bode(estimate, fits=rational, harmonic=1)
@@ -81,7 +81,7 @@ def test_bode_of_another_harmonic_and_one_output(estimate, structured, rational)
 
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
-    figure = hj.plot.bodes(families, fits={"b": rational})
+    figure = hj.plot.bodes(families, fits={"b": rational}).figure
     assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
     with pytest.raises(hj.DefinitionError, match="fits of 'c', but the HTFs are"):
         hj.plot.bodes(families, fits={"c": rational})
@@ -91,9 +91,9 @@ def test_on_given_axes_nothing_else_is_made(estimate):
     with hj.plot.style():
         figure = Figure()
         axes = figure.subplots(2, 2)
-    assert hj.plot.magnitude(estimate, ax=axes[0, 0]) is axes[0, 0]
-    assert hj.plot.bode(estimate, axes=axes[:, 1]) is figure
-    assert hj.plot.multipliers([0.5], ax=axes[1, 0]) is axes[1, 0]
+    assert hj.plot.magnitude(estimate, ax=axes[0, 0]).ax is axes[0, 0]
+    assert hj.plot.bode(estimate, ax=axes[:, 1]).figure is figure
+    assert hj.plot.multipliers([0.5], ax=axes[1, 0]).ax is axes[1, 0]
     assert matplotlib.pyplot.get_fignums() == []
 
 
@@ -121,7 +121,7 @@ def test_bad_input_of_transfer_functions(estimate, hopper):
 
 
 def test_multipliers(hopper, rational, structured):
-    ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured})
+    ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured}).ax
     lines = labeled(ax)
     assert [name.split(":")[0] for name in lines] == ["exact", "2p1z, yM", "2p1z, vM", "structured"]
     z = hopper.multipliers()
@@ -137,9 +137,9 @@ def test_multipliers(hopper, rational, structured):
 
 
 def test_multipliers_outside_the_disc_and_without_estimates():
-    ax = hj.plot.multipliers([3.0, 0.5])
+    ax = hj.plot.multipliers([3.0, 0.5]).ax
     assert ax.get_xlim()[1] > 3 and not ax.child_axes
-    ax = hj.plot.multipliers([1.5], {"same": [1.5]})
+    ax = hj.plot.multipliers([1.5], {"same": [1.5]}).ax
     assert "= 0" in list(labeled(ax))[1]
 
 
@@ -151,7 +151,7 @@ def test_multipliers_of_nothing(bad):
 
 def test_poles_and_zeros(rational):
     moved = eqx.tree_at(lambda fit: fit.zeros, rational, np.array([[np.nan + 0j], [0.9 + 0j]]))
-    figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved})
+    figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved}).figure
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
         poles = labeled(ax)["poles, isochron"].get_xydata()
@@ -169,7 +169,7 @@ def test_experiment(hopper):
     data = hj.experiments.simulate_experiments(
         hopper, hj.multisine(periods=4, band=(0, 2.0)), discard=2
     )
-    figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"})
+    figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"}).figure
     assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ $y_M$", r"$\delta$ vM"]
     y = figure.axes[2].get_lines()[0]
     np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
@@ -190,7 +190,7 @@ def test_failed_experiment():
         result=[hj.Result.GRAZING],
         simulated=hj.experiments.Simulated(np.array([5])),
     )
-    figure = hj.plot.experiment(data)
+    figure = hj.plot.experiment(data).figure
     assert "grazing" in figure.axes[0].get_title()
     assert figure.axes[0].get_lines()[1].get_xdata()[0] == 2.5
 
@@ -199,15 +199,15 @@ def test_failed_experiment():
 
 
 def test_saved_as_png_and_pdf(tmp_path):
-    ax = hj.plot.multipliers([0.5])
-    png, pdf = hj.plot.save(ax, tmp_path / "multipliers.png")
+    plot = hj.plot.multipliers([0.5])
+    png, pdf = hj.plot.save(tmp_path / "multipliers.png", plot)
     assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
     assert {p.name for p in tmp_path.iterdir()} == {"multipliers.png", "multipliers.pdf"}
-    again = hj.plot.save(ax.get_figure(), str(tmp_path / "v1.0"))
+    again = hj.plot.save(str(tmp_path / "v1.0"), plot.figure)
     assert [p.name for p in again] == ["v1.0.png", "v1.0.pdf"]
-    assert isinstance(ax.get_figure().get_layout_engine(), ConstrainedLayoutEngine)
+    assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
-        hj.plot.save(ax, tmp_path / "absent" / "x")
+        hj.plot.save(tmp_path / "absent" / "x", plot.ax)
 
 
 def test_global_settings_stay(estimate):
@@ -224,12 +224,12 @@ def test_bands_hold_the_values(estimate):
         estimate.f, estimate.H, estimate.harmonics, estimate.n_sections, estimate.inputs,
         estimate.outputs, variance=np.full(estimate.H.shape, 1e-6),
     )  # fmt: skip
-    assert not hj.plot.magnitude(estimate).collections
-    ax = hj.plot.magnitude(sure, harmonics=(0,))
+    assert not hj.plot.magnitude(estimate).ax.collections
+    ax = hj.plot.magnitude(sure, harmonics=(0,)).ax
     radius = float(sure.confidence_radius().max())
     top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
     np.testing.assert_allclose(top, np.abs(sure[0][:, 0, 0]).max() + radius)
-    upper, lower = hj.plot.bode(sure, outputs="yM").axes
+    upper, lower = hj.plot.bode(sure, outputs="yM").axes[:, 0]
     known = np.isfinite(lower.get_lines()[0].get_ydata())
     np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
     assert len(upper.collections) == len(lower.collections) == 1

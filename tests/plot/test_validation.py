@@ -13,7 +13,7 @@ def found(hopper):
 
 
 def test_validation_draws_signals_and_correlations(found):
-    figure = hj.plot.validation(found, cycles=2, labels={"vM": "speed"})
+    figure = hj.plot.validation(found, cycles=2, labels={"vM": "speed"}).figure
     grid = np.reshape(figure.axes, (2, 3))
     simulated, measured = grid[1, 0].get_lines()
     np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
@@ -31,7 +31,7 @@ def test_amplitude_marks_the_limit():
         np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
         ("u",), ("y",),
     )  # fmt: skip
-    ax = hj.plot.amplitude(sweep, misfit=1e-2)
+    ax = hj.plot.amplitude(sweep, misfit=1e-2).ax
     assert [line.get_label() for line in ax.get_lines()][0] == "y"
     assert ax.get_lines()[-1].get_xdata()[0] == pytest.approx(10**-0.5)
     assert ax.get_lines()[1].get_xdata()[0] == 1.0
@@ -41,7 +41,7 @@ def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers()
     c = np.poly(true).real[1:]
     estimate = hj.identify.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
-    ax = hj.plot.multipliers(hopper, {"fit": estimate})
+    ax = hj.plot.multipliers(hopper, {"fit": estimate}).ax
     (inset,) = ax.child_axes
     drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]
     np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))

@@ -22,7 +22,7 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
     """At the sections of an angle of the two outputs, these are one number."""
     noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
     apex = hj.recordings.CrossingPhase("vM", "falling")
     data = [hj.recordings.section_data(noisy, phase, **options) for phase in (angle, apex)]
     fits = [hj.fit_series(x.records, order=2) for x in data]
@@ -107,7 +107,7 @@ def test_compass_gait_by_events():
 @pytest.mark.slow
 def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
     """Against the exact linearization, averaged over the push."""
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
     data = hj.recordings.section_data(hopper_recording, angle, **options)
     fit = hj.fit_series(data.records, order=2)
     found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
@@ -129,7 +129,7 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
 
 def test_order_and_advice(hopper_recording, angle):
     noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-3)
-    options = {"inputs": "u", "outputs": ("yM", "vM"), "sections": 16}
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
     data = hj.recordings.section_data(noisy, angle, **options)
     fit = hj.fit_series(data.records, order=2)
     advice = hj.recordings.advise(data, fit)

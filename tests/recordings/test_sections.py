@@ -17,7 +17,7 @@ CIRCLE = hj.recordings.AnglePhase("x", "v", center=(0, 0), scale=(1, 1))
 
 
 def sample(recording, phase=CIRCLE, **options):
-    options = {"inputs": "f", "outputs": ("x", "v"), "sections": 8} | options
+    options = {"inputs": "f", "outputs": ("x", "v"), "n_sections": 8} | options
     return hj.recordings.section_data(recording, phase, **options)
 
 
@@ -78,7 +78,7 @@ def test_times_of_crossings(wave):
 def test_bad_arguments(wave):
     for options, message in [
         ({"inputs": "g"}, "no signal 'g'"),
-        ({"sections": 0}, "one section or more"),
+        ({"n_sections": 0}, "one section or more"),
         ({"drift": 1}, "more than four cycles"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):

@@ -46,7 +46,7 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: int | None = None) -> Mult
     **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
     few frequencies to find the multipliers at all.
     """
-    for name in ("sections", "inputs", "outputs"):
+    for name in ("n_sections", "inputs", "outputs"):
         if getattr(model, name) != getattr(htf, name):
             raise DefinitionError(
                 f"model and HTFs have different {name}: {getattr(model, name)} and "

@@ -155,7 +155,7 @@ def validate(
 
 
 def check_model(model: LDTP | SeriesFit, N: int, inputs, outputs) -> None:
-    of_data = {"sections": N, "inputs": inputs, "outputs": outputs}
+    of_data = {"n_sections": N, "inputs": inputs, "outputs": outputs}
     for name, value in of_data.items():
         if getattr(model, name) != value:
             raise DefinitionError(
