@@ -15,6 +15,7 @@ from peers.contest import Seconds, measure
 import hybridjax as hj
 from hybridjax.experiments.campaign import _FLOW, prepare
 from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.options import Options
 
 
 MODELS = {"hopper": hj.models.VerticalHopper, "bar": hj.models.TwoLeggedBar}
@@ -78,9 +79,8 @@ class Problem:
 
     def response(self, accuracy: float = 1e-9) -> tuple:
         """Arguments of `program`: what `run` gives to it."""
-        campaign = prepare(
-            self.cycle, self.placed, self.u, self.outputs, discard=0, accuracy=accuracy
-        )
+        options = Options(discard=0, accuracy=accuracy)
+        campaign = prepare(self.cycle, self.placed, self.u, self.outputs, options)
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
         start = jnp.repeat(start, len(self.u), axis=1)

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ from .events import EventTimes, in_order
 from .flow_batch import EventLog, flow_batch, observe
 from .inputs import DISCARD, DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
+from .options import Options
 from .start import CycleStart, Start, SteadyStart, predict_start
 from .steady import settle_batch
 from .stepping.plan import ACCURACY, Plan, Stepping, plan_flow
@@ -164,27 +164,19 @@ def prepare(
     sections,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
-    *,
-    start: Literal["cycle", "periodic", "steady"] = "cycle",
-    discard: int | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: float | None = None,
-    record_events: bool = False,
-    execution: Execution | None = None,
+    options: Options,
     chunk: int | None = None,
 ) -> Campaign:
     """Check what `run_experiments` was given, and do what is done once for all experiments.
 
-    These are its ten arguments, so that all ways to run experiments take the same, and `chunk`: how
-    many of them are run together; by default all.
+    `chunk`: how many of them are run together; by default all.
     """
     placed = as_placed(cycle, sections)
     require_x64(cycle)
     z = Structure(cycle.system).resolve_outputs(outputs)
-    if start not in ("cycle", "periodic", "steady"):
-        raise DefinitionError(f"start is 'cycle', 'periodic' or 'steady', not {start!r}.")
-    _require_return(placed)
-    execution = Execution() if execution is None else execution
+    _require_return(cycle, placed)
+    start, discard, accuracy = options.start, options.discard, options.accuracy
+    execution = Execution() if options.execution is None else options.execution
     accuracy = ACCURACY[execution.precision] if accuracy is None else float(accuracy)
     discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
@@ -207,8 +199,9 @@ def prepare(
         if start == "steady":
             begin = SteadyStart(begin, stepping, execution, _SETTLE[small])
     return Campaign(
-        placed, z, inputs, begin, process_noise, stepping, _FLOW[small], record_events, execution
-    )
+        placed, z, inputs, begin, options.process_noise, stepping, _FLOW[small],
+        options.record_events, execution,
+    )  # fmt: skip
 
 
 def chunks(count: int, chunk: int) -> list[slice]:
@@ -221,9 +214,8 @@ def chunks(count: int, chunk: int) -> list[slice]:
     return [slice(k, min(k + chunk, count)) for k in range(0, count, chunk)]
 
 
-def _require_return(placed: PlacedSections) -> None:
+def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
     """Refuse cycles that experiments would leave."""
-    cycle = placed.cycle
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
             f"clock sections sample {type(cycle.system).__name__}, which has no clock, at fixed "

@@ -1,7 +1,7 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, TypedDict, Unpack
+from typing import Unpack
 
 from tqdm import tqdm
 
@@ -12,21 +12,11 @@ from .campaign import chunks, prepare
 from .data import ExperimentData
 from .inputs import DesignLike
 from .noise import ProcessNoise
+from .options import Options, OptionsByName, Start
 
 
 # Experiments in one part of a stream. Twice as many need twice the memory.
 CHUNK = 640
-
-
-class Options(TypedDict, total=False):
-    """What `run_experiments` takes by name."""
-
-    start: Literal["cycle", "periodic", "steady"]
-    discard: int | None
-    process_noise: ProcessNoise | None
-    accuracy: float | None
-    record_events: bool
-    execution: Execution | None
 
 
 def run_experiments(
@@ -35,7 +25,7 @@ def run_experiments(
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    start: Literal["cycle", "periodic", "steady"] = "cycle",
+    start: Start = "cycle",
     discard: int | None = None,
     process_noise: ProcessNoise | None = None,
     accuracy: float | None = None,
@@ -73,11 +63,8 @@ def run_experiments(
     single precision cannot give; `ComputationError` for an unstable cycle, from which any
     experiment would run away, and where a steady start is not found.
     """
-    campaign = prepare(
-        cycle, sections, design, outputs, start=start, discard=discard,
-        process_noise=process_noise, accuracy=accuracy, record_events=record_events,
-        execution=execution,
-    )  # fmt: skip
+    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    campaign = prepare(cycle, sections, design, outputs, options)
     return campaign.run(progress=campaign.execution.progress)
 
 
@@ -88,7 +75,7 @@ def stream_experiments(
     outputs: Sequence[str | Output] | str | Output,
     *,
     chunk: int = CHUNK,
-    **options: Unpack[Options],
+    **options: Unpack[OptionsByName],
 ) -> Iterator[ExperimentData]:
     """Run experiments chunk by chunk, in memory that does not depend on their number.
 
@@ -104,6 +91,6 @@ def stream_experiments(
 
     **Raises:** as `run_experiments`; for arguments that do not fit together at once.
     """
-    campaign = prepare(cycle, sections, design, outputs, chunk=chunk, **options)
+    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
     parts = chunks(len(campaign.inputs), chunk)
     return map(campaign.run, tqdm(parts, "chunks", disable=not campaign.execution.progress))

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,19 +16,17 @@ from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
+from . import options
 from .batches import in_batches
 from .steady import Prediction
 from .stepping.plan import Stepping
-
-
-StartName = Literal["cycle", "periodic", "steady"]
 
 
 @dataclasses.dataclass(frozen=True)
 class CycleStart:
     """All experiments start on the limit cycle."""
 
-    name: ClassVar[StartName] = "cycle"
+    name: ClassVar[options.Start] = "cycle"
     placed: PlacedSections
 
     def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
@@ -46,7 +44,7 @@ class PeriodicStart:
     **Fields:** `model`, the linearization at `placed`; `periods` of the window that repeats.
     """
 
-    name: ClassVar[StartName] = "periodic"
+    name: ClassVar[options.Start] = "periodic"
     placed: PlacedSections
     model: LDTP
     periods: int
@@ -69,7 +67,7 @@ class SteadyStart:
     **Fields:** `program`, `settle_batch` compiled; `stepping` and `execution`, how it is run.
     """
 
-    name: ClassVar[StartName] = "steady"
+    name: ClassVar[options.Start] = "steady"
     predicted: PeriodicStart
     stepping: Stepping
     execution: Execution

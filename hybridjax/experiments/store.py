@@ -27,7 +27,8 @@ from .campaign import Campaign, chunks, prepare
 from .data import ExperimentData, summary
 from .design.design import Design
 from .inputs import DesignLike
-from .run import CHUNK, Options
+from .options import Options, OptionsByName
+from .run import CHUNK
 
 
 _MANIFEST = "experiments.json"
@@ -46,7 +47,7 @@ def store_experiments(
     *,
     chunk: int = CHUNK,
     share: tuple[int, int] = (0, 1),
-    **options: Unpack[Options],
+    **options: Unpack[OptionsByName],
 ) -> "StoredExperiments":
     """Run experiments and write them to a folder, in memory that does not depend on their number.
 
@@ -69,7 +70,7 @@ def store_experiments(
     rank, size = share
     if not 0 <= rank < size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
-    campaign = prepare(cycle, sections, design, outputs, chunk=chunk, **options)
+    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
     parts = chunks(len(campaign.inputs), chunk)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
