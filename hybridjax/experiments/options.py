@@ -18,7 +18,7 @@ class Options:
     **Raises:** `DefinitionError` for another start.
     """
 
-    start: Start = "cycle"
+    start: str = "cycle"  # one of `Start`, as is checked here
     discard: int | None = None
     process_noise: ProcessNoise | None = None
     accuracy: float | None = None

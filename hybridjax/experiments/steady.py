@@ -38,7 +38,7 @@ def settle(
     step: Callable[[Float[Array, "m S"]], tuple[Float[Array, "m S"], Array | None]],
     start: Float[Array, "m S"],
     size: Float[Array, "m #S"],
-    accuracy: float,
+    accuracy: float | Float[Array, ""],
     slope: Float[Array, "S m m"] | None = None,
 ) -> Settled:
     """Newton's method for all experiments side by side, until no step is larger than `accuracy`

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments import steady
+
+from ..conftest import no_compilation
 
 
 SECTIONS = hj.KinematicPhase(4, position="x", velocity="v")
@@ -37,6 +40,35 @@ def test_experiments_start_in_their_periodic_response(vanderpol_cycle):
         )
         transient = np.abs(data.y[:, :n] - data.y[:, n:]).max()
         assert least <= transient < most
+
+
+@pytest.mark.parametrize("start", ["periodic", "steady"])
+def test_calls_that_are_repeated_compile_nothing(vanderpol_cycle, start):
+    def run(seed):
+        design = hj.multisine(4, 3, (0, 1.2), 0.05, seed)
+        call = vanderpol_cycle, placed, design, ("x", "v")
+        return hj.run_experiments(*call, start=start, execution=ALONE)
+
+    placed = hj.place_sections(vanderpol_cycle, SECTIONS)
+    run(1)
+    with no_compilation():
+        run(2)
+
+
+def test_linear_experiments_that_are_repeated_compile_nothing():
+    A = 0.3 * np.random.default_rng(0).normal(size=(4, 2, 2))
+    model = hj.LDTP(A, np.ones((4, 2, 1)), np.ones((4, 1, 2)))
+    simulate = hj.experiments.simulate_experiments
+    simulate(model, DESIGN, start="periodic")
+    with no_compilation():
+        simulate(model, DESIGN.realizations(1, seed=3), start="periodic")
+
+
+def test_a_steady_start_that_is_not_there_is_named(vanderpol_cycle, monkeypatch):
+    monkeypatch.setattr(steady, "MOST_STEPS", 1)
+    u = np.tile(DESIGN.inputs()[:1], (3, 1, 1)) * np.array([0.0, 1.0, 0.0])[:, None, None]
+    with pytest.raises(hj.ComputationError, match="experiment 1: no periodic response was found"):
+        hj.run_experiments(vanderpol_cycle, SECTIONS, u, "x", start="steady", execution=ALONE)
 
 
 @pytest.mark.slow
