@@ -18,7 +18,7 @@ from ._core.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
 from .apps.recording_report import write_report as write_report
-from .engine.move import Settings as Settings
+from .engine.settings import Settings as Settings
 from .engine.trajectory import Trajectory as Trajectory, simulate as simulate
 from .errors import (
     ComputationError as ComputationError,

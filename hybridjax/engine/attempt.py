@@ -4,32 +4,40 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.precision import at_precision
 from ..systems.structure import Structure
 from .aim import Aim
 from .events import width
 from .hermite import NEAR, control_points, root_near_end
-from .lanes import Lanes, for_each_chart, only
+from .lanes import for_each_chart, only
 from .solver.step import Step, rk_step
-from .target import Target
-from .watch import Watch, chart_field, nothing, pick, settle, take, values, watched, write
+from .state import State, Task
+from .watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 
 
-# A crossing slower than this fraction of the function's rate elsewhere in the step is a grazing.
+# A crossing slower than this part of the function's rate elsewhere in the step is a grazing. Twice
+# as much calls crossings grazing whose times are still right to five digits.
 SLOW = 1e-5
 # A step is too long for a watched function if halfway its cubic interpolant misses it by more than
-# this fraction of its size.
+# this part of its size. Twice as much makes fewer steps, and misses the narrower dips.
 _BEND = 2e-3
-# A lane lands if its crossing is nearer to the end of the step than this fraction of its length,
-_SHORT = 0.25
-# and if the last correction is at most this fraction of the way from the step's start.
-_FINE = 1e-6
-# or at most this fraction of the time allowed, in double and in single precision.
-_HERE = 1e-14, 5e-6
+# A lane lands if its crossing is nearer to the end of the step than this part of its length,
+# measured from where the zero was thought to be. Twice as much asks a method of order 4 to go
+# further, so that more landings are rejected as too rough.
+_LANDING_REACH = 0.25
+# It lands if the last correction is at most this part of the way from the step's start, or that of
+# the time allowed (in double and in single precision). Corrections square their error: twice as
+# much still leaves a crossing right to 1e-11 of the way, of which a replay makes rounding errors.
+_LAST_CORRECTION = 1e-6
+_LAST_CORRECTION_OF_SPAN = 1e-14, 5e-6
+# From the end of a step that is at most this part of the one in which the zero was seen, the cubic
+# between its ends is a worse guess of the zero than Newton's. Twice as much: hardly a difference.
+_SHORT_STEP = 1e-3
 # The error of a derivative is seen by a step that starts aside, by this part of the state's size in
-# a direction that no system is made for.
+# a direction that no system is made for. Twice as much: less rounding, more of second derivatives.
 _ASIDE = 1e-4
 
 
@@ -57,109 +65,104 @@ class Attempt(NamedTuple):
 
 
 class _Home(NamedTuple):
-    q: Array
-    f: Array
-    past: Array
-    lands: Array
-    rough: Array
+    """Where lanes are after they tried to land."""
+
+    q: Float[Array, "n L"]
+    f: Float[Array, "n L"]
+    past: Float[Array, " L"]
+    lands: Bool[Array, " L"]
+    rough: Float[Array, " L"]
+    """Error of the way from the step's end to the zero, relative to the tolerance."""
 
 
 def attempt(
     s: Structure,
-    lanes: Lanes,
-    seen: Watch,
-    ready: Bool[Array, "W L"],
-    mask: Bool[Array, " L"],
+    state: State,
     aim: Aim,
-    u: Float[Array, "nu L"],
-    target: Target,
-    rtol: Float[Array, "*#L"],
-    atol: Float[Array, "*#L"],
-    span: Float[Array, " L"],
+    task: Task,
+    *,
     unroll: bool,
     in_step: bool,
     tangents: Bool[Array, ""] | bool,
 ) -> Attempt:
-    """Let the lanes of `mask` step, and land those that come close to the zero they aim at.
+    """Let the active lanes step, and land those that come close to the zero they aim at.
 
     With `in_step`, all lanes are thought to go equally far from the same time, to no zero; then
     what depends on time only is computed once. With `tangents`, errors are also those of a
     derivative: where the state rests, it has none of its own.
     """
-    L = lanes.t.shape[0]
+    lanes, ready, L = state.lanes, state.ready, state.lanes.t.shape[0]
     zero, no, yes = jnp.zeros(L), jnp.zeros(L, bool), jnp.ones(L, bool)
     empty = Attempt(lanes.q, nothing(s, L), zero, zero, no, no, no, yes)
 
     def work(a, here, out):
         n = s.dims[a]
-        t, q, uu = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
+        flow = chart_flow(s, a, here, task.u, task.target)
+        t, q = only(here, lanes.t), only(here, lanes.q[:n])
         tau = jnp.where(here, aim.step, 0.0)
         if in_step:
             t, tau = t[:1], aim.step[jnp.argmax(here)][None]
+        # (A branch of its own, lest XLA masks the states again in every stage.)
         some = here.any()
         step = jax.lax.cond(
             some,
-            lambda: rk_step(chart_field(s, a, uu), t, q, tau, unroll),
+            lambda: rk_step(flow.field, t, q, tau, unroll),
             lambda: Step(q, q, q, q),
         )
-        tolerance = atol + rtol * jnp.maximum(jnp.abs(q), jnp.abs(step.q))
+        size = task.settings.size(a, q, step.q)
+        tolerance = task.settings.tolerance(size, q, tau, step)
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * jnp.cos(1.0 + jnp.arange(n))[:, None] * tolerance / rtol
-            field = chart_field(s, a, uu)
+            aside = _ASIDE * size
+            direction = np.cos(1.0 + np.arange(n))[:, None]
             near = jax.lax.cond(
                 some & tangents,
-                lambda: rk_step(field, t, q + aside, tau, unroll).error,
+                lambda: rk_step(flow.field, t, q + aside * direction, tau, unroll).error,
                 lambda: step.error,
             )
-            change = jnp.max(jnp.abs(near - step.error) / tolerance, axis=0, initial=0.0) / _ASIDE
+            change = jnp.abs(near - step.error) / (task.settings.rtol * aside)
+            change = jnp.max(change, axis=0, initial=0.0)
             error = jnp.maximum(error, jnp.where(jnp.isfinite(change), change, 0.0))
         finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
         error = jnp.where(finite, error, jnp.inf)
-        if not watched(s, a, target):
+        rows = flow.rows
+        if not rows:
             end = jnp.where(here, step.q, out.q[:n])
             return out._replace(q=out.q.at[:n].set(end), error=jnp.where(here, error, out.error))
 
-        rows = watched(s, a, target)
-        before = take(seen, rows)
-        index, which = only(here, target.index), jnp.where(here, aim.which, -1)
-        go = t, uu, index, tau, aim.reach, span
-        home = _Home(step.q, step.f1, zero, no, zero)
-        moved = tau
+        before, which = take(state.seen, rows), jnp.where(here, aim.which, -1)
+        home, moved = _Home(step.q, step.f1, zero, no, zero), tau
         if not in_step:
             home = jax.lax.cond(
                 (which >= 0).any(),
-                lambda: _go_home(s, a, target, rows, before, which, step, tolerance, *go),
+                lambda: _go_home(flow, before, which, step, tolerance, t, tau, aim.reach, task),
                 lambda: home,
             )
             moved = tau + jnp.where(home.lands, home.past, 0.0)
-        value, rate = jax.lax.cond(
-            some,
-            lambda: values(s, a, target, t + moved, home.q, uu, index, home.f),
-            lambda: before,
-        )
-        ends = before[0], value, moved * before[1], moved * rate
+        after = jax.lax.cond(some, lambda: flow.watch(t + moved, home.q, home.f), lambda: before)
+        ends = before.value, after.value, moved * before.rate, moved * after.rate
 
         middle = 0.5 * (q + home.q) + 0.125 * moved * (step.f0 - home.f)
-        true, _ = values(s, a, target, t + 0.5 * moved, middle, uu, index, home.f)
+        true = flow.watch(t + 0.5 * moved, middle, home.f).value
         cubic = 0.5 * (ends[0] + ends[1]) + 0.125 * (ends[2] - ends[3])
         size = jnp.abs(ends[0]) + jnp.abs(ends[1]) + jnp.abs(true)
-        rounding = width(t, span, jnp.maximum(jnp.abs(before[1]), jnp.abs(rate)))
-        bent = (jnp.abs(true - cubic) > _BEND * size + rounding).any(axis=0)
+        fastest = jnp.maximum(jnp.abs(before.rate), jnp.abs(after.rate))
+        bent = jnp.abs(true - cubic) > _BEND * size + width(t, task.span, fastest)
+        bent = bent.any(axis=0)
 
         points = control_points(*ends)
         low = jnp.minimum(jnp.minimum(points[0], points[1]), jnp.minimum(points[2], points[3]))
         high = jnp.maximum(jnp.maximum(points[0], points[1]), jnp.maximum(points[2], points[3]))
         scale = jnp.maximum(jnp.abs(ends[0]), jnp.abs(ends[1]))
-        own = (jnp.array(rows)[:, None] == which) & home.lands
+        own = (np.array(rows)[:, None] == which) & home.lands
         armed = jnp.stack([ready[row] for row in rows])
         far = jnp.where(armed, low > NEAR * scale, high <= 0)
         fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
         # (By rounding, the zero may lie a little before the start.)
-        slow = (own & (jnp.abs(moved) * rate > -SLOW * fastest)).any(axis=0)
+        slow = (own & (jnp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
         return Attempt(
             out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
-            write(out.seen, rows, here, Watch(value, rate)),
+            write(out.seen, rows, here, after),
             jnp.where(here, error + home.rough, out.error),
             jnp.where(here, home.past, out.past),
             jnp.where(here, home.lands, out.lands),
@@ -168,26 +171,34 @@ def attempt(
             jnp.where(here, (far | own).all(axis=0) & ~bent & ~slow, out.calm),
         )
 
-    return for_each_chart(s, lanes.chart, mask, work, empty)
+    return for_each_chart(s, lanes.chart, state.active, work, empty)
 
 
 def _go_home(
-    s, a, target, rows, before, which, step: Step, tolerance, t, u, index, tau, reach, span
+    flow: ChartFlow,
+    before: Watch,
+    which: Int[Array, " L"],
+    step: Step,
+    tolerance: Float[Array, "n #L"],
+    t: Float[Array, " L"],
+    tau: Float[Array, " L"],
+    reach: Float[Array, " L"],
+    task: Task,
 ) -> _Home:
-    """From the end of a step onto the zero of `which`, on either side of it."""
-    value, rate = values(s, a, target, t + tau, step.q, u, index, step.f1)
-    v0, r0, v1, r1 = (pick(x, rows, which) for x in (*before, value, rate))
+    """From the end of a step of length tau onto the zero of `which`, on either side of it."""
+    after = flow.watch(t + tau, step.q, step.f1)
+    v0, r0, v1, r1 = (pick(x, flow.rows, which) for x in (*before, *after))
     by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
     by_newton = -v1 / jnp.where(r1 == 0, 1.0, r1)
-    first = jnp.where(tau > 1e-3 * reach, by_cubic, by_newton)
+    first = jnp.where(tau > _SHORT_STEP * reach, by_cubic, by_newton)
     near = (which >= 0) & (jnp.abs(first) <= reach)
     first = jnp.where(near, first, 0.0)
-    end = settle(s, a, target, t + tau, step.q, step.f1, u, index, which, first)
+    end = flow.settle(t + tau, step.q, step.f1, which, first)
     share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
     rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
-    rounding = at_precision(*_HERE) * span
-    fine = jnp.abs(end.last) <= _FINE * jnp.abs(tau + end.past) + rounding
-    lands = near & fine & (share <= _SHORT) & (jnp.abs(rough) <= 1.0)
+    rounding = at_precision(*_LAST_CORRECTION_OF_SPAN) * task.span
+    fine = jnp.abs(end.last) <= _LAST_CORRECTION * jnp.abs(tau + end.past) + rounding
+    lands = near & fine & (share <= _LANDING_REACH) & (jnp.abs(rough) <= 1.0)
     return _Home(
         jnp.where(lands, end.q, step.q),
         jnp.where(lands, end.f, step.f1),

@@ -10,19 +10,26 @@ from .._core.precision import at_precision
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .lanes import Lanes, for_each_chart, needed, only
+from .settings import ROUNDING
 from .watch import Watch
 
 
-# Each in double and in single precision. A watched function counts as zero if its rate would have
-# made its value in this fraction of the time span at hand.
+# A watched function counts as zero if its rate would have made its value in this part of the time
+# allowed (in double and in single precision). Twice as much: events that follow each other within
+# it are taken for one.
 ZERO = 1e-12, 1e-6
-# Rounding errors of a time or a state, relative to it.
-_ROUNDING = 4e-15, 2e-6
-# Times of a schedule are equal if they differ by less than this fraction of its period.
-_TIE = 1e-11, 1e-5
-# Zeno: this many intervals between events in a row shrink, with a sum that has all but converged.
+# Times of a schedule are equal if they differ by less than this part of its period (in double and
+# in single precision). Twice as much: a piece of flow that ends so shortly before an event has it.
+_SAME_TIME = 1e-11, 1e-5
+# Zeno: this many intervals between events in a row shrink, and what is to come of them (as a
+# geometric series) is at most this part of what was. Twice as many intervals, or half the part, and
+# it is seen later.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
+# An interval between events shrinks if it is at most this part of the last one. Nearer to 1, a
+# long transient of a stable bouncing could be taken for Zeno.
+_ZENO_SHRINKS = 0.999
 # A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno too.
+# Twice as many: some of these are called grazing instead.
 _ZENO_SLOW = 3
 
 
@@ -39,9 +46,11 @@ def start_lanes(
     return Lanes(t, chart, q, armed, jnp.asarray(np.zeros(L, np.int32)), pace)
 
 
-def width(t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]):
+def width(
+    t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]
+) -> Float[Array, "W L"]:
     """Values of watched functions that count as zero: what their rates make of rounding errors."""
-    zero, rounding = at_precision(*ZERO), at_precision(*_ROUNDING)
+    zero, rounding = at_precision(*ZERO), at_precision(*ROUNDING)
     return (zero * span + rounding * jnp.abs(t)) * jnp.abs(rate)
 
 
@@ -58,7 +67,7 @@ def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> La
 
 def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
     """Which rows of a `Watch` belong to the chart of each lane (the target's row to all)."""
-    source = jnp.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
+    source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)
 
 
@@ -80,7 +89,7 @@ def rearm(
     other than the one that fired, at zero and falling, is still due.
     """
     value, rate = seen.value[:-1], seen.rate[:-1]
-    other = jnp.arange(len(s.transitions))[:, None] != fired
+    other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
     zero = jnp.maximum(zero, jnp.where(other, 0.0, 4 * residue))
     due = together & other & (jnp.abs(value) <= zero) & (rate < 0)
@@ -88,7 +97,9 @@ def rearm(
     return eqx.tree_at(lambda x: x.armed, lanes, jnp.where(fired >= 0, armed, lanes.armed))
 
 
-def _noise(s: Structure, lanes: Lanes, u, mask: Bool[Array, " L"]) -> Float[Array, "G L"]:
+def _noise(
+    s: Structure, lanes: Lanes, u: Float[Array, "nu L"], mask: Bool[Array, " L"]
+) -> Float[Array, "G L"]:
     """A bound on the rounding errors of the guards of the charts that lanes are in."""
 
     def work(a, here, out):
@@ -99,7 +110,7 @@ def _noise(s: Structure, lanes: Lanes, u, mask: Bool[Array, " L"]) -> Float[Arra
         def one(s, t, q, u):
             guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in rows])  # noqa: E731
             by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
-            return at_precision(*_ROUNDING) * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
+            return at_precision(*ROUNDING) * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
 
         n = s.dims[a]
         noise = s.by_lane(one)(only(here, lanes.t), only(here, lanes.q[:n]), only(here, u))
@@ -156,7 +167,7 @@ def next_schedule(
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
     at `end` happens at `end`.
     """
-    tie = at_precision(*_TIE)
+    tie = at_precision(*_SAME_TIME)
     best, which = jnp.full_like(t, jnp.inf), jnp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         schedule = transition.guard
@@ -169,7 +180,9 @@ def next_schedule(
     return best, which
 
 
-def scheduled_time(s: Structure, fired: Int[Array, " L"], t: Float[Array, " L"]):
+def scheduled_time(
+    s: Structure, fired: Int[Array, " L"], t: Float[Array, " L"]
+) -> Float[Array, " L"]:
     """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
     its period and offset; t itself for other events."""
     time = t
@@ -194,10 +207,10 @@ def keep_pace(
     since, gap, streak, total = pace
     since = since + moved
     ratio = jnp.where(gap > 0, since / jnp.where(gap > 0, gap, 1.0), 0.0)
-    shrinks = ratio < 0.999
+    shrinks = ratio < _ZENO_SHRINKS
     streak = jnp.where(event, jnp.where(shrinks, streak + 1, 0.0), streak)
     total = jnp.where(event, jnp.where(shrinks, total + since, 0.0), total)
-    rest = since * ratio / (1 - jnp.minimum(ratio, 0.999))
+    rest = since * ratio / (1 - jnp.minimum(ratio, _ZENO_SHRINKS))
     zeno = (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap, since = jnp.where(event, since, gap), jnp.where(event, 0.0, since)

@@ -13,20 +13,23 @@ from jaxtyping import Array, Bool, Float
 from .._core.precision import at_precision
 
 
-# An extremum within this fraction of the guard's values at the step's ends (in double and in single
-# precision) is a touch (grazing) ...
+# An extremum within this part of the guard's values at the step's ends (in double and in single
+# precision) is a touch. Twice as much calls more flights past a guard grazing.
 TOUCH = 1e-10, 1e-6
-# ... and within this fraction a near miss, which a shorter step must settle.
+# An extremum within this part of them is a near miss, which a shorter step must settle. Twice as
+# much shortens more steps; half of it may miss a guard that dips below zero within one.
 NEAR = 1e-2
-# Newton steps to the zero: enough to tell apart guards that fall almost together.
-_NEWTON = 10
+# Steps to the zero of a cubic within a bracket: guards that fall almost together are told apart.
+_BRACKETED_STEPS = 10
+# Newton's steps to the zero of a cubic from the end of the step, where it is near.
+_NEWTON_STEPS = 4
 
 
 class CubicCrossing(NamedTuple):
     """What a guard does within a step."""
 
-    s: Float[Array, "*shape"]
-    """Position of the first falling zero as a fraction of the step; infinity if there is none."""
+    position: Float[Array, "*shape"]
+    """The first falling zero, as a fraction of the step; infinity if there is none."""
     touch: Bool[Array, "*shape"]
     """The guard touches zero without a clear crossing."""
     near: Bool[Array, "*shape"]
@@ -71,7 +74,7 @@ def first_crossing(
     found = first | second | third
 
     s = 0.5 * (lo + hi)
-    for _ in range(_NEWTON):  # kept inside the shrinking bracket
+    for _ in range(_BRACKETED_STEPS):  # kept inside the shrinking bracket
         value = cubic(s)
         lo, hi = jnp.where(value > 0, s, lo), jnp.where(value > 0, hi, s)
         guess = s - _divide(value, slope(s))
@@ -93,7 +96,7 @@ def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     b = 3 * rise - 2 * d0 - d1
     c = d0 + d1 - 2 * rise
     s = jnp.ones_like(v1)
-    for _ in range(4):
+    for _ in range(_NEWTON_STEPS):
         value = v0 + s * (d0 + s * (b + s * c))
         s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
     return s

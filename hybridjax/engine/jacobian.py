@@ -9,15 +9,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
 from .lanes import Lanes
-from .move import Moved, Settings, constant, record, retrace
+from .move import constant, record, retrace
+from .search import Moved
+from .settings import Settings
 from .tape import Tape
 from .target import Target
 
 
 def flow_jacobian(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     target: Target,
     settings: Settings,
@@ -36,10 +37,12 @@ def flow_jacobian(
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
-    zero = jnp.zeros((len(system.inputs), lanes.t.shape[0]))
-    go = constant((system, lanes, zero, target))
-    moved, tape = record(*go, settings, h, result, new_input, tangents=wanted)
-    jacobian, end = tape_jacobian(system, lanes, target, tape, of_states, wanted)
+    u = jnp.zeros((s.nu, lanes.t.shape[0]))
+    source, begin, end = constant((s.source, lanes, target))
+    moved, tape = record(
+        Structure(source), begin, u, end, settings, h, result, new_input, tangents=wanted
+    )
+    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states, wanted)
     if wanted is not True:
         end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
     moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
@@ -47,7 +50,7 @@ def flow_jacobian(
 
 
 def tape_jacobian(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     target: Target,
     tape: Tape,
@@ -56,7 +59,7 @@ def tape_jacobian(
 ) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
     """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
     (t, q) at the targets; both are zeros if they are not `wanted`."""
-    columns, end = _push(system, lanes, target, tape, of_states, wanted)
+    columns, end = _push(s.source, lanes, target, tape, of_states, wanted)
     return columns.transpose(2, 1, 0), end
 
 
@@ -68,7 +71,7 @@ def _columns(system, lanes, target, tape, of_states):
 
     def flow(x):
         start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
-        t, q = retrace(system, start, x[1 + d :], target, tape)
+        t, q = retrace(s, start, x[1 + d :], target, tape)
         return jnp.concatenate([t[None], q])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])

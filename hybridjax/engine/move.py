@@ -1,7 +1,6 @@
 """Flow of many lanes to their targets, differentiable in forward and reverse mode."""
 
 import dataclasses
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,45 +8,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.lane_jvp import lane_jvp
-from .._core.per_lane import PerLane, shared
+from .._core.per_lane import shared
 from .._core.results import Result
 from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
 from .lanes import Lanes
 from .replay import replay
-from .search import Moved, search
+from .search import Moved, Options, Recorded, search
+from .settings import Settings
 from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
 
 
-def _number(x) -> Array:
-    return jnp.asarray(x, float)
-
-
-class Settings(eqx.Module):
-    """Accuracy and effort of the flow."""
-
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
-    """Bound on a step's error estimate relative to each state's size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=1e-10)
-    """Bound on a step's error estimate, absolute."""
-    max_steps: int = eqx.field(static=True, default=256)
-    """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
-
-
-class _How(NamedTuple):
-    """Ways of `search`."""
-
-    tape: bool
-    glide: bool
-    new_input: bool
-    tangents: Bool[Array, ""] | bool
-
-
 def move(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     u: Float[Array, "nu L"],
     target: Target,
@@ -56,6 +31,7 @@ def move(
     result: Int[Array, " L"] | None = None,
     new_input: bool = True,
     glide: bool = False,
+    event_log: int = 0,
 ) -> Moved:
     """Flow every lane to its target under a constant input.
 
@@ -65,14 +41,14 @@ def move(
 
     `setout` is the first step, or a `Stride`. With `new_input`, the guards are armed anew;
     otherwise the lanes go on as they are. With `glide`, one step is thought to be enough for most.
+    `event_log` is the number of events of each lane that are kept in `Moved.log`.
     """
-    how = _How(False, glide, new_input, False)
-    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, how)[0]
+    options = Options(glide=glide, new_input=new_input, event_log=event_log)
+    return _begin(s, lanes, u, target, settings, setout, result, options).moved
 
 
 def record(
-    system: HybridSystem,
+    s: Structure,
     lanes: Lanes,
     u: Float[Array, "nu L"],
     target: Target,
@@ -81,35 +57,30 @@ def record(
     result: Int[Array, " L"] | None = None,
     new_input: bool = True,
     tangents: Bool[Array, ""] | bool = False,
-) -> tuple[Moved, Tape]:
+) -> Recorded:
     """As `move`, with a record of every step, which has no derivatives.
 
     With `tangents`, steps are short enough for the derivatives, too, that a replay will have.
     """
-    how = _How(True, False, new_input, tangents)
-    setout, result = _defaults(system, lanes, u, target, settings, setout, result)
-    return _move(system, lanes, u, target, setout, result, settings, how)
+    options = Options(tape=True, new_input=new_input, tangents=tangents)
+    return _begin(s, lanes, u, target, settings, setout, result, options)
 
 
 def retrace(
-    system: HybridSystem | PerLane,
-    lanes: Lanes,
-    u: Float[Array, "nu L"],
-    target: Target,
-    tape: Tape,
+    s: Structure, lanes: Lanes, u: Float[Array, "nu L"], target: Target, tape: Tape
 ) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
-    return replay(Structure(system), lanes, u, target, tape.h, tape.code)
+    return replay(s, lanes, u, target, tape.h, tape.code)
 
 
-def _defaults(system, lanes, u, target, settings, setout, result):
+def _begin(s: Structure, lanes, u, target, settings, setout, result, options) -> Recorded:
     if setout is None:
-        setout = initial_step(Structure(system), lanes, u, target.limit - lanes.t, settings.rtol)
+        setout = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     if not isinstance(setout, Stride):
         setout = stride(setout)
     if result is None:
         result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
-    return constant(setout), result
+    return _move(s.source, lanes, u, target, constant(setout), result, settings, options)
 
 
 def constant(tree):
@@ -120,52 +91,46 @@ def constant(tree):
 
 
 @eqx.filter_jit
-def _search(system, lanes, u, target, setout, result, settings, how: _How):
+def _search(system, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
+    """`search`, with the axes that `jax.vmap` maps as more lanes."""
     bare = dataclasses.replace(target, levels=None)
-    run = vmap_to_lanes(lambda common, lane: _run(*common, *lane))
-    return run((system, target.levels, settings, how), (lanes, u, bare, setout, result))
 
+    def run(common, lane):
+        system, levels, settings, options = common
+        lanes, u, bare, setout, result = lane
+        target = dataclasses.replace(bare, levels=levels)
+        s = Structure(system)
+        return search(s, lanes, u, target, setout, result, shared(settings), options)
 
-def _run(system, levels, settings, how: _How, lanes, u, target, setout, result):
-    settings = shared(settings)
-    return search(
-        Structure(system),
-        lanes,
-        u,
-        dataclasses.replace(target, levels=levels),
-        stride=setout,
-        result=result,
-        rtol=settings.rtol,
-        atol=settings.atol,
-        max_steps=settings.max_steps,
-        **how._asdict(),
-    )
+    common = system, target.levels, settings, options
+    return vmap_to_lanes(run)(common, (lanes, u, bare, setout, result))
 
 
 @eqx.filter_custom_jvp
-def _move(system, lanes, u, target, setout, result, settings, how: _How):
-    return _search(system, lanes, u, target, setout, result, settings, how)
+def _move(system, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
+    return _search(system, lanes, u, target, setout, result, settings, options)
 
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
-    system, lanes, u, target, setout, result, settings, how = primals
-    closely = how.tangents is not False or not how.glide
-    taped = how._replace(tape=True, glide=False, tangents=closely)
-    go = (constant(x) for x in (system, lanes, u, target, setout, result))
-    moved, tape = _search(*go, settings, taped)
+    system, lanes, u, target, setout, result, settings, options = primals
+    closely = options.tangents is not False or not options.glide
+    taped = options._replace(tape=True, glide=False, tangents=closely)
+    system_, lanes_, u_, target_ = constant((system, lanes, u, target))
+    found = _search(system_, lanes_, u_, target_, constant(setout), result, settings, taped)
+    tape = found.tape
 
     def repeat(lane, common):
         (t, q, u, time), (system, levels) = lane, common
-        start = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
+        begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         to = dataclasses.replace(target, time=time, levels=levels)
-        return replay(Structure(system), start, u, to, tape.h, tape.code, how.glide)
+        return replay(Structure(system), begin, u, to, tape.h, tape.code, options.glide)
 
     t_system, t_lanes, t_u, t_target, *_ = tangents
     lane = (lanes.t, lanes.q, u, target.time), (t_lanes.t, t_lanes.q, t_u, t_target.time)
     common = (system, target.levels), (t_system, t_target.levels)
     (t, q), (t_t, t_q) = lane_jvp(repeat, lane, common)
-    ends = lambda x: (x[0].lanes.t, x[0].lanes.q)  # noqa: E731
-    out = eqx.tree_at(ends, (moved, tape if how.tape else None), (t, q))
+    ends = lambda x: (x.moved.lanes.t, x.moved.lanes.q)  # noqa: E731
+    out = eqx.tree_at(ends, Recorded(found.moved, tape if options.tape else None), (t, q))
     nothing = jax.tree_util.tree_map(lambda _: None, out)
     return out, eqx.tree_at(ends, nothing, (t_t, t_q), is_leaf=lambda x: x is None)

@@ -10,7 +10,7 @@ import functools as ft
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
@@ -19,10 +19,11 @@ from .lanes import Lanes, for_each_chart, needed, only
 from .solver.step import Step, rk_step
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .target import Target
-from .watch import chart_field, settle, watched
+from .watch import ChartFlow
 
 
-# Rows of a tape that are skipped, or computed again by reverse mode, together.
+# Rows of a tape that are skipped, or computed again by reverse mode, together. Twice as many: half
+# the states that reverse mode keeps, and up to 15 empty rows that are looked at.
 _BLOCK = 16
 
 
@@ -35,7 +36,7 @@ def replay(
     code: Int[Array, "R L"],
     unroll: bool = False,
 ) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
-    """Times and states at the end of the moves `h` with outcomes `code` (see `search.Tape`)."""
+    """Times and states at the end of the moves `h` with outcomes `code` (see `Tape`)."""
     scheduled = jnp.array([isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False])
 
     def row(carry, row):
@@ -69,29 +70,41 @@ def replay(
     return t, q
 
 
-def _advance(s, t, q, chart, moves, u, target, h, which, unroll):
+def _advance(
+    s: Structure,
+    t: Float[Array, " L"],
+    q: Float[Array, "d L"],
+    chart: Int[Array, " L"],
+    moves: Bool[Array, " L"],
+    u: Float[Array, "nu L"],
+    target: Target,
+    h: Float[Array, " L"],
+    which: Int[Array, " L"],
+    unroll: bool,
+) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
 
     def work(a, here, out):
         t_out, q_out = out
         n = s.dims[a]
         own, levels = needed(here, (s.source, target.levels))
-        own, goal = Structure(own), dataclasses.replace(target, levels=levels)
+        goal = dataclasses.replace(target, levels=levels, index=only(here, target.index))
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
-        index, crossing = only(here, target.index), jnp.where(here, which, -1)
+        flow = ChartFlow(Structure(own), a, u0, goal)
+        crossing = jnp.where(here, which, -1)
         # (A branch of its own, lest XLA masks the states again in every stage.)
         step = jax.lax.cond(
             here.any(),
-            lambda: rk_step(chart_field(own, a, u0), t0, q0, h0, unroll),
+            lambda: rk_step(flow.field, t0, q0, h0, unroll),
             lambda: Step(q0, q0, q0, q0),
         )
         q1, t1 = step.q, t0 + h0
 
         def land():
-            settled = settle(own, a, goal, t1, q1, step.f1, u0, index, crossing)
+            settled = flow.settle(t1, q1, step.f1, crossing)
             return t1 + settled.past, settled.q
 
-        if watched(own, a, goal):
+        if flow.rows:
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
         return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
 

@@ -7,7 +7,14 @@ from jaxtyping import Array, Float
 
 from ..systems.structure import Structure
 from .lanes import Lanes, for_each_chart, only
+from .settings import Settings
 from .watch import chart_field
+
+
+# The first step, as a part of the time in which the state changes by its size (for errors of
+# _FIRST_RTOL; the method has order 7), and at most as a part of the time allowed. Twice as much: a
+# few more first steps are too long and taken again; half: one more step until they have grown.
+_FIRST_STEP, _FIRST_RTOL, _FIRST_STEP_OF_SPAN = 0.1, 1e-2, 0.01
 
 
 class Stride(NamedTuple):
@@ -27,16 +34,26 @@ def stride(h: Float[Array, " L"]) -> Stride:
     return Stride(h, jnp.zeros_like(h), jnp.ones_like(h))
 
 
-def initial_step(s: Structure, lanes: Lanes, u, span: Float[Array, " L"], rtol):
-    """A cautious first step: a fraction of the time in which the state changes by its size."""
+def initial_step(
+    s: Structure,
+    lanes: Lanes,
+    u: Float[Array, "nu L"],
+    span: Float[Array, " L"],
+    settings: Settings,
+) -> Float[Array, " L"]:
+    """A cautious first step: a part of the time in which the state changes by its size."""
 
     def work(a, here, out):
         q = only(here, lanes.q[: s.dims[a]])
         f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
-        ratio = jnp.linalg.norm(q, axis=0) / jnp.linalg.norm(f, axis=0)
-        ratio = jnp.where(jnp.isfinite(ratio) & (ratio > 0), ratio, jnp.inf)
-        h = jnp.minimum(0.1 * ratio * (100 * rtol) ** (1 / 7), 0.01 * span)
-        return jnp.where(here, h, out)
+        if settings.scale is None:
+            size = jnp.linalg.norm(q, axis=0)
+        else:
+            size = settings.size(a, q)
+        rate = jnp.max(jnp.abs(f) / size, axis=0, initial=0.0)
+        time = jnp.where(jnp.isfinite(rate) & (rate > 0), 1 / rate, jnp.inf)
+        part = _FIRST_STEP * (settings.rtol / _FIRST_RTOL) ** (1 / 7)
+        return jnp.where(here, jnp.minimum(part * time, _FIRST_STEP_OF_SPAN * span), out)
 
     everywhere = jnp.ones(lanes.t.shape[0], bool)
-    return for_each_chart(s, lanes.chart, everywhere, work, 0.01 * span)
+    return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)

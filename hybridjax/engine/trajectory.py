@@ -19,7 +19,8 @@ from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
 from .hermite import interpolate
-from .move import Settings, record
+from .move import record
+from .settings import Settings
 from .stride import initial_step
 from .tape import IDLE
 from .target import until
@@ -209,13 +210,13 @@ def _start(system, t, a, state, u, span, settings):
     s = Structure(system)
     q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
     lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q)
-    return lanes, initial_step(s, lanes, u, span[None], settings.rtol)
+    return lanes, initial_step(s, lanes, u, span[None], settings)
 
 
 @quick_jit
 def _piece(system, lanes, u, end, settings, h):
     settings = dataclasses.replace(settings, max_steps=_ROWS)
-    return record(system, lanes, u, until(end[None]), settings, h)
+    return record(Structure(system), lanes, u, until(end[None]), settings, h)
 
 
 def _slopes(system, t, chart, q, u) -> np.ndarray:

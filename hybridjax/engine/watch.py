@@ -1,5 +1,6 @@
 """The functions whose zeros end a move: guards, and the level function of the target section."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,7 +30,101 @@ def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
     return lambda t, q: field(t, q, u)
 
 
-def slopes(s: Structure, t, chart, q, u) -> Float[Array, "d L"]:
+class Settled(NamedTuple):
+    """Lanes moved onto the zero of the function that they cross."""
+
+    past: Float[Array, " L"]
+    """Time from the start to the zero."""
+    q: Float[Array, "n L"]
+    f: Float[Array, "n L"]
+    """The field there."""
+    last: Float[Array, " L"]
+    """The part of `past` that the second of two corrections added."""
+    error: Float[Array, "n L"]
+    """A bound on the error of the first correction: the distance between two methods."""
+
+
+class ChartFlow(NamedTuple):
+    """What lanes meet in one chart: its field and its watched functions, under their inputs and
+    for their targets."""
+
+    s: Structure
+    a: int
+    u: Float[Array, "nu L"]
+    target: Target
+
+    @property
+    def field(self) -> LaneField:
+        return chart_field(self.s, self.a, self.u)
+
+    @property
+    def rows(self) -> list[int]:
+        """Rows of a `Watch` that mean something here: the guards, and the target's level."""
+        levels = self.target.levels
+        level = levels is not None and shared(levels).present(self.s, self.a)
+        return self.s.guards(self.a) + [len(self.s.transitions)] * level
+
+    def watch(
+        self, t: Float[Array, " #L"], q: Float[Array, "n L"], f: Float[Array, "n L"]
+    ) -> Watch:
+        """The watched functions, in the order of `rows`; f is the field there."""
+        a, guards = self.a, self.s.guards(self.a)
+        level = len(self.rows) > len(guards)
+
+        def one(s, levels, t, q, u, i, f):
+            def all_of_them(t, q):
+                rows = [s.guard(g, t, q, u) for g in guards]
+                return jnp.stack(rows + ([levels.level(s, a, i, t, q)] if level else []))
+
+            return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
+
+        many = self.s.by_lane(one, self.target.levels, name=("watch", a))
+        return Watch(*many(t, q, self.u, self.target.index, f))
+
+    def settle(
+        self,
+        t: Float[Array, " #L"],
+        q: Float[Array, "n L"],
+        f: Float[Array, "n L"],
+        which: Int[Array, " L"],
+        first: Float[Array, " L"] | None = None,
+    ) -> Settled:
+        """Two corrections onto the zero of watched function `which` (-1: stay).
+
+        f is the field at (t, q). The first correction is a short step of known length, or if
+        `first` is not given, of Newton's; the second is a Newton step. From the crossing itself (up
+        to rounding) they change nothing, but carry the derivatives of the crossing's time and state
+        exactly, to second order: this is the saltation formula.
+        """
+        field, rows = self.field, self.rows
+
+        def newton(t, q, f):
+            value, rate = self.watch(t, q, f)
+            value, rate = pick(value, rows, which), pick(rate, rows, which)
+            return -value / jnp.where(rate == 0, 1.0, rate)
+
+        first = newton(t, q, f) if first is None else first
+        q, error = short_step(field, t, q, f, first)
+        f = field(t + first, q)
+        last = newton(t + first, q, f)
+        return Settled(first + last, q + last * f, f, last, error)
+
+
+def chart_flow(
+    s: Structure, a: int, here: Bool[Array, " L"], u: Float[Array, "nu L"], target: Target
+) -> ChartFlow:
+    """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
+    index = only(here, target.index)
+    return ChartFlow(s, a, only(here, u), dataclasses.replace(target, index=index))
+
+
+def slopes(
+    s: Structure,
+    t: Float[Array, " L"],
+    chart: Int[Array, " L"],
+    q: Float[Array, "d L"],
+    u: Float[Array, "nu L"],
+) -> Float[Array, "d L"]:
     """The field at every lane."""
 
     def work(a, here, out):
@@ -38,28 +133,6 @@ def slopes(s: Structure, t, chart, q, u) -> Float[Array, "d L"]:
         return out.at[:n].set(jnp.where(here, f, out[:n]))
 
     return for_each_chart(s, chart, jnp.ones(t.shape, bool), work, jnp.zeros_like(q))
-
-
-def watched(s: Structure, a: int, target: Target) -> list[int]:
-    """Rows of the watched functions of chart a: its guards, and the target's level."""
-    level = target.levels is not None and shared(target.levels).present(s, a)
-    return s.guards(a) + [len(s.transitions)] * level
-
-
-def values(s: Structure, a: int, target: Target, t, q, u, index, f) -> Watch:
-    """Chart a's watched functions over lanes, in the order of `watched`; f is the field there."""
-
-    guards = s.guards(a)
-    level = len(watched(s, a, target)) > len(guards)
-
-    def one(s, levels, t, q, u, i, f):
-        def all_of_them(t, q):
-            rows = [s.guard(g, t, q, u) for g in guards]
-            return jnp.stack(rows + ([levels.level(s, a, i, t, q)] if level else []))
-
-        return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
-
-    return Watch(*s.by_lane(one, target.levels, name=("watch", a))(t, q, u, index, f))
 
 
 def watch(
@@ -74,14 +147,11 @@ def watch(
     """All watched functions at the lanes of `mask`."""
 
     def work(a, here, out):
-        rows = watched(s, a, target)
-        if not rows:
+        flow = chart_flow(s, a, here, u, target)
+        if not flow.rows:
             return out
-        n = s.dims[a]
-        point = only(here, t), only(here, q[:n])
-        uu, index = only(here, u), only(here, target.index)
-        f = chart_field(s, a, uu)(*point)
-        return write(out, rows, here, values(s, a, target, *point, uu, index, f))
+        point = only(here, t), only(here, q[: s.dims[a]])
+        return write(out, flow.rows, here, flow.watch(*point, flow.field(*point)))
 
     return for_each_chart(s, chart, mask, work, nothing(s, t.shape[0]))
 
@@ -119,40 +189,3 @@ def pick(x: Float[Array, "R L"], rows: Sequence[int], which: Int[Array, " L"]):
     for k, row in enumerate(rows):
         out = jnp.where(which == row, x[k], out)
     return out
-
-
-class Settled(NamedTuple):
-    """Lanes moved onto the zero of the function that they cross."""
-
-    past: Float[Array, " L"]
-    """Time from the start to the zero."""
-    q: Float[Array, "n L"]
-    f: Float[Array, "n L"]
-    """The field there."""
-    last: Float[Array, " L"]
-    """The part of `past` that the second of two corrections added."""
-    error: Float[Array, "n L"]
-    """A bound on the error of the first correction: the distance between two methods."""
-
-
-def settle(s: Structure, a: int, target: Target, t, q, f, u, index, which, first=None) -> Settled:
-    """Two corrections onto the zero of watched function `which` (-1: stay), in chart a.
-
-    f is the field at (t, q). The first correction is a short step of known length, or if `first`
-    is not given, of Newton's; the second is a Newton step. From the crossing itself (up to
-    rounding) they change nothing, but carry the derivatives of the crossing's time and state
-    exactly, to second order: this is the saltation formula.
-    """
-    field = chart_field(s, a, u)
-    rows = watched(s, a, target)
-
-    def newton(t, q, f):
-        value, rate = values(s, a, target, t, q, u, index, f)
-        value, rate = pick(value, rows, which), pick(rate, rows, which)
-        return -value / jnp.where(rate == 0, 1.0, rate)
-
-    first = newton(t, q, f) if first is None else first
-    q, error = short_step(field, t, q, f, first)
-    f = field(t + first, q)
-    last = newton(t + first, q, f)
-    return Settled(first + last, q + last * f, f, last, error)

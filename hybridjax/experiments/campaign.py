@@ -14,7 +14,7 @@ from .._core.compile import quick_jit
 from .._core.execution import Execution
 from .._core.precision import require_x64
 from .._core.results import Result
-from ..engine.move import Settings
+from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
 from ..maps.place import PATIENCE, as_placed
 from ..maps.placed import PlacedSections
@@ -30,13 +30,14 @@ from .noise import ProcessNoise
 from .options import Options
 from .start import CycleStart, Start, SteadyStart, predict_start
 from .steady import settle_batch
-from .stepping.plan import ACCURACY, Plan, Stepping, plan_flow
+from .stepping.plan import Plan, Stepping, plan_flow
 from .stepping.single_precision import plan_single
 
 
 # Up to so many samples in all, programs are compiled with little optimization, in half the time,
 # and run up to five times as long: at most 0.03 s longer here. Twice as many, twice that.
 _SMALL = 20_000
+_ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
 
 # Compiled with little optimization, and with all.
 _FLOW = {True: quick_jit(flow_batch), False: eqx.filter_jit(flow_batch)}
@@ -177,7 +178,7 @@ def prepare(
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
-    accuracy = ACCURACY[execution.precision] if accuracy is None else float(accuracy)
+    accuracy = _ACCURACY[execution.precision] if accuracy is None else float(accuracy)
     discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
     inputs = check_inputs(design, discard, N, nu)
@@ -240,7 +241,8 @@ def _compiling_ahead(
     N, m = placed.n_sections, 1 + placed.lanes.q.shape[0]
     plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
     start, u = jnp.asarray(np.zeros((m, shape[0]))), jnp.asarray(np.zeros(shape))
-    settings = Settings(1.0, 1.0, PATIENCE)
+    s = Structure(placed.cycle.system)
+    settings = Settings(1.0, 1.0, PATIENCE, np.ones((len(s.charts), s.d)))
     return compiling(program, (placed, plan, start, u, tuple(z.items), settings, 0), execution)
 
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..engine.lanes import Lanes, for_each_chart, needed, only
-from ..engine.move import Moved, Settings, move
+from ..engine.move import Moved, move
+from ..engine.settings import Settings
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
@@ -76,7 +77,6 @@ def flow_batch(
     first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
     lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
-    logged = dict(event_log=event_log) if event_log else {}
 
     @jax.checkpoint
     def section(carry, xs):
@@ -88,7 +88,15 @@ def flow_batch(
         target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.order)
         moved = move(
-            system, lanes, u, target, settings, plan.stride(i, S), result, glide=True, **logged
+            s,
+            lanes,
+            u,
+            target,
+            settings,
+            plan.stride(i, S),
+            result,
+            glide=True,
+            event_log=event_log,
         )
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.precision import require_x64
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..maps.place import as_placed
 from ..maps.placed import PlacedSections
@@ -17,7 +18,7 @@ from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .flow_batch import Response, flow_batch
-from .stepping.plan import ACCURACY, Stepping, plan_flow
+from .stepping.plan import Stepping, plan_flow
 
 
 # Steps that a derivative remembers: between two sections at least, and in a period of the cycle.
@@ -75,7 +76,7 @@ def response_function(
     sections,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    accuracy: float = ACCURACY["double"],
+    accuracy: float = EXPERIMENT,
 ) -> ResponseFunction:
     """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.
 

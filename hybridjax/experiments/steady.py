@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..engine.move import Settings
+from ..engine.settings import STEADY_START, Settings
 from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
 from ..systems.system import HybridSystem
@@ -109,7 +109,7 @@ def steady_start(
     u: Float[ArrayLike, "S n nu"],
     system: HybridSystem | None = None,
     *,
-    accuracy: float = 1e-10,
+    accuracy: float = STEADY_START,
 ) -> Float[Array, "m S"]:
     r"""Where experiments must start so that their responses repeat with their inputs.
 

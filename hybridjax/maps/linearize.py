@@ -83,7 +83,7 @@ def _section_jacobians(placed: PlacedSections):
     """A (N, c, c) and B (N, c, nu), padded; NaN where the flow failed."""
     n = 1 + placed.lanes.q.shape[0]
     following, _, target = placed.onwards()
-    jacobian, _ = tape_jacobian(placed.cycle.system, placed.lanes, target, placed.tape)
+    jacobian, _ = tape_jacobian(Structure(placed.cycle.system), placed.lanes, target, placed.tape)
     jacobian = jnp.where((placed.result == Result.OK)[:, None, None], jacobian, jnp.nan)
     embed, select = placed.frames()
     after = select[following]

@@ -123,7 +123,7 @@ def _place(cycle, sections) -> tuple[PlacedSections, Int[Array, ""]]:
         target = Target(
             time[None], i[None], event[None], limit, None, levels, Result.SECTION_MISSED
         )
-        moved, tape = record(system, lanes, u, target, settings, h, result, tangents=True)
+        moved, tape = record(s, lanes, u, target, settings, h, result, tangents=True)
         end = moved.lanes
         if anchored:
             anchor = jax.tree_util.tree_map(lambda x, y: jnp.where(first, x, y), end, anchor)

@@ -93,8 +93,7 @@ def section_map(cycle: LimitCycle, sections, i: SupportsIndex, j: SupportsIndex)
 
 @quick_jit
 def _map(placed, i, j, q, u, t) -> Arrival:
-    system = placed.cycle.system
-    s = Structure(system)
+    s = Structure(placed.cycle.system)
     pick = slice(i, i + 1)
     lanes = placed.lanes
     q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
@@ -105,7 +104,7 @@ def _map(placed, i, j, q, u, t) -> Arrival:
          lanes.pace[:, pick]),
     )  # fmt: skip
     target = placed.target(jnp.array([j]), t[None], jnp.array([1 if j <= i else 0]))
-    moved = move(system, start, u[:, None], target, placed.cycle.settings)
+    moved = move(s, start, u[:, None], target, placed.cycle.settings)
     end = moved.lanes
     result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
     keep = jnp.where(result == Result.OK, 1.0, jnp.nan)  # a factor makes derivatives NaN, too

@@ -15,7 +15,7 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
-from ..engine.move import Settings
+from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.target import until
 from ..engine.trajectory import Trajectory, simulate
 from ..engine.watch import slopes, watch
@@ -198,7 +198,7 @@ def find_limit_cycle(
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
     cycle that was not found mean nothing, and are NaN as a rule.
     """
-    settings = Settings(rtol=1e-12, atol=1e-12) if settings is None else settings
+    settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system)

@@ -141,7 +141,7 @@ def _go(system, lanes, section, target, settings):
     """One lane to a time, or to one section, however many steps it takes."""
     s = Structure(system)
     settings = dataclasses.replace(settings, max_steps=1_000_000)
-    return move(system, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
+    return move(s, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
 
 
 def _to_section(section, target: Target) -> Target:

@@ -218,14 +218,15 @@ def _meetings(s: Structure, kind: ReturnMap, legs: Lanes, codes) -> Int[Array, "
     return 1 + jnp.sum(falls, dtype=jnp.int32)
 
 
-def _flow(system, lanes, target, settings, h, result):
-    u = jnp.zeros((len(system.inputs), 1))
-    return move(system, lanes, u, target, settings, h, result, new_input=False), None
+def _flow(s, lanes, target, settings, h, result):
+    u = jnp.zeros((s.nu, 1))
+    return move(s, lanes, u, target, settings, h, result, new_input=False), None
 
 
-def _flow_with_jacobian(system, lanes, target, settings, h, result, wanted):
-    go = system, lanes, target, settings, h, result
-    jacobian, moved, tape = flow_jacobian(*go, of_states=True, new_input=False, wanted=wanted)
+def _flow_with_jacobian(s, lanes, target, settings, h, result, wanted):
+    jacobian, moved, tape = flow_jacobian(
+        s, lanes, target, settings, h, result, of_states=True, new_input=False, wanted=wanted
+    )
     return moved, (lanes, jacobian, tape.code)
 
 
@@ -243,7 +244,7 @@ def turn(q, system, start: Lanes, kind: ReturnMap, expected, settings, flow):
     def leg(carry, target):
         lanes, h, result = carry
         target = jax.tree_util.tree_map(lambda x: x[None], target)
-        moved, extra = flow(system, lanes, eqx.combine(target, common), settings, h, result)
+        moved, extra = flow(s, lanes, eqx.combine(target, common), settings, h, result)
         return (moved.lanes, moved.h, moved.result), extra
 
     begin = (lanes, (0.5 * expected / LEGS)[None], jnp.zeros(1, jnp.int32))

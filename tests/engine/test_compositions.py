@@ -14,7 +14,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
-from hybridjax.engine.move import Settings
+from hybridjax.engine.settings import Settings
 
 from ..conftest import APEX
 

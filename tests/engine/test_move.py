@@ -9,7 +9,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.events import start_lanes
-from hybridjax.engine.move import Settings, move
+from hybridjax.engine.move import move
+from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
@@ -27,7 +28,7 @@ def flow(system, chart, q, u, t, end):
     q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
     index = jnp.full(1, s.chart_index(chart), jnp.int32)
     lanes = start_lanes(s, t[None], index, q)
-    moved = move(system, lanes, u[:, None], until(end[None]), TIGHT)
+    moved = move(s, lanes, u[:, None], until(end[None]), TIGHT)
     return moved.lanes.q[:, 0], moved.result[0]
 
 
@@ -113,7 +114,7 @@ def test_lanes_fail_one_by_one():
     end = jnp.full(4, 0.6)
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
-    moved = move(system, lanes, u, until(end), TIGHT)
+    moved = move(s, lanes, u, until(end), TIGHT)
     bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.engine.move import Settings
+from hybridjax.engine.settings import Settings
 from hybridjax.experiments.flow_batch import flow_batch
 from hybridjax.experiments.stepping.plan import make_plan
 

@@ -10,7 +10,8 @@ import numpy as np
 import hybridjax as hj
 from hybridjax._core.compile import quick_jit
 from hybridjax.engine.events import start_lanes
-from hybridjax.engine.move import Settings, record
+from hybridjax.engine.move import record
+from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
@@ -155,13 +156,12 @@ def engine(
 @quick_jit
 def _flow(plan: Plan, many: Sample, ends, accuracy):
     def one(sample: Sample, end):
-        system = Random(plan, sample.charts, sample.arrows)
         t, q, u, _ = sample.start
-        s = Structure(system)
+        s = Structure(Random(plan, sample.charts, sample.arrows))
         q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
         lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q)
-        moved, tape = record(system, lanes, u[:, None], until(end[None]), settings)
+        moved, tape = record(s, lanes, u[:, None], until(end[None]), settings)
         happens = tape.code[:, 0] >= 0
         (rows,) = jnp.nonzero(happens, size=EVENTS, fill_value=0)
         events = [x[rows, ..., 0] for x in (tape.t, tape.code, tape.chart, tape.after)]

@@ -10,7 +10,8 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.compile import quick_jit
 from hybridjax.engine.events import start_lanes
-from hybridjax.engine.move import Settings, move, record
+from hybridjax.engine.move import move, record
+from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
@@ -77,16 +78,16 @@ def test_a_guard_that_the_input_makes_positive_is_armed():
 
 def two_pieces(x, first, second):
     """One second at one input, and one at another."""
-    system = Threshold()
+    s = Structure(Threshold())
     lanes = start_lanes(
-        Structure(system),
+        s,
         jnp.zeros(1),
         jnp.zeros(1, jnp.int32),
         jnp.full((1, 1), x),
     )
     h = None
     for end, u in ((1.0, first), (2.0, second)):
-        moved = move(system, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), Settings(), h)
+        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), Settings(), h)
         lanes, h = moved.lanes, moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 
@@ -116,10 +117,10 @@ def across(x, time, duration):
     t = jnp.full(1, time)
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
-    system = Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit)))
-    lanes = start_lanes(Structure(system), t, jnp.zeros(1, jnp.int32), q)
+    s = Structure(Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))))
+    lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
     u = jnp.zeros((1, 1))
-    moved = move(system, lanes, u, until(t + duration), Settings())
+    moved = move(s, lanes, u, until(t + duration), Settings())
     return moved.result[0], moved.lanes.events[0]
 
 
@@ -153,10 +154,10 @@ def around(level, width, other):
     """Results, numbers of events, and times of the first, on half a turn at the usual accuracy."""
 
     def one(*numbers):
-        system, t, q = Layer(*numbers), jnp.zeros(1), jnp.array([[1.0], [0.0]])
+        s, t, q = Structure(Layer(*numbers)), jnp.zeros(1), jnp.array([[1.0], [0.0]])
         span = jnp.asarray(2.9)
-        lanes = start_lanes(Structure(system), t, jnp.zeros(1, jnp.int32), q)
-        moved, tape = record(system, lanes, jnp.zeros((1, 1)), until(t + span), Settings())
+        lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
+        moved, tape = record(s, lanes, jnp.zeros((1, 1)), until(t + span), Settings())
         first = jnp.argmax(tape.code[:, 0] >= 0)
         return moved.result[0], moved.lanes.events[0], tape.t[first, 0]
 

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int
 from ..._core.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.results import Result
-from ...engine.move import Settings, move
+from ...engine.move import move
+from ...engine.settings import Settings
 from ...engine.stride import Stride
 from ...engine.watch import watch
 from ...errors import DefinitionError
@@ -53,10 +54,9 @@ _MOST_CANCELLATION = 30.0
 # Errors per section that are taken for granted, relative to the states' scales: a few units in the
 # last place. Twice as much changes nothing above accuracies of 1e-13.
 _ROUNDING = 1e-15
-# Accuracies, relative to the states' scales, that a plan can be made for, and those taken where
-# none is asked for. Below the least, rounding is larger; beyond the largest, differences are.
+# Accuracies, relative to the states' scales, that a plan can be made for. Below the least, rounding
+# is larger; beyond the largest, the cycle tells little about lanes beside it.
 _LEAST_ACCURACY, _LARGEST_ACCURACY = 1e-13, 1e-2
-ACCURACY = {"double": 1e-9, "single": 1e-4}
 
 
 class Plan(eqx.Module):
@@ -153,15 +153,17 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
     by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
     rtol = jnp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
-    u = jnp.zeros((len(placed.cycle.system.inputs), N))
+    s = Structure(placed.cycle.system)
+    u = jnp.zeros((s.nu, N))
 
     def block(xs):
         nudge, divide, slack, rtol = xs
         moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
         lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
         start = Stride(longest / divide, lead, jnp.full(N, slack))
-        tolerance = Settings(rtol, settings.atol * rtol / settings.rtol, patience)
-        moved = move(placed.cycle.system, lanes, u, target, tolerance, start)
+        atol = settings.atol * rtol / settings.rtol
+        tolerance = Settings(rtol, atol, patience, settings.scale)
+        moved = move(s, lanes, u, target, tolerance, start)
         ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
         return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
 
@@ -213,18 +215,18 @@ def _accumulated(J, error, scale) -> float:
     return largest
 
 
-def section_scales(placed: PlacedSections) -> Float[np.ndarray, "N n"]:
-    """Scales (N, 1 + d) of time and states at the sections: the largest size on the cycle."""
+def state_sizes(placed: PlacedSections) -> Float[np.ndarray, "A d"]:
+    """Sizes of states, by chart: the largest that a state of this name has at any section, in any
+    chart; 1 for one that is always zero, and beyond a chart's dimension."""
     s = Structure(placed.cycle.system)
     chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
-    out = np.ones((placed.n_sections, 1 + s.d))
-    out[:, 0] = float(placed.cycle.period)
+    sizes = np.ones((len(s.charts), s.d))
     for name in s.state_names():
         places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
         size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
-        for a, k in places:
-            out[chart == a, 1 + k] = size if size > 0 else 1.0
-    return out
+        for place in places:
+            sizes[place] = size if size > 0 else 1.0
+    return sizes
 
 
 class Stepping(eqx.Module):
@@ -265,8 +267,10 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
     accuracy = float(accuracy)
 
     def make() -> Stepping:
-        scales = section_scales(placed)
-        settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
+        sizes = state_sizes(placed)
+        settings = Settings(accuracy, accuracy, PATIENCE, sizes)
+        time = np.full((placed.n_sections, 1), float(placed.cycle.period))
+        scales = np.concatenate([time, sizes[np.asarray(placed.lanes.chart)]], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
     return _made.recall(placed, accuracy, make)

@@ -12,7 +12,8 @@ from ..._core.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.precision import single, single_precision
 from ..._core.results import Result
-from ...engine.move import Settings, move
+from ...engine.move import move
+from ...engine.settings import Settings
 from ...engine.stride import Stride
 from ...errors import DefinitionError
 from ...maps.placed import PlacedSections
@@ -126,8 +127,8 @@ def _sections(
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
     target = placed.target(i, lanes.t, turns)
     stride = Stride(plan.h[k], plan.lead[k], plan.slack[k])
-    u = jnp.zeros((len(placed.cycle.system.inputs), L))
-    moved = move(placed.cycle.system, lanes, u, target, settings, stride)
+    s = Structure(placed.cycle.system)
+    moved = move(s, lanes, jnp.zeros((s.nu, L)), target, settings, stride)
     t = moved.lanes.t - turns * placed.cycle.period
     ends = jnp.concatenate([t[None], moved.lanes.q])
     return jnp.where(moved.result == Result.OK, ends, jnp.nan)

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from ..._core.compile import quick_jit
 from ...engine.lanes import Lanes
-from ...engine.move import Settings, constant, record, retrace
+from ...engine.move import constant, record, retrace
+from ...engine.settings import Settings
 from ...systems.structure import Structure
 from ...systems.system import HybridSystem
 from ..return_map import ReturnMap, across, departure, held, turn
@@ -59,17 +60,19 @@ def go_round(
         start = eqx.tree_at(lambda x: x.t, start, start.t / expected * kind.turns * period)
         expected, rate = kind.turns * period, by_parameter / period
 
-    def flow(system, lanes, target, settings, h, result):
+    def flow(s, lanes, target, settings, h, result):
         u = jnp.zeros((s.nu, 1))
-        go = constant((system, lanes, u, target))
-        moved, tape = record(*go, settings, h, result, new_input=False, tangents=True)
+        source, *go = constant((s.source, lanes, u, target))
+        moved, tape = record(
+            Structure(source), *go, settings, h, result, new_input=False, tangents=True
+        )
 
         def end(q, step):
             grown = 1 + rate * step
             begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (lanes.t * grown, q))
             time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
             to = dataclasses.replace(target, time=time)
-            t, q = retrace(_moved(system, direction, step), begin, u, to, tape)
+            t, q = retrace(Structure(_moved(system, direction, step)), begin, u, to, tape)
             return t, q[:, 0]
 
         at = (lanes.q, jnp.zeros(()))

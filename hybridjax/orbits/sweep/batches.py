@@ -16,7 +16,8 @@ from ..._core.garbage_collector import uncollected
 from ..._core.results import Result
 from ..._core.threads import in_threads
 from ...engine.lanes import Lanes
-from ...engine.move import Settings, move
+from ...engine.move import move
+from ...engine.settings import TRANSIENT, Settings
 from ...engine.target import toward, until
 from ...sections.families import AtEvent, ListLevels
 from ...systems.structure import Structure
@@ -293,21 +294,21 @@ def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
     """Where systems are after they have flowed freely for a while, at the guess's phase or
     section (NaN for those that do not get there), and their expected periods."""
     base = guess.base
-    patient = Settings(rtol=1e-6, atol=1e-6, max_steps=512 * _SETTLE)
+    patient = Settings(rtol=TRANSIENT, atol=TRANSIENT, max_steps=512 * _SETTLE)
 
     def one(system, start, expected):
         start, expected = _on_clock(system, guess, start, expected)
-        u = jnp.zeros((len(system.inputs), 1))
-        moved = move(system, start, u, until(start.t + _SETTLE * expected), patient)
+        s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
+        moved = move(s, start, u, until(start.t + _SETTLE * expected), patient)
         if base is not None:
             at_event = isinstance(base, AtEvent)
-            event = Structure(system).transition_index(base.name) if at_event else -1
+            event = s.transition_index(base.name) if at_event else -1
             target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
             if not at_event:
                 target = eqx.tree_at(
                     lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
                 )
-            moved = move(system, moved.lanes, u, target, patient, moved.h, moved.result)
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
         start = eqx.tree_at(lambda x: (x.chart, x.q), start, (moved.lanes.chart, q))
         return start, expected

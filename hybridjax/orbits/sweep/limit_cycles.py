@@ -13,7 +13,7 @@ from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.threads import thread_count
 from ...engine.lanes import Lanes
-from ...engine.move import Settings
+from ...engine.settings import SWEEP, Settings
 from ...errors import DefinitionError
 from ...systems.structure import check_system
 from ...systems.system import HybridSystem
@@ -137,7 +137,7 @@ def find_limit_cycles(
 
     **Raises:** `DefinitionError` for systems that do not belong together.
     """
-    settings = Settings(rtol=1e-9, atol=1e-9) if settings is None else settings
+    settings = Settings(rtol=SWEEP, atol=SWEEP) if settings is None else settings
     systems = _stacked(systems)
     require_x64(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)

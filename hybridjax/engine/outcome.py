@@ -1,0 +1,248 @@
+"""What becomes of lanes after each of them has attempted a step.
+
+As long as no watched function comes near to a zero in any lane, little has to be done (`calmly`);
+otherwise `eventfully` finds out what happened.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.precision import at_precision
+from .._core.results import Result, update_result
+from ..systems.structure import Structure
+from .aim import Aim, Way
+from .attempt import SLOW, Attempt
+from .events import apply_resets, enabled, keep_pace, rearm, width
+from .hermite import CubicCrossing, first_crossing
+from .lanes import Lanes
+from .state import Approach, State, Task
+from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
+from .watch import Watch, pick, watch
+
+
+# Steps below this part of the time allowed (in double and in single precision) are not taken: the
+# lane is stuck. Twice as much gives up one halving earlier.
+_SHORTEST_STEP = 1e-13, 1e-6
+# Attempts to land on a crossing before the step in which it was seen is halved. More of them only
+# cost time where the cubic interpolant is no guide to the crossing.
+_LANDING_TRIES = 8
+# A landing may lie beyond the step in which the crossing was seen by this part of that step, and by
+# this part of the time allowed (in double and in single precision). Twice as much accepts zeros
+# that may belong to the step after it.
+_BEYOND_STEP, _BEYOND_STEP_OF_SPAN = 1e-6, (1e-13, 1e-6)
+# A target's level counts once it is above what its rate makes in this part of the time allowed (in
+# double and in single precision). Twice as much may miss a level that falls right after the start;
+# half may meet one that was at zero up to rounding.
+_LEVEL_CLEAR = 1e-10, 1e-6
+# The next step has this part of the length that the error estimate asks for, and lies between these
+# multiples of the last one (the lowest where the estimate is no number). Nearer to 1, more steps
+# are rejected.
+_CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
+
+
+def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[State, Tape]:
+    """Nothing happened to any lane, except perhaps that it arrived. Also returns the row for the
+    tape."""
+    lanes, active, slack = state.lanes, state.active, task.stride.slack
+    level, on_time = active & new.lands, way.last
+    moved = aim.step + jnp.where(level, new.past, 0.0)
+    t = jnp.where(way.last, way.known, lanes.t + moved)
+    arrived = level | on_time
+    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, lanes.pace.at[0].add(moved))
+    h = jnp.where(active, _next_step(state.h, aim.step, new.error / slack), state.h)
+    late = active & ~arrived & (t >= task.target.limit)
+    code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
+    code = jnp.where(active, code, IDLE).astype(jnp.int32)
+    row = Tape(moved, code, t, new.q, new.q, lanes.chart)
+    end = State(
+        lanes,
+        _merge(active, new.seen, state.seen),
+        state.aimed,
+        state.approach,
+        h,
+        state.error + jnp.where(active, new.error, 0.0),
+        update_result(state.result, late, task.target.missed),
+        state.arrived | arrived,
+        state.i + 1,
+    )
+    return end, row
+
+
+def eventfully(
+    s: Structure, state: State, aim: Aim, way: Way, new: Attempt, task: Task
+) -> tuple[State, Tape]:
+    """Find out what happened to each lane, and let it happen. Also returns the row for the tape."""
+    lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
+    active, target, slack = state.active, task.target, task.stride.slack
+    G = len(s.transitions)
+    near = new.error <= slack
+
+    # 1. Which approaches succeed.
+    tau = approach.tau + new.past
+    beyond = _BEYOND_STEP * approach.reach + at_precision(*_BEYOND_STEP_OF_SPAN) * task.span
+    inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
+    falling = _of(end.rate, aim.which) < 0
+    lands = active & new.lands & falling & jnp.where(approach.on, inside, near)
+    closer = active & approach.on & ~lands & (approach.tries < _LANDING_TRIES)
+    lost = active & approach.on & ~lands & ~closer
+    moved = aim.step + jnp.where(new.lands, new.past, 0.0)
+    t = jnp.where(way.last, way.known, jnp.where(active, lanes.t + moved, lanes.t))
+
+    # 2. What was crossed on the way.
+    ready = state.ready
+    fresh = active & ~approach.on & near
+    crossing = _crossing(fresh | lands, seen, end, moved, ready)
+    zero = width(t, task.span, end.rate)
+    chosen = lands & (np.arange(G + 1)[:, None] == aim.which)
+    old = lands & (jnp.abs(end.value) <= zero)
+    s_first = jnp.where(chosen | old, jnp.inf, crossing.position)
+    which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
+    first = jnp.min(s_first, axis=0)
+    bent = fresh & new.bent
+    crosses = ((fresh | lands) & jnp.isfinite(first)) & ~bent
+    refine = bent | ((fresh | lands) & ~crosses & (crossing.near & ~chosen).any(axis=0))
+    touch = fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0)
+    lands = lands & ~crosses & ~refine
+    chosen = chosen & lands
+    plain = fresh & ~crosses & ~refine & ~lands
+    accept = plain | lands
+
+    # 3. What happens there.
+    clear = end.value > zero
+    ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
+    guard = lands & (aim.which < G)
+    fires = guard & enabled(s, t, new.q, task.u, aim.which)
+    by_clock = plain & (way.schedule >= 0)
+    fired = jnp.where(fires, aim.which, jnp.where(by_clock, way.schedule, -1))
+    level = lands & (aim.which == G)
+    on_time = plain & way.last & ~by_clock
+    arrived = on_time | level | ((fired >= 0) & (fired == target.event))
+    speed = jnp.abs(_of(end.rate, aim.which))
+    slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
+    pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
+    expected = _expected(target.order, lanes.events, fired)
+    falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
+    together = (ready & falls)[:-1].any(axis=0)
+    after = Lanes(
+        jnp.where(accept, t, lanes.t),
+        lanes.chart,
+        jnp.where(accept, new.q, lanes.q),
+        ready[:-1],
+        lanes.events + (fired >= 0),
+        pace,
+    )
+    seen = _merge(accept, end, seen)
+    after, seen, aimed = _reset(s, after, seen, ready[-1], fired, together, task)
+
+    # 4. The next step, and reasons to stop.
+    fastest = jnp.maximum(jnp.abs(_of(state.seen.rate, which)), jnp.abs(_of(end.rate, which)))
+    approach = Approach(
+        crosses | closer,
+        jnp.where(crosses, which, approach.which),
+        jnp.where(crosses, first * moved, jnp.clip(tau, 0.0, approach.reach)),
+        jnp.where(crosses, moved, approach.reach),
+        jnp.where(crosses, fastest, approach.rate),
+        jnp.where(crosses, 0, approach.tries + 1),
+    )
+    adapted = _next_step(state.h, aim.step, new.error / slack)
+    too_long = active & ~state.approach.on & ~near
+    h = jnp.where(plain | too_long, adapted, state.h)
+    h = jnp.where(fired >= 0, jnp.maximum(h, task.stride.h), h)
+    h = jnp.where(refine, 0.5 * aim.step, jnp.where(lost, 0.5 * aim.reach, h))
+    stuck = (too_long | refine | lost) & (h < at_precision(*_SHORTEST_STEP) * task.span)
+    graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
+    result = update_result(state.result, graze, Result.GRAZING)
+    result = update_result(result, stuck, Result.BLOW_UP)
+    result = update_result(result, zeno, Result.ZENO)
+    result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)
+    result = update_result(result, active & ~arrived & (after.t >= target.limit), target.missed)
+
+    code = jnp.where(accept, MOVE, IDLE)
+    code = jnp.where(on_time, ARRIVE_TIME, code)
+    code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
+    row = Tape(moved, code.astype(jnp.int32), t, new.q, after.q, after.chart)
+    error = state.error + jnp.where(accept, new.error, 0.0)
+    arrived = state.arrived | arrived
+    return State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
+
+
+def _crossing(
+    some: Bool[Array, " L"],
+    seen: Watch,
+    end: Watch,
+    moved: Float[Array, " L"],
+    ready: Bool[Array, "W L"],
+) -> CubicCrossing:
+    """What was crossed on the way. (In a branch, so that it is not computed anew by every user.)"""
+
+    def look():
+        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+
+    def nothing():
+        no = jnp.zeros_like(ready)
+        return CubicCrossing(jnp.full_like(end.value, jnp.inf), no, no)
+
+    return jax.lax.cond(some.any(), look, nothing)
+
+
+def _next_step(
+    h: Float[Array, " L"], step: Float[Array, " L"], error: Float[Array, " L"]
+) -> Float[Array, " L"]:
+    """The step after one of length `step` with this error, where h was allowed.
+
+    The estimate is of order 7; three square roots are cheaper than that power, and nearly it.
+    """
+    factor = jnp.clip(_CAUTION / jnp.sqrt(jnp.sqrt(jnp.sqrt(error))), _SHRINK, _GROW)
+    factor = jnp.where(jnp.isfinite(error), factor, _SHRINK_BLINDLY)
+    return jnp.where((step < h) & (error <= 1), jnp.maximum(h, step * factor), step * factor)
+
+
+def _reset(
+    s: Structure,
+    lanes: Lanes,
+    seen: Watch,
+    aimed: Bool[Array, " L"],
+    fired: Int[Array, " L"],
+    together: Bool[Array, " L"],
+    task: Task,
+) -> tuple[Lanes, Watch, Bool[Array, " L"]]:
+    """The lanes after their events, what they see there, and whether they aim at their target."""
+    fires = fired >= 0
+
+    def work():
+        q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
+        new = eqx.tree_at(lambda x: (x.q, x.chart), lanes, (q, chart))
+        after = watch(s, new.t, chart, q, task.u, task.target, fires)
+        residue = jnp.abs(_of(seen.value, fired))
+        new = rearm(s, new, after, fired, together, task.span, task.u, residue)
+        return new, _merge(fires, after, seen), jnp.where(fires, aims(after, task.span), aimed)
+
+    return jax.lax.cond(fires.any(), work, lambda: (lanes, seen, aimed))
+
+
+def aims(seen: Watch, span: Float[Array, " L"]) -> Bool[Array, " L"]:
+    """Whether the target's level is clearly positive, so that its next fall counts."""
+    return seen.value[-1] > at_precision(*_LEVEL_CLEAR) * span * jnp.abs(seen.rate[-1])
+
+
+def _merge(mask: Bool[Array, " L"], new: Watch, old: Watch) -> Watch:
+    return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
+
+
+def _of(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
+    """Each lane's entry in the row `which`; 0 for -1."""
+    return pick(x, range(len(x)), which)
+
+
+def _expected(
+    order: tuple[int, ...] | None, events: Int[Array, " L"], fired: Int[Array, " L"]
+) -> Bool[Array, " L"]:
+    """Whether the next event of each lane is the one that the limit cycle has."""
+    if order is None:
+        return jnp.ones(fired.shape, bool)
+    if not order:
+        return jnp.zeros(fired.shape, bool)
+    return jnp.array(order)[events % len(order)] == fired

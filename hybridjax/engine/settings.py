@@ -1,0 +1,92 @@
+"""Accuracy and effort of the flow, and every accuracy that the package takes by default."""
+
+import functools as ft
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._core.precision import at_precision
+from .solver.step import Step
+
+
+# Default accuracies: the error that one step may have, relative to the size of each state. A tenth
+# of the accuracy costs about 1.4 times as many steps (the method has order 7).
+SIMULATION = 1e-10
+"""Single trajectories (`simulate`), and settings that do not say."""
+LIMIT_CYCLE = 1e-12
+"""Limit cycles, and all that is linearized along them."""
+SWEEP = 1e-9
+"""Many limit cycles at once (`find_limit_cycles`)."""
+TRANSIENT = 1e-6
+"""Waiting until transients have died out, where a sweep's Newton fails."""
+
+# Accuracies of data: the error at every section, accumulated since the start of an experiment,
+# relative to the size of each state on the limit cycle.
+EXPERIMENT = 1e-9
+"""Experiments in double precision, and response functions."""
+SINGLE_PRECISION_EXPERIMENT = 1e-4
+"""Experiments in single precision."""
+STEADY_START = 1e-10
+"""Starts of periodic responses, relative to the sizes of time and states."""
+
+
+# Rounding errors of a time or a state, relative to it, in double and in single precision. Twice as
+# much: events that are as near to each other are taken for one.
+ROUNDING = 4e-15, 2e-6
+
+
+def _number(x) -> Array:
+    return jnp.asarray(x, float)
+
+
+def _numbers(x) -> Array | None:
+    return None if x is None else jnp.asarray(x, float)
+
+
+class Settings(eqx.Module):
+    """Accuracy and effort of the flow.
+
+    The estimated error of a step in state k of chart a is at most
+    `rtol * |q[k]| + atol * scale[a, k]`.
+    """
+
+    rtol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    """Error of a step relative to each state's own size."""
+    atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    """Error of a step relative to each state's `scale`."""
+    max_steps: int = eqx.field(static=True, default=256)
+    """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
+    scale: Float[Array, "A d"] | None = eqx.field(converter=_numbers, default=None)
+    """Sizes that states usually have, by chart, padded to the dimension of the largest with
+    anything above zero. `None`: sizes are taken from each step (see `tolerance`)."""
+
+    # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
+
+    def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
+        """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`
+        is small, those that the states usually have (1 if that is not known)."""
+        own = ft.reduce(jnp.maximum, map(jnp.abs, q))
+        usual = 1.0 if self.scale is None else self.scale[a, : len(own)].reshape(len(own), -1)
+        return own + self.atol / self.rtol * usual
+
+    def tolerance(
+        self,
+        size: Float[Array, "n L"],
+        q: Float[Array, "n L"],
+        tau: Float[Array, " #L"],
+        step: Step,
+    ) -> Float[Array, "n L"]:
+        """The error that a step of length tau from states `q` may have, where `size` is theirs.
+
+        Where the usual sizes are not known, a state is taken to be as large as it is at the ends
+        of the step, or as it would become at the rates there if that is more, and rounding errors
+        of the largest of all states are allowed in each.
+        """
+        if self.scale is not None:
+            return self.rtol * size
+        own = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
+        change = jnp.abs(tau) * jnp.maximum(jnp.abs(step.f0), jnp.abs(step.f1))
+        rounding = at_precision(*ROUNDING) * jnp.max(own, axis=0, initial=0.0)
+        tolerance = self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
+        return jnp.maximum(tolerance, jnp.finfo(own.dtype).tiny)  # where all is at rest at zero

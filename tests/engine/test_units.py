@@ -1,0 +1,169 @@
+"""The flow does not depend on the units in which a system is written."""
+
+import functools as ft
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import move, record
+from hybridjax.engine.settings import Settings
+from hybridjax.engine.target import until
+from hybridjax.systems.structure import Structure
+
+from ..toys import Field
+
+
+# Lengths and times in these units. Powers of two change no rounding: all decisions are the same.
+UNITS = [(2.0**20, 1.0), (2.0**-30, 1.0), (1.0, 2.0**10), (2.0**-20, 2.0**-8)]
+SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
+
+
+def hopper(length=1.0, time=1.0):
+    """The hopper with lengths and times multiplied."""
+    return hj.models.VerticalHopper(
+        l0=2.0 * length,
+        a=20.0 * length / time**2,
+        g=2.0 * length / time**2,
+        k=10.0 / time**2,
+        b=5.0 / time,
+        omega=2 * np.pi / time,
+    )
+
+
+def sizes(length, time):
+    """By which the hopper's states are multiplied."""
+    return length * jnp.array([1.0, 1 / time, 1.0, 1 / time])
+
+
+def begin(system, length, time):
+    """A lane at the top of a hop, and one on the ground."""
+    q = np.array([[2.2, 0.0, 0.3, 0.1], [2.0, 1.9, 0.0, 0.0]]) * sizes(length, time)
+    return start_lanes(Structure(system), jnp.zeros(2), jnp.array([0, 1], jnp.int32), q.T)
+
+
+@ft.partial(jax.jit, static_argnums=3)
+def flow(length, time, scale, tangents):
+    """Steps, codes and states (in the units of 1, 1) of a second and a half."""
+    system = hopper(length, time)
+    lanes, u = begin(system, length, time), jnp.zeros((1, 2))
+    settings = Settings(1e-10, 1e-10, 256, scale)
+    end = until(jnp.full(2, 1.5 * time))
+    moved, tape = record(Structure(system), lanes, u, end, settings, tangents=tangents)
+    return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
+
+
+@pytest.mark.parametrize("tangents", [False, True])
+def test_the_same_steps_in_all_units(tangents):
+    h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
+    np.testing.assert_array_equal(result, hj.Result.OK)
+    assert jnp.max(code) >= 0
+    for length, time in UNITS:
+        other = flow(length, time, SIZES * sizes(length, time), tangents)
+        for x, y in zip((h, code, q), other, strict=False):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_micrometers_and_milliseconds():
+    _, _, q, _ = flow(1.0, 1.0, SIZES, False)
+    for length, time in ((1e6, 1.0), (1e-9, 1.0), (1.0, 1e3), (1e-9, 1e9)):
+        _, _, other, _ = flow(length, time, SIZES * sizes(length, time), False)
+        np.testing.assert_allclose(other, q, rtol=1e-11, atol=1e-11)
+
+
+def test_sizes_of_each_of_many_flows_and_derivatives():
+    """Mapped over sizes: finer ones are more accurate. Derivatives in both modes agree."""
+    system = hopper()
+    lanes = begin(system, 1.0, 1.0)
+
+    def end(u, scale, rtol=1e-13, atol=1.0):
+        target = until(jnp.full(2, 1.5))
+        settings = Settings(rtol, atol, 256, scale)
+        return move(Structure(system), lanes, jnp.full((1, 2), u), target, settings).lanes.q
+
+    scales = SIZES * np.array([1e-13, 1e-12, 1e-4, 1.0])[:, None, None]
+    truth, *found = jax.jit(jax.vmap(lambda scale: end(0.1, scale)))(scales)
+    errors = [np.max(np.abs(q - truth)) for q in found]
+    assert errors[0] < 1e-12 and 1e-8 < errors[1] < 1e-5 < errors[2] < 1e-2
+
+    along = lambda scale: lambda u: end(u, scale, 1e-12, 1e-12)  # noqa: E731
+    forward = lambda scale: jax.jvp(along(scale), (0.1,), (1.0,))[1]  # noqa: E731
+    rates = jax.jit(jax.vmap(forward))(SIZES * np.array([1.0, 10.0])[:, None, None])
+    np.testing.assert_allclose(rates[0], rates[1], rtol=1e-9, atol=1e-9)
+    reverse = jax.jit(jax.grad(lambda u: jnp.sum(along(SIZES)(u))))(0.1)
+    np.testing.assert_allclose(reverse, jnp.sum(rates[0]), rtol=1e-9)
+
+
+# --- Single trajectories, whose usual sizes are not known -----------------------------------------
+
+
+def run(length, time):
+    system = hopper(length, time)
+    state = np.array([2.0, 1.9]) * sizes(length, time)[:2]
+    return hj.simulate(system, "stance", state, 3.0 * time)
+
+
+@pytest.mark.parametrize("length, time", UNITS)
+def test_a_trajectory_takes_the_same_steps_in_all_units_of_length(length, time):
+    """In units of time, too, but for the first step."""
+    usual, other = run(1.0, 1.0), run(length, time)
+    if time == 1.0:
+        np.testing.assert_array_equal(other.t, usual.t)
+    assert [e.name for e in other.events] == [e.name for e in usual.events]
+    ends = [x.after[-1] / sizes(*u) for x, u in ((usual, (1.0, 1.0)), (other, (length, time)))]
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9, atol=1e-9)
+    times = [[e.time for e in x.events] for x in (usual, other)]
+    np.testing.assert_allclose(np.array(times[1]) / time, times[0], rtol=1e-10)
+
+
+class Any(hj.HybridSystem):
+    """One chart with any field."""
+
+    function: Callable = eqx.field(static=True)
+    n: int = eqx.field(static=True)
+
+    def charts(self):
+        return {"x": Field(tuple(f"x{k}" for k in range(self.n)), self.function)}
+
+
+SPRING = lambda t, q, u: (q[1], 9.81 - 100.3 * (q[0] - 0.1))  # noqa: E731
+CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
+
+
+@pytest.mark.parametrize(
+    "function, start, end",
+    [
+        pytest.param(lambda t, q, u: (q[1], -q[0]), (0.0, 0.0), (0.0, 0.0), id="zero"),
+        pytest.param(lambda t, q, u: (-q[0], 0.0), (1.0, 0.0), (np.exp(-10), 0), id="a counter"),
+        pytest.param(
+            SPRING, (0.1 + 9.81 / 100.3, 0.0), (0.1 + 9.81 / 100.3, 0.0), id="rest up to rounding"
+        ),
+        pytest.param(
+            lambda t, q, u: (-q[0], 1e-17 * q[0]), (1.0, 0.0), (np.exp(-10), 0), id="rounding level"
+        ),
+        pytest.param(CHAIN, (0.0,) * 5, None, id="a chain of integrators from zero"),
+    ],
+)
+def test_states_at_rest_stop_nothing(function, start, end):
+    found = hj.simulate(Any(function, len(start)), "x", start, 10.0)
+    assert len(found.t) < 150
+    if end is None:
+        t = 10.0
+        end = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
+        np.testing.assert_allclose(found.after[-1][1:], end, rtol=1e-9)
+    else:
+        np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
+
+
+def test_a_weak_force_counts_where_it_is_all_there_is():
+    """From rest at zero under a force of 1e-9, to as many digits as under a force of 1."""
+    found = hj.simulate(
+        Any(lambda t, q, u: (q[1], -q[0] + 1e-9 * jnp.sin(t)), 2), "x", (0.0, 0.0), 10.0
+    )
+    exact = 0.5e-9 * (np.sin(10.0) - 10.0 * np.cos(10.0))
+    np.testing.assert_allclose(found.after[-1, 0], exact, rtol=1e-8)
