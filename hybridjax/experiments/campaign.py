@@ -190,7 +190,12 @@ def prepare(
     execution = divide(together, execution)
     samples = inputs.cycles * N
     small = len(inputs) * samples <= _SMALL
-    with _compiling_ahead(_FLOW[small], placed, (execution.batch, samples, nu), z, execution):
+    if options.record_events:  # what has room for the events is known after the plan
+        ahead = contextlib.nullcontext()
+    else:
+        shape = execution.batch, samples, nu
+        ahead = _compiling_ahead(_FLOW[small], placed, shape, z, execution)
+    with ahead:
         single = execution.precision == "single"
         stepping = (plan_single if single else plan_flow)(placed, accuracy)
     if start == "cycle":

@@ -63,3 +63,29 @@ def test_events_are_saved_with_the_data(events, tmp_path):
     assert back.events.names == events.names and back.error is None
     with np.load(tmp_path / "data.npz") as file:
         assert "simulated.events.time" in file.files
+
+
+def test_experiments_record_their_events(hopper_cycle, placed_isochrons, tmp_path):
+    u = np.zeros((3, 3 * 32, 1))
+    u[1] = 0.05 * np.random.default_rng(0).standard_normal(u[1].shape)
+    u[2, 32:48] = 60.0
+    arguments = hopper_cycle, placed_isochrons, u, "yM"
+    data = hj.run_experiments(*arguments, discard=0, record_events=True)
+    events = data.events
+    assert list(data.ok) == [True, True, False]
+    np.testing.assert_array_equal(events.count[:2], 6)
+    np.testing.assert_allclose(
+        events.cycle_time, [0.35098179 + 0.27665765, 0.51631443 + 0.27665765]
+    )
+    assert np.abs(events.deviations[0]).max() < 1e-11
+    assert 1e-5 < np.abs(events.deviations[1]).max() < 0.1
+    assert {e.name for e in events.of(1)} == {"touchdown", "liftoff"}
+    without = hj.run_experiments(*arguments, discard=0)
+    assert without.events is None
+    np.testing.assert_allclose(without.y, data.y, rtol=0, atol=1e-13)
+    stored = hj.experiments.store_experiments(
+        tmp_path, *arguments, discard=0, record_events=True, chunk=2
+    )
+    for part, rows in zip(stored, (slice(0, 2), slice(2, 3)), strict=True):
+        count = part.events.time.shape[1]
+        np.testing.assert_allclose(part.events.time, events.time[rows, :count], atol=1e-11)
