@@ -45,7 +45,7 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
-        N, PERIODS, f_max=min(4.0, N / 2), amplitude=case.amplitude or 1.0, lines="odd"
+        N, PERIODS, band=(0, min(4.0, N / 2)), amplitude=case.amplitude or 1.0, lines="odd"
     )
     estimate = None
     if case.amplitude:

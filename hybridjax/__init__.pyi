@@ -13,6 +13,7 @@ from . import (
     testing as testing,
 )
 from ._core.compilation_cache import enable_compilation_cache as enable_compilation_cache
+from ._core.execution import Execution as Execution
 from ._core.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result

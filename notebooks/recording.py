@@ -143,7 +143,7 @@ figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 # A multisine as a table: by phase, for hardware that triggers on it, or against time.
 
 # %%
-design = hj.multisine(periods=64, f_max=8.0, lines="odd").scaled(rms=0.02)
+design = hj.multisine(periods=64, band=(0, 8.0), lines="odd").scaled(rms=0.02)
 with tempfile.TemporaryDirectory() as folder:
     hj.recordings.write_design(Path(folder) / "by_phase.csv", design)
     print((Path(folder) / "by_phase.csv").read_text()[:120])

@@ -1,5 +1,6 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -47,12 +48,14 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         return [one.result() for one in running]
 
 
-def meanwhile(work: Callable[[], Any]) -> None:
-    """Begin with `work` in a thread of its own, under the caller's configuration of JAX. What it
-    returns or raises is lost: it only makes ready what will be asked for again."""
-    pool = ThreadPoolExecutor(1)
-    pool.submit(_configured(work))
-    pool.shutdown(wait=False)
+@contextlib.contextmanager
+def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
+    """A context during which `work` is done in a thread of its own, under the caller's
+    configuration of JAX. It ends when both have ended, and raises what `work` raised."""
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(_configured(work))
+        yield
+        running.result()
 
 
 def _cores() -> int:

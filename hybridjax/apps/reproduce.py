@@ -151,13 +151,14 @@ def _design(protocol: Protocol) -> Design:
             "transient must die out first."
         )
     f_max = min(10.0, protocol.n_sections / 2 - 1 / protocol.keep)
-    arguments = (protocol.n_sections, protocol.keep, f_max, protocol.amplitude, protocol.seed)
+    band = (0.0, f_max)
+    arguments = (protocol.n_sections, protocol.keep, band, protocol.amplitude, protocol.seed)
     cosines = 2 * f_max * protocol.keep / protocol.experiments
     room = cosines <= protocol.keep / 4  # a quarter of the classes in each experiment
     return paper_design(
         *arguments,
+        division="sum-free" if room else "random",
         experiments=protocol.experiments,
-        second_order="avoid" if room else "ignore",
     )
 
 

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.plan import Plan
-from ..experiments.respond import respond
+from ..experiments.flow_batch import flow_batch
 from ..experiments.response_function import response_function
+from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..maps.linearize import linearize
@@ -155,7 +155,7 @@ class ObservedSeries(AbstractObservation):
         placed = place_sections(cycle, self.sections)
         start = jnp.tile(placed.section_zero[:, None], len(self.u))
         plan, settings = self.flow
-        y = respond(placed, plan, start, self.u, self.outputs, settings).y
+        y = flow_batch(placed, plan, start, self.u, self.outputs, settings).y
         if not self.absolute:
             y = y - jnp.tile(placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1))
         return ((y - self.y) / self.scale).ravel()
@@ -167,7 +167,10 @@ class ObservedSeries(AbstractObservation):
             )
         response = response_function(cycle, self.sections, self.outputs)
         return eqx.tree_at(
-            lambda o: o.flow, self, (response.plan, response.settings), is_leaf=lambda x: x is None
+            lambda o: o.flow,
+            self,
+            (response.stepping.plan, response.stepping.settings),
+            is_leaf=lambda x: x is None,
         )
 
 

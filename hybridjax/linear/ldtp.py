@@ -263,24 +263,28 @@ class LDTP(eqx.Module):
         **Raises:** `DefinitionError` if `u` has another length, or a multiplier is a `P`-th root
         of one within `1e-8`: then no such state exists.
         """
-        u = self._input(u)
-        if periods < 1 or u.shape[0] != periods * self.n_sections:
+        return self.periodic_states(self._input(u)[None], periods)[0]
+
+    def periodic_states(self, u: ArrayLike, periods: int) -> Float[Array, "S d"]:
+        """As `periodic_state`, for S inputs (S, P N, nu) at once."""
+        u = self._input(u, ndim=3)
+        if periods < 1 or u.shape[1] != periods * self.n_sections:
             raise DefinitionError(
-                f"`u` has {u.shape[0]} samples, but {periods} periods of {self.n_sections} "
+                f"`u` has {u.shape[1]} samples, but {periods} periods of {self.n_sections} "
                 f"sections are {periods * self.n_sections}."
             )
         self._refuse_resonance(np.arange(periods) / periods)
-        by_period = u.reshape(periods, self.n_sections, -1)
-        return time_response.periodic_state(self.A, self.B, by_period)
+        by_period = u.reshape(len(u), periods, self.n_sections, -1)
+        return time_response.periodic_states(self.A, self.B, by_period)
 
     def _sections_from(self, first_section, u):
         return (first_section + jnp.arange(u.shape[0])) % self.n_sections
 
-    def _input(self, u):
-        u = real_array("u", u, ndim=2)
-        if u.shape[1] != len(self.inputs):
+    def _input(self, u, ndim=2):
+        u = real_array("u", u, ndim)
+        if u.shape[-1] != len(self.inputs):
             raise DefinitionError(
-                f"`u` has {u.shape[1]} columns, but the inputs are ({', '.join(self.inputs)})."
+                f"`u` has {u.shape[-1]} columns, but the inputs are ({', '.join(self.inputs)})."
             )
         return u
 

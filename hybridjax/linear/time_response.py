@@ -63,21 +63,22 @@ def impulse_response(
 
 
 @jax.jit
-def periodic_state(
-    A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "P N nu"]
-) -> Float[Array, " d"]:
-    r"""The start of the response with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
+def periodic_states(
+    A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "S P N nu"]
+) -> Float[Array, "S d"]:
+    r"""The starts of responses with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
 
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.
     """
-    periods, n_sections, _ = u.shape
+    _, periods, n_sections, _ = u.shape
     zero = jnp.zeros(A.shape[-1])
-    w = jax.vmap(lambda u: states(A, B, u, zero, jnp.arange(n_sections))[-1])(u)
+    after_one = jax.vmap(lambda u: states(A, B, u, zero, jnp.arange(n_sections))[-1])
+    w = jax.vmap(after_one)(u)
     z_N = jnp.exp(2j * jnp.pi * jnp.arange(periods) / periods)
     resolvent = z_N[:, None, None] * jnp.eye(A.shape[-1]) - monodromy(A)
-    x = jnp.linalg.solve(resolvent, jnp.fft.fft(w, axis=0)[..., None])
-    return jnp.mean(x[..., 0], axis=0).real
+    x = jnp.linalg.solve(resolvent, jnp.fft.fft(w, axis=1)[..., None])
+    return jnp.mean(x[..., 0], axis=1).real
 
 
 @jax.jit

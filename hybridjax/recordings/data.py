@@ -81,7 +81,7 @@ class SectionData(eqx.Module):
             periods=periods,
             inputs=self.inputs,
             outputs=self.outputs,
-            family="recorded",
+            label="recorded",
         )
 
     def __repr__(self) -> str:

@@ -7,7 +7,7 @@ import hybridjax as hj
 
 def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     family = hj.ClockPhase(8, anchor=hj.Crossing("v", "falling"))
-    design = hj.multisine(n_sections=8, periods=4, f_max=2.0)
+    design = hj.multisine(n_sections=8, periods=4, band=(0, 2.0))
     with pytest.raises(hj.DefinitionError, match=r"has no clock.*multiplier of exactly 1.*Kinemat"):
         hj.run_experiments(vanderpol_cycle, family, design, "x")
     # Between such sections the multiplier 1 is there, and makes whole frequencies resonant.

@@ -14,7 +14,7 @@ from ..linear.conftest import blocks_at_random
 DESIGNS = {
     "paper": hj.paper_design(),
     "minimum": hj.multisine(),
-    "two-phase": hj.multisine(half_integers="two-phase"),
+    "two-phase": hj.multisine(lines="two-phase"),
 }
 
 
@@ -48,7 +48,7 @@ def test_any_system_is_identified_exactly(shape, seed):
     model = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
     N = len(dims)
     top = N * periods // 2 / periods
-    design = hj.multisine(N, periods, top, 1.0, seed, half_integers="two-phase", inputs=nu)
+    design = hj.multisine(N, periods, (0, top), 1.0, seed, lines="two-phase", inputs=nu)
     estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
     np.testing.assert_array_equal(estimate.f, design.frequencies)
     exact = model.htf(estimate.f)

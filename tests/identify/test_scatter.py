@@ -9,7 +9,7 @@ import hybridjax as hj
 
 
 N, P = 4, 16
-LINES = hj.multisine(N, P, 2.0, 0.1, experiments=4)
+LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +19,14 @@ def model():
     return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
-def realized(model, count, repeats=1, noise=0.0, seed=0, **more):
+def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
     design = LINES.realizations(count, seed)
     data = hj.experiments.simulate_experiments(
-        model, design, start="periodic", discard=(repeats - 1) * P, seed=seed, **more
+        model,
+        design,
+        start="periodic",
+        discard=(repeats - 1) * P,
+        process_noise=hj.experiments.ProcessNoise(process_noise, seed),
     )
     return hj.experiments.add_noise(data, std=noise, seed=seed)
 
@@ -158,7 +162,7 @@ def test_noise_by_its_ratio(model):
     for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
         with pytest.raises(hj.DefinitionError):
             hj.experiments.add_noise(data, **bad)
-    with pytest.raises(hj.DefinitionError, match="process_noise must be finite"):
+    with pytest.raises(hj.DefinitionError, match="std of process noise must be finite"):
         realized(model, 1, process_noise=-1.0)
 
 

@@ -10,7 +10,7 @@ from ..linear.conftest import hopper as hopper
 
 @pytest.fixture(scope="module")
 def full():
-    return hj.multisine(periods=12, f_max=3.0)
+    return hj.multisine(periods=12, band=(0, 3.0))
 
 
 def errors(model, data, harmonics=(-1, 0, 1)):

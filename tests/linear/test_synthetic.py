@@ -49,6 +49,6 @@ def test_transfer_functions(model, f, m):
 
 
 def test_experiments_find_its_transfer_functions(model):
-    design = hj.multisine(n_sections=6, periods=16, f_max=2.0, inputs=2, amplitude=0.1)
+    design = hj.multisine(n_sections=6, periods=16, band=(0, 2.0), inputs=2, amplitude=0.1)
     estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
     assert np.max(estimate.error(model.htf(estimate.f, estimate.harmonics))) < 1e-12

@@ -168,7 +168,7 @@ def test_poles_and_zeros(rational):
 
 def test_experiment(hopper):
     data = hj.experiments.simulate_experiments(
-        hopper, hj.multisine(periods=4, f_max=2.0), discard=2
+        hopper, hj.multisine(periods=4, band=(0, 2.0)), discard=2
     )
     figure = hj.plot.experiment(data, -1, labels={"yM": "$y_M$"}).figure
     assert [ax.get_ylabel() for ax in figure.axes] == ["u", r"$\delta$ $y_M$", r"$\delta$ vM"]
@@ -184,7 +184,12 @@ def test_failed_experiment():
     y = np.ones((1, 8, 1))
     y[0, 5:] = np.nan
     data = hj.ExperimentData(
-        np.zeros((1, 8, 1)), y, n_sections=2, periods=2, result=[hj.Result.GRAZING], failed_at=[5]
+        np.zeros((1, 8, 1)),
+        y,
+        n_sections=2,
+        periods=2,
+        result=[hj.Result.GRAZING],
+        simulated=hj.experiments.Simulated(np.array([5])),
     )
     figure = hj.plot.experiment(data).figure
     assert "grazing" in figure.axes[0].get_title()

@@ -95,7 +95,7 @@ def test_bad_arguments(wave):
 
 
 def test_designs_as_tables(tmp_path, wave):
-    design = hj.multisine(n_sections=8, periods=16, f_max=2.0)
+    design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
     table = hj.recordings.read_design(tmp_path / "phase.csv")
     np.testing.assert_allclose(table["u"], design.inputs(19)[:, :, 0], atol=1e-9)

@@ -4,8 +4,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData, simulate_experiments
+from ...experiments.data import ExperimentData
 from ...experiments.design.design import Design
+from ...experiments.linear_model import simulate_experiments
 from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP

@@ -86,7 +86,7 @@ def estimate_htf(
         raise DefinitionError(
             f"f = {f:.10g} lies on a multiple of 1/2 and was measured with one phase only: "
             "measure it in a second experiment with a phase 90 degrees apart "
-            "(half_integers='two-phase' in the design does so), or leave it out here with "
+            "(multisine(lines='two-phase') does so), or leave it out here with "
             "half_integers='skip' and use HTF.interpolate."
         )
     rows = np.flatnonzero(sums.solvable(sums.ran))

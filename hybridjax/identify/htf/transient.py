@@ -8,13 +8,15 @@ multipliers is gone). So all amplitudes are linear unknowns that can be projecte
 multipliers alone are left to be found (variable projection: Golub and Pereyra 1973).
 """
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData
+from ...experiments.data import ExperimentData, Simulated
 from ...experiments.design.partition import line_class
 
 
@@ -134,9 +136,9 @@ def remove_transient(
     roots = np.roots(np.r_[1.0, known])
     roots = roots[np.lexsort((-roots.imag, -np.abs(roots)))].astype(complex)
     failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
-    data = eqx.tree_at(
-        lambda d: (d.u, d.y, d.failed_at), data, (data.u[:, skip * N :], clean, failed_at)
-    )
+    # Events, some of which lie in the cycles that were cut off, are left out.
+    simulated = None if data.simulated is None else Simulated(failed_at, data.error)
+    data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
     return TransientFit(data, roots, removed)
 
 

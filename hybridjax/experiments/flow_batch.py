@@ -10,17 +10,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
-from ..engine.move import move
+from ..engine.move import Moved, move
 from ..engine.settings import Settings
 from ..maps.outputs import observe
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
 from ..systems.structure import Structure
-from .plan import Plan
+from .stepping.plan import Plan
 
 
-# Error that rounding alone may leave, relative to the states' scales.
+# The error that rounding alone may leave at a section, relative to the states' scales. Twice as
+# much is seen in `error` only where accuracies near 1e-13 are asked for.
 ROUNDING = 1e-13
+
+
+class EventLog(NamedTuple):
+    """Events of S experiments between consecutive sections, the first K of each interval."""
+
+    time: Float[Array, "S n K"]
+    """Since the limit cycle passed section 0 at the start of this turn."""
+    event: Int[Array, "S n K"]
+    """Transitions by index; beyond `count` without meaning, as their times."""
+    count: Int[Array, "S n"]
+    """How many events there were, which may be more than K."""
 
 
 class Response(NamedTuple):
@@ -29,25 +41,33 @@ class Response(NamedTuple):
     y: Float[Array, "S n ny"]
     """Outputs at the sections, before the new input acts; NaN after a failure."""
     result: Int[Array, " S"]
+    """Codes of `Result`."""
     failed_at: Int[Array, " S"]
     """The sample at which an experiment failed, or -1."""
     error: Float[Array, " S"]
     """Estimate of the largest error of (t, q) at any section, relative to the states' scales."""
+    end: Float[Array, "S m"]
+    """Times and states on section 0 after the last sample, the time counted within one period as
+    that of the start is; NaN after a failure."""
+    log: EventLog | None
+    """Events, if they were asked for."""
 
 
-def respond(
+def flow_batch(
     placed: PlacedSections,
     plan: Plan,
     start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
     outputs: Sequence[str | Output],
     settings: Settings,
+    event_log: int = 0,
 ) -> Response:
     """Flow S experiments from section 0 through n sections under inputs held between them, n a
     multiple of N.
 
-    `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse
-    mode stores the states at the sections, and computes what lies between them again.
+    `start` holds times and (padded) states at section 0; `event_log`, how many events between two
+    sections are kept. Differentiable in both modes; reverse mode stores the states at the sections,
+    and computes what lies between them again.
     """
     system, cycle = placed.cycle.system, placed.cycle
     s = Structure(system)
@@ -67,7 +87,10 @@ def respond(
         turns = (j == 0).astype(jnp.int32)
         target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.event_sequence)
-        moved = move(s, lanes, u, target, settings, plan.stride(i, S), result, glide=True)
+        stride = plan.stride(i, S)
+        moved = move(
+            s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log
+        )
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1
@@ -80,12 +103,24 @@ def respond(
         )
         ok = result == Result.OK
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
-        return (lanes, result), (y, ok, jax.lax.stop_gradient(share))
+        return (lanes, result), (
+            y,
+            ok,
+            jax.lax.stop_gradient(share),
+            _log(moved, first.t) if event_log else None,
+        )
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
     begin = (lanes, jnp.zeros(S, jnp.int32))
-    (_, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
+    (lanes, result), (y, ok, shares, log) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
-    turns = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = ROUNDING + jnp.max(turns, axis=0)
-    return Response(jnp.transpose(y, (2, 0, 1)), result, failed_at, error)
+    each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
+    error = ROUNDING + jnp.max(each_turn, axis=0)
+    end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
+    y, log = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x, -1, 0), (y, log))
+    return Response(y, result, failed_at, error, end.T, log)
+
+
+def _log(moved: Moved, beginning: Float[Array, " 1"]) -> EventLog:
+    """The events on the way to one section, time counted from `beginning`."""
+    return EventLog(moved.log.time - beginning, moved.log.event, moved.log.count)

@@ -4,7 +4,6 @@ A plan serves prediction, step lengths and error estimates, not control flow: la
 way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,36 +12,51 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.compile import quick_jit
-from .._core.memo import Memory
-from .._core.results import Result
-from ..engine.move import move
-from ..engine.settings import Settings
-from ..engine.stride import Stride
-from ..engine.watch import watch
-from ..errors import DefinitionError
-from ..maps.place import PATIENCE
-from ..maps.placed import PlacedSections
-from ..systems.structure import Structure
+from ..._core.compile import quick_jit
+from ..._core.memo import Memory
+from ..._core.results import Result
+from ...engine.move import move
+from ...engine.settings import Settings
+from ...engine.stride import Stride
+from ...engine.watch import watch
+from ...errors import DefinitionError
+from ...maps.place import PATIENCE
+from ...maps.placed import PlacedSections
+from ...systems.structure import Structure
 
 
 # Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
-# steps whose error estimate is at most this part of the tolerance.
-_PIECES = (1, 2, 3, 4, 6, 8)
-_PARTS = (1.0, 1e-2, 1e-4)
-# The reference, and the differences that give the sensitivities.
-_TIGHT, _NUDGE = 1e-13, 1e-6
-# Room for the way to a level, which takes longer in some lanes than on the cycle.
+# steps whose error estimate is at most this part of the tolerance. Twice as many of either take
+# longer to try, and find ways that are a little cheaper.
+_EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
+_TOLERANCES = (1.0, 1e-2, 1e-4)
+# The relative tolerance of the reference to which the ways are compared. Twice as much shows where
+# accuracies near 1e-13 are asked for.
+_REFERENCE_RTOL = 1e-13
+# The step of the differences that give section maps, relative to the states' scales. With twice the
+# step, twice as much of the maps' curvature is taken for their slope.
+_DIFFERENCE = 1e-6
+# Room for the way to a level, which takes longer in some lanes than on the cycle, as a ratio of
+# times. Twice as much makes equal steps longer than they need to be.
 _ROOM = 1.25
-# A step may have this many times its error estimate on the cycle, where the accuracy allows it.
-_SLACK = 10.0
-# Turns over which errors are followed; the rest is a geometric series.
-_TURNS = 8
-# Estimates are this many times the error that accumulates on the cycle, and credit is given for
-# cancellation up to a factor.
-_CAUTION, _CANCEL = 3.0, 30.0
-# Errors per section that are taken for granted, relative to the states' scales.
+# A step may have up to this many times its error estimate on the cycle, where the accuracy allows
+# it. Twice as much lets lanes far from the cycle go twice as wrong before their steps get shorter.
+_MOST_SLACK = 10.0
+# Periods over which errors are followed; the rest is a geometric series. Twice as many plan for
+# longer, and matter where multipliers are near the unit circle.
+_PERIODS = 8
+# Estimates are this many times the error that accumulates on the cycle. Twice as much doubles
+# `ExperimentData.error`.
+_CAUTION = 3.0
+# Errors of different sections cancel in part; credit for it is given up to this ratio. Twice as
+# much lets estimates be half as large where nearly everything cancels.
+_MOST_CANCELLATION = 30.0
+# Errors per section that are taken for granted, relative to the states' scales: a few units in the
+# last place. Twice as much changes nothing above accuracies of 1e-13.
 _ROUNDING = 1e-15
+# Accuracies, relative to the states' scales, that a plan can be made for. Below the least, rounding
+# is larger; beyond the largest, the cycle tells little about lanes beside it.
+_LEAST_ACCURACY, _LARGEST_ACCURACY = 1e-13, 1e-2
 
 
 class Plan(eqx.Module):
@@ -50,10 +64,10 @@ class Plan(eqx.Module):
 
     **Fields:**
 
-    - `h`: first step; `lead`, `slack`: see `flow.stride.Stride`.
+    - `h`: first step; `lead`, `slack`: see `engine.stride.Stride`.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
         cycle and relative to the states' scales: the largest that it ever leads to at a later
-        section, summed over all turns as if each made the same error.
+        section, summed over all periods as if each made the same error.
     """
 
     h: Float[Array, " N"]
@@ -78,7 +92,7 @@ def make_plan(
     ways = jax.device_get(_try_ways(placed, settings, jnp.asarray(scale)))
     K = len(ways.estimate)
     exact = ways.ends[:, K]
-    J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _NUDGE, (2, 0, 1))
+    J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _DIFFERENCE, (2, 0, 1))
     J = J / scale[:, None, :]
     J[~np.asarray(placed.time_is_state), :, 0] = 0.0
     error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
@@ -95,14 +109,16 @@ def make_plan(
         total = impact[best, section].sum()
         if total <= accuracy:
             break
-    spare = np.clip(accuracy / total, 1e-6, _SLACK)
+    spare = np.clip(accuracy / total, 1e-6, _MOST_SLACK)
     impact, estimate = impact[best, section], estimate[best, section]
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
     together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
-    weight = impact / estimate * np.maximum(together, 1 / _CANCEL)
+    weight = impact / estimate * np.maximum(together, 1 / _MOST_CANCELLATION)
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
     share = np.minimum(accuracy * estimate / impact, 1.0) / N
-    slack = np.where(best < len(_PIECES), np.maximum(spare * estimate, share), ways.slack[best])
+    slack = np.where(
+        best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
+    )
     return Plan(*map(jnp.asarray, (ways.first[best, section], ways.lead, slack, weight)))
 
 
@@ -123,7 +139,7 @@ class _Ways(NamedTuple):
 @quick_jit
 def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N n"]) -> _Ways:
     N, n = scale.shape
-    K = len(_PIECES) + len(_PARTS)
+    K = len(_EQUAL_STEPS) + len(_TOLERANCES)
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
@@ -131,12 +147,12 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
 
     # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
-    nudge = _NUDGE * scale.T[None] * np.eye(n)[:, :, None]
+    nudge = _DIFFERENCE * scale.T[None] * np.eye(n)[:, :, None]
     nudge = jnp.concatenate([np.zeros((K + 1, n, N)), nudge])
-    divide = np.array([*_PIECES, *[_PIECES[-1]] * len(_PARTS), *[2] * (1 + n)])
-    slack = np.array([*[np.inf] * len(_PIECES), *_PARTS, *[1.0] * (1 + n)])
+    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), *[2] * (1 + n)])
+    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
     by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
-    rtol = jnp.where(by_estimate, settings.rtol, _TIGHT)
+    rtol = jnp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
     s = Structure(placed.cycle.system)
     u = jnp.zeros((s.nu, N))
 
@@ -145,7 +161,8 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
         moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
         lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
         start = Stride(longest / divide, lead, jnp.full(N, slack))
-        tolerance = Settings(rtol, settings.atol * rtol / settings.rtol, patience)
+        atol = settings.atol * rtol / settings.rtol
+        tolerance = Settings(rtol, atol, patience, settings.scale)
         moved = move(s, lanes, u, target, tolerance, start)
         ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
         return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
@@ -177,8 +194,8 @@ def _lead(placed: PlacedSections, target):
 def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
     """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
     N = len(scale)
-    section, worst = np.arange(N), np.zeros((_TURNS, *error.shape[:2]))
-    for m in range(_TURNS * N):
+    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:2]))
+    for m in range(_PERIODS * N):
         at = (section + 1 + m) % N
         now = worst[m // N]
         np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
@@ -192,39 +209,42 @@ def _accumulated(J, error, scale) -> float:
     """The largest error, relative to the scales, when every section makes its `error` (N, n)."""
     N = len(scale)
     total, largest = np.zeros(scale.shape[1]), 0.0
-    for m in range(_TURNS * N):
+    for m in range(_PERIODS * N):
         total = J[m % N] @ total + error[m % N]
         largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
     return largest
 
 
-def section_scales(placed: PlacedSections, scale: Mapping[str, float] | None) -> np.ndarray:
-    """Scales (N, 1 + d) of time and states at the sections: the largest size on the cycle."""
+def state_sizes(placed: PlacedSections) -> Float[np.ndarray, "A d"]:
+    """Sizes of states, by chart: the largest that a state of this name has at any section, in any
+    chart; 1 for one that is always zero, and beyond a chart's dimension."""
     s = Structure(placed.cycle.system)
     chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
-    given = dict(scale or {})
-    out = np.ones((placed.n_sections, 1 + s.d))
-    out[:, 0] = given.pop("t", float(placed.cycle.period))
+    sizes = np.ones((len(s.charts), s.d))
     for name in s.state_names():
         places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
         size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
-        size = given.pop(name, size if size > 0 else 1.0)
-        for a, k in places:
-            out[chart == a, 1 + k] = size
-    if given or not np.all(out > 0) or not np.all(np.isfinite(out)):
-        raise DefinitionError(
-            "`scale` gives positive sizes of states, by name, and of time, as t; states are "
-            f"{', '.join(s.state_names())}. Got {scale}."
-        )
-    return out
+        for place in places:
+            sizes[place] = size if size > 0 else 1.0
+    return sizes
 
 
-class Planned(NamedTuple):
-    """A plan, and what it was made from."""
+class Stepping(eqx.Module):
+    """How lanes step from section to section, and how precise that is.
+
+    **Fields:**
+
+    - `plan`, `settings`: first steps, and tolerances.
+    - `scales`: of time and states at each section.
+    - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
+    - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
+    """
 
     plan: Plan
     settings: Settings
     scales: Float[np.ndarray, "N n"]
+    accuracy: float = eqx.field(static=True)
+    rounding: float = eqx.field(static=True, default=0.0)
 
 
 _made = Memory()
@@ -232,23 +252,25 @@ _made = Memory()
 
 def check_accuracy(accuracy: float) -> None:
     """**Raises:** `DefinitionError` for an accuracy that no plan has."""
-    if not 1e-13 <= accuracy <= 1e-2:
-        raise DefinitionError(f"accuracy lies between 1e-13 and 1e-2, not at {accuracy}.")
+    if not _LEAST_ACCURACY <= accuracy <= _LARGEST_ACCURACY:
+        raise DefinitionError(
+            f"accuracy lies between {_LEAST_ACCURACY} and {_LARGEST_ACCURACY}, not at {accuracy}."
+        )
 
 
-def plan_flow(
-    placed: PlacedSections, accuracy: float, scale: Mapping[str, float] | None = None
-) -> Planned:
-    """The plan for placed sections; made once for each accuracy and scale.
+def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
+    """The plan for placed sections; made once for each accuracy.
 
-    **Raises:** `DefinitionError` for an accuracy out of range, or scales of unknown states.
+    **Raises:** `DefinitionError` for an accuracy out of range.
     """
     check_accuracy(accuracy)
+    accuracy = float(accuracy)
 
-    def make() -> Planned:
-        scales = section_scales(placed, scale)
-        settings = Settings(rtol=accuracy, atol=accuracy * scales[:, 1:].min(), max_steps=PATIENCE)
-        plan = make_plan(placed, settings, accuracy, scales)
-        return Planned(plan, settings, scales)
+    def make() -> Stepping:
+        sizes = state_sizes(placed)
+        settings = Settings(accuracy, accuracy, PATIENCE, sizes)
+        time = np.full((placed.n_sections, 1), float(placed.cycle.period))
+        scales = np.concatenate([time, sizes[np.asarray(placed.lanes.chart)]], axis=1)
+        return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
-    return _made.recall(placed, (float(accuracy), tuple(sorted((scale or {}).items()))), make)
+    return _made.recall(placed, accuracy, make)

@@ -10,8 +10,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.settings import Settings
-from hybridjax.experiments.plan import make_plan
-from hybridjax.experiments.respond import respond
+from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.stepping.plan import make_plan
 
 from ..conftest import APEX, OUTPUTS
 
@@ -41,7 +41,7 @@ def experiment(request, lossy_cycle):
         pick = lambda s: [getattr(s, name) for name in PARAMETERS]  # noqa: E731
         system = eqx.tree_at(pick, lossy_cycle.system, list(x))
         other = eqx.tree_at(lambda p: p.cycle.system, placed, system)
-        response = respond(other, plan, start, u[None], OUTPUTS, SETTINGS)
+        response = flow_batch(other, plan, start, u[None], OUTPUTS, SETTINGS)
         return response.y[0], response.result[0]
 
     return run
