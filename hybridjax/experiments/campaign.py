@@ -145,7 +145,7 @@ class Campaign:
         placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
         start = CycleStart(placed).states(np.zeros((1, 0, 0)), 0)
         u = jnp.zeros((1, N, len(placed.cycle.system.inputs)))
-        capacity = max(len(placed.cycle.order), 1)
+        capacity = max(len(placed.cycle.event_sequence), 1)
         log = _FLOW[True](
             placed, stepping.plan, jnp.asarray(start), u, (), stepping.settings, capacity
         ).log
