@@ -28,7 +28,7 @@ import hybridjax as hj
 
 NAMES = ("m", "M", "k", "b", "l0", "a", "g")
 OUTPUTS = ("yM", "vM")
-SECTIONS = hj.ClockPhase(8, start=hj.Crossing("vM", "falling"))
+SECTIONS = hj.ClockPhase(8, anchor=hj.Crossing("vM", "falling"))
 SNR = 40
 
 
@@ -49,7 +49,7 @@ class HTFs:
         real, imag = np.random.default_rng(seed).normal(size=(2, *self.std.shape))
         H = np.asarray(self.exact.H) + self.std * (real + 1j * imag) / np.sqrt(2)
         noisy = hj.HTF(
-            self.exact.f, H, self.exact.harmonics, SECTIONS.count, self.exact.inputs, OUTPUTS,
+            self.exact.f, H, self.exact.harmonics, SECTIONS.n_sections, self.exact.inputs, OUTPUTS,
             variance=self.std**2,
         )  # fmt: skip
         return hj.ObservedHTF(noisy, SECTIONS)
@@ -59,7 +59,7 @@ class Series:
     """Fits to outputs at the sections."""
 
     def __init__(self, cycle):
-        u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.count, 1))
+        u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
         self.data = hj.run_experiments(cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
         self.std = np.sqrt(np.mean(self.data.y**2, axis=(0, 1))) * 10 ** (-SNR / 20)
 

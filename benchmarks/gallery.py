@@ -35,13 +35,17 @@ NAMES = [*CASES, "branches"]
 def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
     """The cycle, the exact HTF, and its estimate."""
     cycle = hj.find_limit_cycle(
-        case.system, case.guess, section=case.section, turns=case.turns, conserved=case.conserved
+        case.system,
+        case.guess,
+        section=case.section,
+        multiplicity=case.multiplicity,
+        conserved=case.conserved,
     )
     placed = hj.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
-        N, PERIODS, f_max=min(4.0, N / 2), amplitude=case.amplitude or 1.0, lines="odd"
+        N, PERIODS, band=(0, min(4.0, N / 2)), amplitude=case.amplitude or 1.0, lines="odd"
     )
     estimate = None
     if case.amplitude:
@@ -101,7 +105,7 @@ def branches(path: Path) -> None:
     m, strike = hj.models, hj.AtEvent("heelstrike")
     walker, buck = m.SimplestWalker(), m.BuckConverter()
     doubled = hj.find_limit_cycle(
-        m.BuckConverter(Vin=25.0), hj.Guess("open", (12.04, 0.627, 3.8)), turns=2
+        m.BuckConverter(Vin=25.0), hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2
     )
     gaits = [
         hj.find_limit_cycle(walker, guess, section=strike)

@@ -36,7 +36,7 @@ class Case(NamedTuple):
     plane: tuple[str, str] | None
     section: object = None
     guess: hj.Guess | None = None
-    turns: int | None = None
+    multiplicity: int | None = None
     conserved: dict[str, float] | None = None
     start: str = "periodic"
 
@@ -58,12 +58,12 @@ _BUCK = ("v", "i")
 
 CASES: dict[str, Callable[[], Case]] = {
     "hopper": lambda: Case(
-        "vertical hopper", m.VerticalHopper(), hj.ClockPhase(32, start=_APEX), "yM", "force",
+        "vertical hopper", m.VerticalHopper(), hj.ClockPhase(32, anchor=_APEX), "yM", "force",
         5e-4, _pair(-0.248983334735609 + 0.699333251798004j), _MPMATH, ("yM", "vM"),
     ),
     "lossy hopper": lambda: Case(
         "the same, retention 0.8", m.VerticalHopper(retention=0.8),
-        hj.ClockPhase(32, start=_APEX), "yM", "force", 5e-4,
+        hj.ClockPhase(32, anchor=_APEX), "yM", "force", 5e-4,
         _pair(-0.317897006349938 + 0.694628822735891j), _MPMATH, ("yM", "vM"),
     ),
     "bar": lambda: Case(
@@ -107,29 +107,29 @@ CASES: dict[str, Callable[[], Case]] = {
         ("y", "v"),
     ),
     "buck": lambda: Case(
-        "buck converter, 20 V", m.BuckConverter(), hj.ClockPhase(8, start=0.06), "v",
+        "buck converter, 20 V", m.BuckConverter(), hj.ClockPhase(8, anchor=0.06), "v",
         "reference voltage", 1e-5, _pair(-0.691894155835222 + 0.447746968999235j), _MPMATH, _BUCK,
     ),
     "buck, period 2": lambda: Case(
-        "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, start=0.03),
+        "buck converter, 25 V, period 2", m.BuckConverter(Vin=25.0), hj.ClockPhase(16, anchor=0.03),
         "v", "reference voltage", 2e-6, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
-        _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), turns=2,
+        _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2,
     ),
     "Hopf": lambda: Case(
         "Hopf normal form", m.HopfOscillator(),
-        hj.KinematicPhase(16, position="x", velocity="y", start=hj.Crossing("y", "rising")),
+        hj.KinematicPhase(16, position="x", velocity="y", anchor=hj.Crossing("y", "rising")),
         "x", "added to x'", 1e-4, [0.818730753077982], _CLOSED, ("x", "y"),
         section=hj.Crossing("y", "rising"),
     ),
     "van der Pol": lambda: Case(
         "van der Pol, mu = 1", m.VanDerPol(),
-        hj.KinematicPhase(16, position="x", velocity="v", start=hj.Crossing("v", "falling")),
+        hj.KinematicPhase(16, position="x", velocity="v", anchor=hj.Crossing("v", "falling")),
         "x", "force", 1e-3, [8.59695063603805e-4], _MPMATH, ("x", "v"),
         section=hj.Crossing("v", "falling"),
     ),
     "van der Pol, 3": lambda: Case(
         "van der Pol, mu = 3", m.VanDerPol(mu=3.0),
-        hj.KinematicPhase(16, position="x", velocity="v", start=hj.Crossing("v", "falling")),
+        hj.KinematicPhase(16, position="x", velocity="v", anchor=hj.Crossing("v", "falling")),
         "x", "force", 1e-3, [6.98947562607979e-16], _MPMATH, ("x", "v"),
         section=hj.Crossing("v", "falling"),
     ),

@@ -44,7 +44,7 @@ BAND = (-4, -3, -2, -1, 0, 1, 2, 3, 4)  # further harmonics tell nothing more ab
 class Identification(Family):
     @property
     def true(self) -> np.ndarray:
-        return np.asarray(self.model.multipliers())[:1]
+        return np.asarray(self.model.multipliers)[:1]
 
     def error(self, estimate, true=None) -> float:
         true = self.true if true is None else true
@@ -65,7 +65,7 @@ def paper(family: Identification) -> None:
     some = hj.ExperimentData(
         data.u[:20], data.y[:20], n_sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
     )
-    family.show("paper.series", family.error(hj.fit_series(some, 2, start="rest")))
+    family.show("paper.series", family.error(hj.fit_series(some, 2, start="cycle")))
     for lines in ("all", "odd"):
         for label, start in (("predicted", "periodic"), ("steady", "steady")):
             data = family.run(hj.multisine(lines=lines, amplitude=0.001), start=start)
@@ -151,7 +151,7 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
     # depends on the weights: the truth has those of the runs.
     weighted = hj.HTF(
         mean.f, mean.H, chosen, N, mean.inputs, mean.outputs,
-        variance=np.mean(variances, axis=0), freedom=estimate.freedom,
+        variance=np.mean(variances, axis=0), variance_freedom=estimate.variance_freedom,
     )  # fmt: skip
     truth = hj.fit_multipliers(weighted, 2).multipliers[:1]
     hits = sum(int(fit.contains(truth).all()) for fit in fits)

@@ -73,7 +73,7 @@ def make_job(cycle, sections, u) -> Job:
     states = np.asarray(sections.lanes.q, float).T
     names = list(system.charts())
     charts = tuple(names[a] for a in np.asarray(sections.lanes.chart))
-    planes = np.zeros((sections.count, 3))
+    planes = np.zeros((sections.n_sections, 3))
     if family.label == "kinematic":
         planes = _planes(states[:, :2], np.asarray(family.center), np.asarray(family.scale))
     return Job(

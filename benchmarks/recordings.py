@@ -20,12 +20,12 @@ import numpy as np
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.testing.dirt import spoil
+from hybridjax.testing import Dirt, spoil
 
 
-ANGLE = hj.recordings.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
-APEX = hj.recordings.EventPhase("apex")
-PHASES = {"apex": APEX, "angle": ANGLE}
+N_SECTIONS = 32
+APEX = hj.AtEvent("apex")
+PHASES = ("apex", "angle")
 RATE, BANDWIDTH, RMS = 500, 8.0, 0.0205  # Hz, Hz, N: outputs deviate by 9.7e-4 m (rms)
 NOISES = (0.0, 1e-4, 1e-3)
 
@@ -40,8 +40,17 @@ def hopper(strides, seeds, force=RMS):
 
 def noisy(recording, noise, seed):
     """With white noise, in which the apex of each stride is marked."""
-    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
-    return dirty.mark("apex", "vM", direction="falling", bandwidth=16)
+    dirty = spoil(recording, ("yM", "vM"), Dirt(noise=noise, seed=seed))
+    return dirty.mark("apex", hj.Crossing("vM", "falling"), bandwidth=16)
+
+
+def phase_of(name, n_sections=N_SECTIONS):
+    """From apex to apex, or the angle of position and velocity."""
+    if name == "apex":
+        return APEX
+    return hj.KinematicPhase(
+        n_sections, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9)
+    )
 
 
 def start_of(recording, strides):
@@ -54,8 +63,9 @@ def start_of(recording, strides):
     return eqx.tree_at(lambda r: r.trials, recording, tuple(map(cut, recording.trials)))
 
 
-def at_sections(recording, phase, n_sections=32, **options):
-    options |= {"inputs": "u", "outputs": ("yM", "vM"), "sections": sections}
+def at_sections(recording, name, n_sections=N_SECTIONS, **options):
+    phase = phase_of(name, n_sections)
+    options |= {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": n_sections}
     return hj.recordings.section_data(recording, phase, **options)
 
 
@@ -71,12 +81,12 @@ def errors(seeds=10):
         found, said, plain, rough = [], [], [], []
         for seed, recording in enumerate(recordings):
             dirty = noisy(start_of(recording, strides), noise, seed)
-            data = at_sections(dirty, PHASES[name])
+            data = at_sections(dirty, name)
             fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
             plain.append(distance(hj.recordings.plain_regression(data, 2), true))
-            through = at_sections(dirty, PHASES[name], bandwidth=np.inf)
+            through = at_sections(dirty, name, bandwidth=np.inf)
             rough.append(distance(hj.recordings.plain_regression(through, 2), true))
         row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
         row = "  ".join(f"{x:9.1e}" for x in row)
@@ -88,10 +98,10 @@ def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
     print(f"\nForce and noise ({noise:g}) as they are, and {part:g} of both; {seeds} seeds")
     for share in (1.0, part):
         recordings, true = hopper(strides, range(seeds), share * RMS)
-        for name, phase in PHASES.items():
+        for name in PHASES:
             found, said = [], []
             for seed, recording in enumerate(recordings):
-                data = at_sections(noisy(recording, share * noise, seed), phase)
+                data = at_sections(noisy(recording, share * noise, seed), name)
                 fit = hj.fit_series(data.records, 2, check=False, distortion=False)
                 found.append(distance(fit.multipliers, true))
                 said.append(fit.standard_errors[0])
@@ -102,16 +112,16 @@ def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
     print(f"what all samples would tell if the hopper were linear: {bound(strides, noise):.1e}")
 
 
-def bound(strides, noise, n_sections=32, seed=0):
+def bound(strides, noise, n_sections=N_SECTIONS, seed=0):
     """The standard error from all samples of the linearized hopper, as means over sections."""
-    rate = 16 * sections
+    rate = 16 * n_sections
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    placed = hj.place_sections(cycle, hj.ClockPhase(sections))
+    placed = hj.place_sections(cycle, hj.ClockPhase(n_sections))
     force = hj.testing.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=seed)
     u = force.reshape(-1, 16, 1).mean(axis=1)
     y = np.array(hj.linearize(cycle, placed, ("yM", "vM")).simulate(u))
-    y += noise * np.sqrt(sections / RATE) * np.random.default_rng(seed).normal(size=y.shape)
-    record = hj.Record(u, y, sections=sections)
+    y += noise * np.sqrt(n_sections / RATE) * np.random.default_rng(seed).normal(size=y.shape)
+    record = hj.Record(u, y, n_sections=n_sections)
     return hj.fit_series(record, 2, errors="white", distortion=False).standard_errors[0]
 
 
@@ -119,9 +129,9 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=tuple(PHASES)):
+def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=PHASES):
     print(
-        f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {sections} sections, "
+        f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
     )
     for name in phases:
@@ -129,7 +139,7 @@ def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, n_sections=16, phases
         for first in range(0, seeds, chunk):
             recordings, true = hopper(strides, range(1000 + first, 1000 + first + chunk))
             for seed, recording in enumerate(recordings, first):
-                data = at_sections(noisy(recording, noise, seed), PHASES[name], sections)
+                data = at_sections(noisy(recording, noise, seed), name, n_sections)
                 fit = hj.fit_series(data.records, 2, check=False)
                 hits.append(bool(fit.contains(true[:1])[0]))
                 found.append(distance(fit.multipliers, true))
@@ -147,33 +157,34 @@ def dirt(seeds=5, strides=500, noise=1e-4):
     recordings, true = hopper(strides, range(seeds))
     gap = (strides / 2, strides / 2 + 20)
     cases = {
-        "clean": (ANGLE, {}, {}),
-        "1 % of samples lost, gap of 20 strides": (ANGLE, {"missing": 0.01, "gap": gap}, {}),
+        "clean": ("angle", {}, {}),
+        "1 % of samples lost, gap of 20 strides": ("angle", {"missing": 0.01, "gap": gap}, {}),
         "the same, a third not there": (
-            ANGLE, {"missing": 0.01, "gap": gap, "irregular": True}, {},
+            "angle", {"missing": 0.01, "gap": gap, "irregular": True}, {},
         ),
         "the same, rounded to 1e-4": (
-            ANGLE, {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
+            "angle", {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
         ),
-        "drift of 5e-3, removed": (ANGLE, {"drift": 5e-3}, {"drift": 50}),
-        "period that grows by 5 %": (ANGLE, {"stretch": 0.05}, {}),
-        "cycles from apex to apex, clean": (APEX, {}, {}),
+        "drift of 5e-3, removed": ("angle", {"drift": 5e-3}, {"drift": 50}),
+        "period that grows by 5 %": ("angle", {"stretch": 0.05}, {}),
+        "cycles from apex to apex, clean": ("apex", {}, {}),
         "1 % lost, gap, 5 events lost, 5 doubled": (
-            APEX, {"missing": 0.01, "gap": gap, "lost": 5, "doubled": 5}, {},
+            "apex", {"missing": 0.01, "gap": gap, "lost_events": 5, "doubled_events": 5}, {},
         ),
     }  # fmt: skip
-    for label, (phase, spoiled, options) in cases.items():
+    for label, (name, spoiled, options) in cases.items():
         found, said, hits = [], [], 0
         for seed, recording in enumerate(recordings):
-            if phase is APEX:
+            if name == "apex":
                 dirty = noisy(recording, noise, seed)
-                dirty = spoil(dirty, ("yM", "vM"), seed=seed, **spoiled)
+                dirty = spoil(dirty, ("yM", "vM"), Dirt(seed=seed, **spoiled))
             else:
-                dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
+                about = Dirt(noise=noise, seed=seed, **spoiled)
+                dirty = spoil(recording, ("yM", "vM"), about)
             if "drift" in options:
-                rough = hj.recordings.estimate_phase(dirty, phase)
+                rough = hj.recordings.estimate_phase(dirty, phase_of(name))
                 dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), options["drift"])
-            fit = hj.fit_series(at_sections(dirty, phase, **options).records, 2, check=False)
+            fit = hj.fit_series(at_sections(dirty, name, **options).records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
             hits += bool(fit.contains(true[:1])[0])
@@ -187,8 +198,9 @@ def dirt(seeds=5, strides=500, noise=1e-4):
 def walker(seeds=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
-    oscillator, angle = hj.models.VanDerPol(mu=0.1), hj.recordings.AnglePhase("x", "v")
-    middle = hj.recordings.EventPhase("middle")
+    oscillator = hj.models.VanDerPol(mu=0.1)
+    angle = hj.KinematicPhase(16, position="x", velocity="v")
+    middle = hj.AtEvent("middle")
     # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
     # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
@@ -215,11 +227,11 @@ def walker(seeds=30, strides=100, trials=5, noise=1e-4):
         for seed in range(seeds):
             own = made.trials[seed * trials : (seed + 1) * trials]
             one = eqx.tree_at(lambda r: r.trials, made, own)
-            one = spoil(one, outputs, noise=noise, seed=seed)
+            one = spoil(one, outputs, Dirt(noise=noise, seed=seed))
             if mark:
-                one = one.mark("middle", mark[0], direction=mark[1], bandwidth=20 / period)
+                one = one.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
             data = hj.recordings.section_data(
-                one, phase, inputs="u", outputs=outputs, n_sections=16, time="duration"
+                one, phase, inputs="u", outputs=outputs, n_sections=16, timing="duration"
             )
             fit = hj.fit_series(data.records, order, overhang=16 * overhang, check=False)
             hits += bool(fit.contains(true).all())
@@ -262,7 +274,7 @@ def write_trials(files, minutes, rate):
         for k in range(len(files))
     ]
     made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
-    made = spoil(made, ("yM", "vM"), noise=1e-4)
+    made = spoil(made, ("yM", "vM"), Dirt(noise=1e-4))
     for file, trial in zip(files, made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
         header = "time (s),force (N),yM (m),vM (m/s)"

@@ -24,16 +24,16 @@ def sections():
     """The paper's two families."""
     apex = hj.Crossing("vM", "falling")
     return {
-        "isochron": hj.ClockPhase(32, start=apex),
+        "isochron": hj.ClockPhase(32, anchor=apex),
         "kinematic": hj.KinematicPhase(
-            32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+            32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
         ),
     }
 
 
-def errors(cycle, placed, exact, seed: int, second_order: str) -> np.ndarray:
+def errors(cycle, placed, exact, seed: int, division: str) -> np.ndarray:
     """Largest error of H_0 per output."""
-    design = hj.paper_design(seed=seed, second_order=second_order)
+    design = hj.paper_design(seed=seed, division=division)
     data = hj.run_experiments(cycle, placed, design, OUTPUTS)
     return np.asarray(hj.estimate_htf(data, harmonics=0).error(exact))
 
@@ -48,7 +48,7 @@ def main() -> None:
     for family, definition in sections().items():
         placed = hj.place_sections(cycle, definition)
         exact = hj.linearize(cycle, placed, OUTPUTS).htf(hj.paper_design().frequencies, 0)
-        for choice, label in (("ignore", "random"), ("avoid", "avoiding")):
+        for choice, label in (("random", "random"), ("sum-free", "avoiding")):
             found = np.array([errors(cycle, placed, exact, seed, choice) for seed in seeds])
             for k, output in enumerate(OUTPUTS):
                 name = f"second_order.{family}.{label}.{output}"

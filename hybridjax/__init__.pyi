@@ -13,6 +13,7 @@ from . import (
     testing as testing,
 )
 from ._core.compilation_cache import enable_compilation_cache as enable_compilation_cache
+from ._core.execution import Execution as Execution
 from ._core.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
@@ -28,6 +29,7 @@ from .errors import (
 from .experiments.data import ExperimentData as ExperimentData
 from .experiments.design.design import Design as Design
 from .experiments.design.multisine import multisine as multisine, paper_design as paper_design
+from .experiments.record import Record as Record
 from .experiments.response_function import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model
@@ -41,7 +43,6 @@ from .identify.multipliers.order import select_order as select_order
 from .identify.multipliers.structured import fit_multipliers as fit_multipliers
 from .identify.rational.fit import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
-from .identify.series.layout import Record as Record
 from .identify.series.validation import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF
@@ -52,7 +53,8 @@ from .maps.placed import PlacedSections as PlacedSections
 from .maps.section_map import section_map as section_map
 from .orbits.branches.branch import Branch as Branch
 from .orbits.branches.continuation import continuation as continuation
-from .orbits.cycle import LimitCycle as LimitCycle, find_limit_cycle as find_limit_cycle
+from .orbits.cycle import LimitCycle as LimitCycle
+from .orbits.find import find_limit_cycle as find_limit_cycle
 from .orbits.sweep.limit_cycles import (
     LimitCycles as LimitCycles,
     find_limit_cycles as find_limit_cycles,
@@ -60,16 +62,18 @@ from .orbits.sweep.limit_cycles import (
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
-from .sections.families import (
-    AtEvent as AtEvent,
-    ClockPhase as ClockPhase,
-    Crossing as Crossing,
-    KinematicPhase as KinematicPhase,
-    SectionList as SectionList,
-)
+from .sections.clock import ClockPhase as ClockPhase
+from .sections.crossing import AtEvent as AtEvent, Crossing as Crossing
+from .sections.kinematic import KinematicPhase as KinematicPhase
+from .sections.section_list import SectionList as SectionList
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
-from .systems.system import Guess as Guess, HybridSystem as HybridSystem, parameter as parameter
+from .systems.system import (
+    Guess as Guess,
+    HybridSystem as HybridSystem,
+    Parameter as Parameter,
+    parameter as parameter,
+)
 from .systems.transition import Scheduled as Scheduled, Transition as Transition
 
 __version__: str

@@ -72,12 +72,12 @@ class Stance(hj.Chart):
 class Robot(hj.HybridSystem):
     """Mass on a leg that thrusts while it gets longer. Input `u`: a force on the mass."""
 
-    m: jax.Array = hj.parameter(1.0, unit="kg", doc="mass")
-    g: jax.Array = hj.parameter(9.81, unit="m/s^2", doc="gravity")
-    l0: jax.Array = hj.parameter(0.5, unit="m", doc="length of the leg")
-    k: jax.Array = hj.parameter(800.0, unit="N/m", doc="stiffness of the leg")
-    b: jax.Array = hj.parameter(12.0, unit="N s/m", doc="damping of the leg")
-    thrust: jax.Array = hj.parameter(30.0, unit="N", doc="force of the cylinder")
+    m: hj.Parameter = hj.parameter(1.0, unit="kg", doc="mass")
+    g: hj.Parameter = hj.parameter(9.81, unit="m/s^2", doc="gravity")
+    l0: hj.Parameter = hj.parameter(0.5, unit="m", doc="length of the leg")
+    k: hj.Parameter = hj.parameter(800.0, unit="N/m", doc="stiffness of the leg")
+    b: hj.Parameter = hj.parameter(12.0, unit="N s/m", doc="damping of the leg")
+    thrust: hj.Parameter = hj.parameter(30.0, unit="N", doc="force of the cylinder")
 
     def charts(self):
         return {
@@ -156,7 +156,7 @@ print(f"by hand {slope:.8f}, exactly {cycle.multipliers[0].real:.8f}")
 _, *orbit = cycle.trajectory()("y", "v")
 center = [(np.min(x) + np.max(x)) / 2 + 0.1 * np.ptp(x) for x in orbit]
 scale = [(np.max(x) - np.min(x)) / 2 for x in orbit]
-phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, start=apex)
+phase = hj.KinematicPhase(16, position="y", velocity="v", center=center, scale=scale, anchor=apex)
 model = hj.linearize(cycle, phase, outputs=("y", "v"))
 design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(rms=0.05)  # N
 data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))

@@ -21,7 +21,6 @@
 # %%
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -64,13 +63,13 @@ class Stance(hj.Chart):
 
 
 class Hopper(hj.HybridSystem):
-    m: jax.Array = hj.parameter(1.0, unit="kg")
-    M: jax.Array = hj.parameter(2.0, unit="kg")
-    k: jax.Array = hj.parameter(10.0, unit="N/m")
-    b: jax.Array = hj.parameter(5.0, unit="N s/m")
-    l0: jax.Array = hj.parameter(2.0, unit="m")
-    a: jax.Array = hj.parameter(20.0, unit="N")
-    g: jax.Array = hj.parameter(2.0, unit="m/s^2")
+    m: hj.Parameter = hj.parameter(1.0, unit="kg")
+    M: hj.Parameter = hj.parameter(2.0, unit="kg")
+    k: hj.Parameter = hj.parameter(10.0, unit="N/m")
+    b: hj.Parameter = hj.parameter(5.0, unit="N s/m")
+    l0: hj.Parameter = hj.parameter(2.0, unit="m")
+    a: hj.Parameter = hj.parameter(20.0, unit="N")
+    g: hj.Parameter = hj.parameter(2.0, unit="m/s^2")
 
     def leg(self, t, yM, ym):
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(2 * jnp.pi * t)
@@ -126,9 +125,9 @@ print(cycle)
 # %%
 apex = hj.Crossing("vM", "falling")
 families = {
-    "isochron": hj.ClockPhase(SECTIONS, start=apex),
+    "isochron": hj.ClockPhase(SECTIONS, anchor=apex),
     "kinematic": hj.KinematicPhase(
-        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
     ),
 }
 placed = {name: hj.place_sections(cycle, family) for name, family in families.items()}
@@ -147,7 +146,7 @@ for name, model in models.items():
     print(name, model)
     print("   dimensions", *np.asarray(model.dims))
     print("   on section 0:", model.coordinates[0], "rank of the return map:", model.rank())
-    print("   multipliers", model.multipliers())
+    print("   multipliers", model.multipliers)
 
 # %% [markdown]
 # ## A design (Sec. V)
@@ -202,9 +201,9 @@ figure = hj.plot.harmonics(pairs)
 rational = {name: hj.fit_rational(estimate) for name, estimate in estimates.items()}
 for name, fit in rational.items():
     biased = hj.fit_rational(exact[name])
-    for k, output in enumerate(outputs):
-        error = fit.compare(cycle.multipliers)[k].max_error
-        bias = biased.compare(cycle.multipliers)[k].max_error
+    for output in outputs:
+        error = fit.compare(cycle.multipliers, output).max_error
+        bias = biased.compare(cycle.multipliers, output).max_error
         print(f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}")
 figure = hj.plot.bodes(pairs, fits=rational)
 

@@ -38,11 +38,12 @@ hj.enable_x64()
 
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-force = np.stack([hj.testing.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)])
-clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
-recording = hj.testing.spoil(
-    clean, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0), seed=0
+force = np.stack(
+    [hj.testing.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
 )
+clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
+dirt = hj.testing.Dirt(noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0))
+recording = hj.testing.spoil(clean, ("yM", "vM"), dirt)
 print(recording)
 
 # %% [markdown]
@@ -52,8 +53,9 @@ print(recording)
 # each cycle is sampled at 32 phases; two multipliers are fitted.
 
 # %%
-phase = hj.recordings.estimate_phase(recording, hj.recordings.AnglePhase("yM", "vM"))
-data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"), n_sections=32)
+angle = hj.KinematicPhase(32, position="yM", velocity="vM")
+phase = hj.recordings.estimate_phase(recording, angle)
+data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"))
 fit = hj.fit_series(data.records, order=2)
 print(phase, data, fit, sep="\n")
 
@@ -72,10 +74,8 @@ print("held by the 95 % regions:", fit.contains(cycle.multipliers))
 # The multipliers are the same, and surer.
 
 # %%
-marked = recording.mark("apex", "vM", direction="falling", bandwidth=16)
-strides = hj.recordings.section_data(
-    marked, hj.recordings.EventPhase("apex"), inputs="u", outputs=("yM", "vM"), n_sections=32
-)
+apex = hj.Crossing("vM", "falling")
+strides = hj.recordings.section_data(recording, apex, inputs="u", outputs=("yM", "vM"))
 surer = hj.fit_series(strides.records, order=2)
 print(surer)
 print(surer.compare(cycle.multipliers))
@@ -128,7 +128,7 @@ axes = hj.plot.multiplier_regions(fit, advice.plain)
 # %%
 sections = hj.KinematicPhase(
     32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-    start=hj.Crossing("vM", "falling"),
+    anchor=apex,
 )  # fmt: skip
 exact = hj.linearize(cycle, sections, outputs=("yM", "vM"))
 f = np.arange(1, 161) / 20
@@ -143,7 +143,7 @@ figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 # A multisine as a table: by phase, for hardware that triggers on it, or against time.
 
 # %%
-design = hj.multisine(periods=64, f_max=8.0, lines="odd").scaled(rms=0.02)
+design = hj.multisine(periods=64, band=(0, 8.0), lines="odd").scaled(rms=0.02)
 with tempfile.TemporaryDirectory() as folder:
     hj.recordings.write_design(Path(folder) / "by_phase.csv", design)
     print((Path(folder) / "by_phase.csv").read_text()[:120])
@@ -158,9 +158,7 @@ with tempfile.TemporaryDirectory() as folder:
 # does the same and writes one page for a colleague. From Python:
 
 # %%
-found = hj.identify_recording(
-    recording, hj.recordings.AnglePhase("yM", "vM"), inputs="u", outputs=("yM", "vM"), order=2
-)
+found = hj.identify_recording(recording, angle, inputs="u", outputs=("yM", "vM"), order=2)
 with tempfile.TemporaryDirectory() as folder:
     page = hj.write_report(Path(folder) / "results", found)
     print(sorted(path.name for path in page.parent.iterdir()), page.stat().st_size // 1000, "kB")

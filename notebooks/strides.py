@@ -28,7 +28,7 @@ import hybridjax as hj
 
 hj.enable_x64()
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-phase = hj.ClockPhase(32, start=hj.Crossing("vM", "falling"))  # 32 instants per stride
+phase = hj.ClockPhase(32, anchor=hj.Crossing("vM", "falling"))  # 32 instants per stride
 truth = cycle.multipliers
 print("true multipliers", np.round(truth, 4))
 

@@ -15,9 +15,9 @@ hypothesis.settings.load_profile("untimed")
 DATA = pathlib.Path(__file__).parent / "data"
 
 APEX = hj.Crossing("vM", "falling")
-ISOCHRONS = hj.ClockPhase(32, start=APEX)
+ISOCHRONS = hj.ClockPhase(32, anchor=APEX)
 KINEMATIC = hj.KinematicPhase(
-    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+    32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
 OUTPUTS = ("yM", "vM")
 
@@ -35,6 +35,11 @@ class no_compilation:
     def __exit__(self, *_):
         jax.monitoring.unregister_event_duration_listener(self.listen)
         assert not self.count, f"{self.count} programs were compiled"
+
+
+def unchecked(function):
+    """`function` without the check of types in these tests, which would be the first to refuse."""
+    return getattr(function, "__wrapped__", function)
 
 
 @pytest.fixture(scope="session")

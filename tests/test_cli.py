@@ -32,7 +32,7 @@ def test_help_does_not_import_jax(arguments):
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hybridjax.reproduce.enable_compilation_cache", lambda: None)
+        patch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
         main(["reproduce", "--quick", "--out", str(out), "--param", "M=2.0"])
     return out
 
@@ -94,7 +94,7 @@ def test_reproduce_draws_its_figures(results):
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, monkeypatch, arguments, message):
-    monkeypatch.setattr("hybridjax.reproduce.enable_compilation_cache", lambda: None)
+    monkeypatch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path), *arguments])
     assert message in str(error.value) and "\n" not in str(error.value)

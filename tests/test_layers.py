@@ -1,6 +1,7 @@
-"""Imports flow one way, and importing the package is cheap."""
+"""Imports flow one way, files and signatures stay small, and importing the package is cheap."""
 
 import ast
+import importlib
 import pathlib
 import subprocess
 import sys
@@ -63,8 +64,30 @@ def test_imports_flow_one_way(file):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_files_stay_small(file):
-    assert len(file.read_text().splitlines()) <= 400
+def test_files_and_signatures_stay_small(file):
+    text = file.read_text()
+    assert len(text.splitlines()) <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            all_of_them = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            names = [x.arg for x in all_of_them]
+            own = len(names) - (names[:1] in (["self"], ["cls"]))
+            assert own <= 10, f"{node.name} has {own} parameters"
+
+
+FOLDERS = sorted({f.parent for f in FILES} | {ROOT})
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
+def test_folders_stay_small_and_hide_no_name(folder):
+    """A public name that is also a module of its folder would be either of them, by chance."""
+    assert len(list(folder.glob("*.py"))) <= 17
+    modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
+    stub = folder / "__init__.pyi"
+    if stub.exists():
+        imports = [n for n in ast.parse(stub.read_text()).body if isinstance(n, ast.ImportFrom)]
+        names = {x.asname for n in imports if n.module is not None for x in n.names}
+        assert not names & modules
 
 
 def test_importing_hybridjax_does_not_import_jax():
@@ -76,7 +99,15 @@ def test_importing_hybridjax_does_not_import_jax():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_public_names_resolve_and_have_docstrings():
-    for name in hybridjax.__all__:
-        thing = getattr(hybridjax, name)
-        assert thing.__doc__, name
+NAMESPACES = [
+    importlib.import_module(f"hybridjax{'.' * bool(place)}{place}")
+    for place in ["", *(f.parent.name for f in sorted(ROOT.glob("*/__init__.pyi")))]
+]
+
+
+@pytest.mark.parametrize("namespace", NAMESPACES, ids=lambda n: n.__name__)
+def test_public_names_resolve_and_have_docstrings(namespace):
+    for name in namespace.__all__:
+        thing = getattr(namespace, name)
+        if not isinstance(thing, str | dict | float):
+            assert thing.__doc__, name

@@ -2,11 +2,18 @@
 
 import pathlib
 import re
+import shlex
 import sys
 import types
 
 import numpy as np
+import pytest
 from matplotlib import pyplot
+
+import hybridjax as hj
+from hybridjax.apps.cli import main
+
+from .conftest import OUTPUTS
 
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -54,6 +61,34 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
         )
     pyplot.close("all")
     assert (tmp_path / "bode.png").stat().st_size > 10_000
+
+
+@pytest.fixture
+def trials(tmp_path, hopper_cycle):
+    """What the README's recording is read from."""
+    force = [hj.testing.random_force(200, 100, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
+    made = hj.testing.simulate_recording(hopper_cycle, force, OUTPUTS, rate=100, steps=1)
+    for name, trial in zip(("trial1", "trial2"), made.trials, strict=True):
+        table = np.column_stack([trial.time, trial.values])
+        header = ",".join(("time", *("force" if x == "u" else x for x in made.signals)))
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=header, comments="")
+
+
+@pytest.mark.slow
+def test_every_session_and_command_runs(tmp_path, monkeypatch, trials):
+    """In the order in which they stand, in one session: fences of python, py and bash."""
+    monkeypatch.chdir(tmp_path)
+    session = types.ModuleType("whole_readme_session")
+    monkeypatch.setitem(sys.modules, session.__name__, session)
+    for language, text in BLOCK.findall((ROOT / "README.md").read_text()):
+        if language in ("python", "py"):
+            exec(compile(text, "README.md", "exec"), vars(session))
+        elif language == "bash" and text.startswith("hybridjax"):
+            assert main(shlex.split(text)[1:]) in (None, 0)
+    pyplot.close("all")
+    found = session.found.fit.compare(session.cycle.multipliers)
+    assert found.max_error < 1e-2 and (tmp_path / "report" / "report.html").exists()
+    assert session.fit.contains(session.hopper)
 
 
 def test_links_lead_somewhere():

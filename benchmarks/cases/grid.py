@@ -42,7 +42,7 @@ def run(show, options) -> None:
         show(f"failed.{Result(int(code)).name.lower()}", int((cycles.result == code).sum()))
     show("residual", float(cycles.residual[cycles.ok].max()))
     show("good", float((cycles.ok & (cycles.residual <= 1e-10)).mean()))
-    show("in_flight", int((cycles.start.chart.ravel() == 0).sum()))
+    show("in_flight", int((cycles.anchor.chart.ravel() == 0).sum()))
     _check(cycles, multipliers, show, 5 if options.quick else 20)
 
 
@@ -52,10 +52,10 @@ def _check(cycles: LimitCycles, multipliers, show, count: int) -> None:
     errors = []
     for i in rng.choice(np.flatnonzero(cycles.ok), count, replace=False):
         here = cycles[int(i)]
-        name = ("flight", "stance")[int(here.start.chart[0])]
-        ours = np.asarray(here.start.q)[: 4 if name == "flight" else 2, 0]
+        name = ("flight", "stance")[int(here.anchor.chart[0])]
+        ours = np.asarray(here.anchor.q)[: 4 if name == "flight" else 2, 0]
         charts = scipy_hopper(**_numbers(here.system))
-        t0, period = float(here.start.t[0]), float(here.period)
+        t0, period = float(here.anchor.t[0]), float(here.period)
 
         def turn(q, charts=charts, t0=t0, period=period, name=name):
             return _flow(charts, name, q, t0, t0 + period)

@@ -7,6 +7,7 @@ states on the cycle as the reported ones are, but not below 1e-13.
 import numpy as np
 
 from hybridjax.experiments.campaign import prepare
+from hybridjax.experiments.options import Options
 
 from .problems import ALL, N, Problem, problem, record
 
@@ -32,7 +33,8 @@ def _honest(task: Problem, accuracy: float, name: str, show) -> None:
 
 def show_honesty(task: Problem, data, accuracy: float, name: str, show) -> None:
     """The share of experiments that ran well, and the errors of these."""
-    scale = prepare(task.cycle, task.placed, task.u, task.outputs, discard=0).scales[:, 1:3]
+    campaign = prepare(task.cycle, task.placed, task.u, task.outputs, Options(discard=0))
+    scale = campaign.stepping.scales[:, 1:3]
     scale = np.resize(scale, task.exact.shape[1:])
     assert scale.shape[0] % N == 0
     true = np.abs(record(data) - task.exact) / scale

@@ -13,8 +13,9 @@ from job import Job, make_job
 from peers.contest import Seconds, measure
 
 import hybridjax as hj
-from hybridjax.experiments.campaign import _respond, prepare
-from hybridjax.experiments.respond import respond
+from hybridjax.experiments.campaign import _FLOW, prepare
+from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.options import Options
 
 
 MODELS = {"hopper": hj.models.VerticalHopper, "bar": hj.models.TwoLeggedBar}
@@ -65,7 +66,8 @@ class Problem:
         """All experiments, as a user runs them."""
         return hj.run_experiments(
             self.cycle, self.placed, self.u, self.outputs,
-            discard=0, accuracy=accuracy, workers=workers, precision=precision,
+            discard=0, accuracy=accuracy,
+            execution=hj.Execution(workers=workers, precision=precision),
         )  # fmt: skip
 
     def error(self, data: hj.ExperimentData) -> float:
@@ -77,24 +79,24 @@ class Problem:
 
     def response(self, accuracy: float = 1e-9) -> tuple:
         """Arguments of `program`: what `run` gives to it."""
-        campaign = prepare(
-            self.cycle, self.placed, self.u, self.outputs, discard=0, accuracy=accuracy
-        )
+        options = Options(discard=0, accuracy=accuracy)
+        campaign = prepare(self.cycle, self.placed, self.u, self.outputs, options)
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
         start = jnp.repeat(start, len(self.u), axis=1)
         z = tuple(campaign.outputs.items)
-        return self.placed, campaign.plan, start, jnp.asarray(self.u), z, campaign.settings
+        stepping = campaign.stepping
+        return self.placed, stepping.plan, start, jnp.asarray(self.u), z, stepping.settings
 
 
 def responding(placed, plan, start, u, outputs, settings):
     """Outputs (S, n, 2) of experiments, to be differentiated."""
-    return respond(placed, plan, start, u, outputs, settings).y
+    return flow_batch(placed, plan, start, u, outputs, settings).y
 
 
 def program(*arguments) -> jax.Array:
     """`responding` as `run_experiments` has compiled it for many experiments."""
-    return _respond[False](*arguments).y
+    return _FLOW[False](*arguments, 0).y
 
 
 def record(data: hj.ExperimentData) -> np.ndarray:
@@ -110,12 +112,12 @@ def cycle(model: str) -> hj.LimitCycle:
 def sections(model: str, family: str) -> hj.ClockPhase | hj.KinematicPhase:
     """32 sections, section 0 where the body is highest."""
     position, velocity = OUTPUTS[model]
-    start = hj.Crossing(velocity, "falling")
+    anchor = hj.Crossing(velocity, "falling")
     if family == "isochron":
-        return hj.ClockPhase(N, start=start)
+        return hj.ClockPhase(N, anchor=anchor)
     center, scale = CENTERS[model]
     return hj.KinematicPhase(
-        N, position=position, velocity=velocity, center=center, scale=scale, start=start
+        N, position=position, velocity=velocity, center=center, scale=scale, anchor=anchor
     )
 
 

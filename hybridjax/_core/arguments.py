@@ -6,9 +6,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import DefinitionError
 from .tracing import is_traced
+
+
+Numbers = npt.ArrayLike | Sequence | int | float
+"""What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int` and
+`float` to the promotion of static type checkers, which checks at run time do not know.)"""
 
 
 def real_array(name: str, value: Any, ndim: int) -> jax.Array:

@@ -1,6 +1,10 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
+<<<<<<< HEAD
 import logging
+=======
+import contextlib
+>>>>>>> tree
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -51,6 +55,7 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         return [one.result() for one in running]
 
 
+<<<<<<< HEAD
 def meanwhile(work: Callable[[], Any]) -> Future[Any]:
     """Begin with `work` in a thread of its own, under the caller's configuration of JAX.
 
@@ -67,6 +72,16 @@ def meanwhile(work: Callable[[], Any]) -> Future[Any]:
 def _log_error(future: Future) -> None:
     if not future.cancelled() and (error := future.exception()) is not None:
         _log.error("what was begun in another thread has failed", exc_info=error)
+=======
+@contextlib.contextmanager
+def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
+    """A context during which `work` is done in a thread of its own, under the caller's
+    configuration of JAX. It ends when both have ended, and raises what `work` raised."""
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(_configured(work))
+        yield
+        running.result()
+>>>>>>> tree
 
 
 def _cores() -> int:

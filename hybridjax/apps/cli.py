@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from typing import Literal
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -66,8 +67,8 @@ def _add_identify(commands) -> None:
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument("--phase", type=_names, metavar="X,V",
         help="two signals whose angle about the center is the phase")  # fmt: skip
-    phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:LEVEL]",
-        help="a cycle begins where signal X crosses a level, rising or falling")  # fmt: skip
+    phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:VALUE]",
+        help="a cycle begins where signal X crosses a value, rising or falling")  # fmt: skip
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
     add("--center", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
     add("--scale", type=_numbers, metavar="X,V", help="of the angle; estimated by default")
@@ -77,7 +78,7 @@ def _add_identify(commands) -> None:
     add("--bandwidth", type=float, metavar="HZ", help="of the splines through the outputs; by "
         "default N per period")  # fmt: skip
     add("--time", default="time", metavar="NAME", help="column with the times")
-    add("--time-of-crossing", choices=("clock", "duration"), help="an extra output, from when "
+    add("--timing", choices=("clock", "duration"), help="an extra output, from when "
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=float, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
@@ -95,8 +96,9 @@ def _identify(options) -> None:
     from .._core.precision import enable_x64
     from ..errors import DefinitionError
     from ..recordings.identification import identify_recording
-    from ..recordings.phase import AnglePhase, CrossingPhase, EventPhase
     from ..recordings.read import read_recording
+    from ..sections.crossing import AtEvent, Crossing
+    from ..sections.kinematic import KinematicPhase
     from .recording_report import check_folder, write_report
 
     enable_x64()
@@ -108,15 +110,20 @@ def _identify(options) -> None:
     recording = read_recording(*options.files, time=options.time)
     print(recording)
     if options.phase is not None:
-        phase = AnglePhase(*options.phase, center=options.center, scale=options.scale)
+        position, velocity = options.phase
+        phase = KinematicPhase(
+            options.sections, position=position, velocity=velocity,
+            center=options.center, scale=options.scale,
+        )  # fmt: skip
     elif options.crossing is not None:
-        phase = CrossingPhase(*options.crossing)
+        signal, direction, value = options.crossing
+        phase = Crossing(signal, direction, value=value)
     else:
-        phase = EventPhase(options.event)
+        phase = AtEvent(options.event)
     found = identify_recording(
         recording, phase, inputs=options.input, outputs=options.outputs,
         n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
-        time=options.time_of_crossing, drift=options.drift,
+        timing=options.timing, drift=options.drift,
     )  # fmt: skip
     print(found)
     print(write_report(options.out, found))
@@ -166,16 +173,16 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers") from None
 
 
-def _crossing(text: str) -> tuple[str, str, float]:
+def _crossing(text: str) -> tuple[str, Literal["rising", "falling"], float]:
     signal, *more = text.split(":")
-    direction, level = (*more, *("rising", "0")[len(more) :])[:2]
+    direction, value = (*more, *("rising", "0")[len(more) :])[:2]
     try:
         if len(more) > 2 or direction not in ("rising", "falling"):
             raise ValueError
-        return signal, direction, float(level)
+        return signal, direction, float(value)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a signal, a direction and a level, as in x:falling:0.2"
+            f"{text!r} is not a signal, a direction and a value, as in x:falling:0.2"
         ) from None
 
 

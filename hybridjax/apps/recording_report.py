@@ -145,7 +145,7 @@ def _write_sections(found: Identification, folder: Path) -> None:
         table.writerow(["trial", "record", "cycle", "section", "time", *header])
         numbers = ",".join(["%d", "%d", "%.9g", *["%.9g"] * len(names)])
         for k, (record, times) in enumerate(zip(data.records, data.times, strict=True)):
-            place = np.divmod(record.start + np.arange(len(record.u)), data.n_sections)
+            place = np.divmod(record.first_section + np.arange(len(record.u)), data.n_sections)
             start = io.StringIO()
             trial = found.recording.trials[data.trials[k]].name
             csv.writer(start, lineterminator=",").writerow([trial, k])

@@ -31,8 +31,11 @@ from ..maps.linearize import linearize
 from ..maps.place import place_sections
 from ..maps.placed import PlacedSections
 from ..models.hopper import VerticalHopper
-from ..orbits.cycle import LimitCycle, find_limit_cycle
-from ..sections.families import ClockPhase, Crossing, KinematicPhase
+from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
+from ..sections.clock import ClockPhase
+from ..sections.crossing import Crossing
+from ..sections.kinematic import KinematicPhase
 from .paper_report import OUTPUTS, summarize, table
 
 
@@ -148,13 +151,14 @@ def _design(protocol: Protocol) -> Design:
             "transient must die out first."
         )
     f_max = min(10.0, protocol.n_sections / 2 - 1 / protocol.keep)
-    arguments = (protocol.n_sections, protocol.keep, f_max, protocol.amplitude, protocol.seed)
+    band = (0.0, f_max)
+    arguments = (protocol.n_sections, protocol.keep, band, protocol.amplitude, protocol.seed)
     cosines = 2 * f_max * protocol.keep / protocol.experiments
     room = cosines <= protocol.keep / 4  # a quarter of the classes in each experiment
     return paper_design(
         *arguments,
+        division="sum-free" if room else "random",
         experiments=protocol.experiments,
-        second_order="avoid" if room else "ignore",
     )
 
 
@@ -169,9 +173,9 @@ def _find(hopper: VerticalHopper) -> LimitCycle:
 def _sections(name: str, count: int):
     apex = Crossing("vM", "falling")
     if name == "isochron":
-        return ClockPhase(count, start=apex)
+        return ClockPhase(count, anchor=apex)
     return KinematicPhase(
-        count, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=apex
+        count, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=apex
     )
 
 
@@ -205,11 +209,11 @@ def _identify(cycle, name, design, protocol, clock) -> Family:
 def _perturbed(cycle: LimitCycle) -> Trajectory:
     start = dict(cycle.state)
     start["yM"] += 0.05
-    chart = list(cycle.system.charts())[int(cycle.start.chart[0])]
+    chart = list(cycle.system.charts())[int(cycle.anchor.chart[0])]
     period = float(cycle.period)
     state = np.array(list(start.values()))
     return simulate(
-        cycle.system, chart, state, 12 * period, time=float(cycle.start.t[0]), throw=False
+        cycle.system, chart, state, 12 * period, time=float(cycle.anchor.t[0]), throw=False
     )
 
 

@@ -28,7 +28,7 @@ EXPERIMENT = 1e-9
 SINGLE_PRECISION_EXPERIMENT = 1e-4
 """Experiments in single precision."""
 STEADY_START = 1e-10
-"""Starts of periodic responses, relative to their largest entry."""
+"""Starts of periodic responses, relative to the sizes of time and states."""
 
 
 # Rounding errors of a time or a state, relative to it, in double and in single precision. Twice as

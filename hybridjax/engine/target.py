@@ -20,7 +20,9 @@ class AbstractLevels(eqx.Module):
         """Whether any of the sections can be crossed in chart a."""
 
     @abc.abstractmethod
-    def level(self, s: Structure, a: int, i, t, q):
+    def level(
+        self, s: Structure, a: int, i: Int[Array, ""], t: Float[Array, ""], q: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         """Level of section i at a single state of chart a; it falls through zero at the section.
 
         1 for a section that cannot be crossed in chart a.

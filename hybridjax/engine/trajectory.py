@@ -27,8 +27,8 @@ from .target import until
 from .watch import slopes
 
 
-# Rows of a tape that is filled in one compiled call. Twice as many: twice the memory, half the calls
-# for long trajectories.
+# Rows of a tape that is filled in one compiled call. Twice as many: twice the memory, half the
+# calls for long trajectories.
 _ROWS = 512
 
 

@@ -1,20 +1,34 @@
 """What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from .._core.arguments import names
 from .._core.results import Result
 from ..errors import DefinitionError
-from ..linear.ldtp import LDTP
-from .design.design import Design
-from .noise import draw_process_noise
+from .events import EventTimes
+from .record import Record
+
+
+class Simulated(eqx.Module):
+    """What only a simulation knows of its S experiments.
+
+    **Fields:**
+
+    - `failed_at`: (S,) the sample at which an experiment failed, -1 where it did not.
+    - `error`: (S,) estimates of the largest error of the states at any section, relative to their
+      sizes on the cycle, or None.
+    - `events`: when events happened, or None.
+    """
+
+    failed_at: Int[np.ndarray, " S"]
+    error: Float[np.ndarray, " S"] | None = None
+    events: EventTimes | None = None
 
 
 class ExperimentData(eqx.Module):
@@ -26,41 +40,38 @@ class ExperimentData(eqx.Module):
       section 0, n is a whole number of periods.
     - `y`: outputs at the sections minus those on the limit cycle, (S, n, ny), sampled before
       `u[:, i]` acts. NaN from the failure on where an experiment failed.
-    - `result`: (S,) codes of `Result`. `failed_at`: (S,) the sample at which an experiment
-      failed, -1 where it did not.
-    - `error`: (S,) estimates of the largest error of a simulation, relative to the sizes of the
-      states on the cycle, or None if not known.
+    - `result`: (S,) codes of `Result`.
+    - `simulated`: what only a simulation knows, or None; also to be had as `failed_at`, `error`
+      and `events`.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
-    - `inputs`, `outputs`: names. `family`: name of the section family, for labels.
+    - `inputs`, `outputs`: names. `label`: whose sections these are, for labels.
     """
 
     u: Float[np.ndarray, "S n nu"]
     y: Float[np.ndarray, "S n ny"]
     result: Int[np.ndarray, " S"]
-    failed_at: Int[np.ndarray, " S"]
-    error: Float[np.ndarray, " S"] | None
+    simulated: Simulated | None
     cycle_outputs: Float[np.ndarray, "N ny"] | None
     n_sections: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-    family: str = eqx.field(static=True)
+    label: str = eqx.field(static=True)
 
     def __init__(
         self,
-        u: Any,
-        y: Any,
+        u: ArrayLike,
+        y: ArrayLike,
         *,
         n_sections: int,
         periods: int,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
-        result: Any = None,
-        failed_at: Any = None,
-        error: Any = None,
-        cycle_outputs: Any = None,
-        family: str = "",
+        result: ArrayLike | None = None,
+        simulated: Simulated | None = None,
+        cycle_outputs: ArrayLike | None = None,
+        label: str = "",
     ):
         """**Arguments:** the fields. Without `result` every experiment counts as good; names
         default to `u` and `y`, or `u0`, `u1`, ... where there are several.
@@ -77,12 +88,11 @@ class ExperimentData(eqx.Module):
             )
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
-        self.failed_at = np.full(S, -1) if failed_at is None else np.asarray(failed_at, int)
-        self.error = None if error is None else np.asarray(error, float)
+        self.simulated = simulated
         self.cycle_outputs = (
             None if cycle_outputs is None else _real("cycle_outputs", cycle_outputs)
         )
-        self.n_sections, self.periods, self.family = n_sections, periods, family
+        self.n_sections, self.periods, self.label = n_sections, periods, label
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
 
@@ -104,9 +114,10 @@ class ExperimentData(eqx.Module):
                 f"{N} sections."
             )
         each = (self.result, self.failed_at) + (() if self.error is None else (self.error,))
-        if any(x.shape != (S,) for x in each):
+        if any(x.shape != (S,) for x in each) or (self.events and len(self.events.time) != S):
             raise DefinitionError(
-                f"result, failed_at and error must have one entry for each of {S} experiments."
+                f"result, failed_at, error and events must have one entry for each of {S} "
+                "experiments."
             )
         if self.cycle_outputs is not None and self.cycle_outputs.shape != (N, ny):
             raise DefinitionError(
@@ -129,6 +140,28 @@ class ExperimentData(eqx.Module):
     def ok(self) -> Bool[np.ndarray, " S"]:
         """Which experiments ran to their end."""
         return self.result == Result.OK
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The experiments that ran to their end, each with all of its cycles."""
+        about = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
+        return tuple(Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok))
+
+    @property
+    def failed_at(self) -> Int[np.ndarray, " S"]:
+        """The sample at which an experiment failed, -1 where it did not or is not known."""
+        return np.full(len(self.u), -1) if self.simulated is None else self.simulated.failed_at
+
+    @property
+    def error(self) -> Float[np.ndarray, " S"] | None:
+        """Estimates of the largest error of a simulation, relative to the sizes of the states on
+        the cycle, or None if not known."""
+        return None if self.simulated is None else self.simulated.error
+
+    @property
+    def events(self) -> EventTimes | None:
+        """When events happened (`run_experiments(record_events=True)`), or None if not known."""
+        return None if self.simulated is None else self.simulated.events
 
     @property
     def window(self) -> slice:
@@ -156,9 +189,9 @@ class ExperimentData(eqx.Module):
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
-        family = f"{self.family}, " if self.family else ""
+        label = f"{self.label}, " if self.label else ""
         return (
-            f"ExperimentData({family}{self.summary()}; {n // self.n_sections} cycles of "
+            f"ExperimentData({label}{self.summary()}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
         )
@@ -187,65 +220,3 @@ def _real(name: str, values: Any) -> np.ndarray:
     if values.dtype.kind not in "fiu":
         raise DefinitionError(f"{name} must hold real numbers, not {values.dtype}.")
     return values.astype(float)
-
-
-def simulate_experiments(
-    ldtp: LDTP,
-    design: Design,
-    *,
-    discard: int | None = None,
-    start: Literal["rest", "periodic"] = "rest",
-    process_noise: int | float = 0.0,
-    seed: int = 0,
-) -> ExperimentData:
-    """Run a design on a linear periodic model, from section 0.
-
-    **Arguments:**
-
-    - `ldtp`: the model. `design`: for the same N and number of inputs.
-    - `start`: `"rest"` starts at zero, so a transient decays during the first cycles;
-      `"periodic"` starts on the periodic response, without a transient.
-    - `discard`: cycles run before the window of P periods; by default 20 from rest (as in the
-      paper), 0 from the periodic start.
-    - `process_noise`: standard deviation of a random input, held from section to section, that
-      acts beside the excitation and is not recorded. `seed`: of it.
-
-    **Returns:** `ExperimentData` with `discard + P` cycles.
-
-    **Raises:** `DefinitionError` if N or the number of inputs differ, or if a periodic response
-    does not exist (a multiplier that is a P-th root of one).
-    """
-    if start not in ("rest", "periodic"):
-        raise DefinitionError(f"start must be 'rest' or 'periodic', not {start!r}.")
-    if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
-        raise DefinitionError(
-            f"the design is for N = {design.n_sections} and {len(design.input_names)} inputs, the "
-            f"model has N = {ldtp.n_sections} and {len(ldtp.inputs)}."
-        )
-    if discard is None:
-        discard = 20 if start == "rest" else 0
-    if discard < 0:
-        raise DefinitionError(f"discard must not be negative, but is {discard}.")
-    u = design.inputs(design.periods + discard)
-    x0 = None
-    if start == "periodic":
-        # Outside of jit, where the model can tell that no periodic response exists.
-        x0 = jax.vmap(lambda u: ldtp.periodic_state(u, design.periods))(design.inputs())
-    kicks = draw_process_noise(u.shape, process_noise, seed)
-    y = _respond(ldtp, jnp.asarray(u + kicks), x0)
-    return ExperimentData(
-        u,
-        y,
-        n_sections=design.n_sections,
-        periods=design.periods,
-        inputs=ldtp.inputs,
-        outputs=ldtp.outputs,
-        family="linear model",
-    )
-
-
-@eqx.filter_jit
-def _respond(
-    ldtp: LDTP, u: Float[Array, "S n nu"], x0: Float[Array, "S d"] | None
-) -> Float[Array, "S n ny"]:
-    return jax.vmap(ldtp.simulate)(u, x0)

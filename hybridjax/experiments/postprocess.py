@@ -5,7 +5,7 @@ import numpy as np
 
 from .._core.results import Result
 from ..errors import DefinitionError
-from .data import ExperimentData
+from .data import ExperimentData, Simulated
 
 
 Number = int | float
@@ -45,7 +45,8 @@ def odd_part(data: ExperimentData) -> ExperimentData:
     """Half the difference of each pair of experiments with opposite inputs.
 
     Even-order distortion is the same for u and -u and cancels; so do offsets, such as an error of
-    the limit cycle. A pair with a failed member counts as failed.
+    the limit cycle. A pair with a failed member counts as failed. Events belong to no pair and are
+    left out.
 
     **Arguments:** `data` of a design `with_negatives()`: experiments 2k and 2k + 1 are a pair.
 
@@ -75,8 +76,7 @@ def odd_part(data: ExperimentData) -> ExperimentData:
         inputs=data.inputs,
         outputs=data.outputs,
         result=result,
-        failed_at=failed_at,
-        error=error,
+        simulated=Simulated(failed_at, error),
         cycle_outputs=data.cycle_outputs,
-        family=data.family,
+        label=data.label,
     )

@@ -1,7 +1,7 @@
 """The response to inputs as a function that can be differentiated."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,31 +9,31 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.precision import require_x64
-from ..engine.settings import EXPERIMENT, Settings
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..maps.place import as_placed
-from ..maps.placed import PlacedSections
+from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .plan import Plan, plan_flow
-from .respond import Response, respond
+from .flow_batch import Response, flow_batch
+from .stepping.plan import Stepping, plan_flow
 
 
-# Steps between two sections that a derivative remembers, and for a whole period.
-_STEPS, _STEPS_IN_ALL = 32, 1024
+# Steps that a derivative remembers: between two sections at least, and in a period of the cycle.
+# Twice as many need twice the memory, and let experiments go ways that need more steps.
+_STEPS, _STEPS_PER_PERIOD = 32, 1024
 
 
 class ResponseFunction(eqx.Module):
     """From inputs held between sections to outputs at the sections; see `response_function`.
 
-    **Fields:** `placed`, the sections; `plan` and `settings`, how to step between them; `outputs`.
+    **Fields:** `placed`, the sections; `stepping`, how to step between them; `outputs`.
     """
 
     placed: PlacedSections
-    plan: Plan
-    settings: Settings
+    stepping: Stepping
     outputs: tuple[str | Output, ...]
 
     def __call__(
@@ -47,7 +47,10 @@ class ResponseFunction(eqx.Module):
         `system`, one with other parameters: the sections stay where they are.
 
         **Returns:** a `Response`: outputs `y` (S, n, ny) (not deviations), `result` (S,) codes,
-        `failed_at` (S,), and estimates `error` (S,). Nothing is raised for experiments that fail.
+        `failed_at` (S,), estimates `error` (S,), and where experiments `end` (S, m). Nothing is
+        raised for experiments that fail.
+
+        **Raises:** `DefinitionError` for inputs of another shape.
         """
         u = jnp.asarray(u, float)
         N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
@@ -60,19 +63,18 @@ class ResponseFunction(eqx.Module):
         if system is not None:
             placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
         if start is None:
-            lanes = placed.lanes
-            first = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
-            start = jnp.broadcast_to(first, (len(first), len(u)))
-        return respond(placed, self.plan, start, u, self.outputs, self.settings)
+            start = jnp.tile(placed.section_zero[:, None], len(u))
+        return flow_batch(
+            placed, self.stepping.plan, start, u, self.outputs, self.stepping.settings
+        )
 
 
 def response_function(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
     accuracy: float = EXPERIMENT,
-    scale: Mapping[str, float] | None = None,
 ) -> ResponseFunction:
     """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.
 
@@ -97,7 +99,8 @@ def response_function(
     placed = as_placed(cycle, sections)
     require_x64(cycle)
     z = Structure(cycle.system).resolve_outputs(outputs)
-    plan, settings, _ = plan_flow(placed, accuracy, scale)
-    steps = max(_STEPS, _STEPS_IN_ALL // placed.n_sections)
-    settings = dataclasses.replace(settings, max_steps=steps)
-    return ResponseFunction(placed, plan, settings, tuple(z.items))
+    stepping = plan_flow(placed, accuracy)
+    steps = max(_STEPS, _STEPS_PER_PERIOD // placed.n_sections)
+    settings = dataclasses.replace(stepping.settings, max_steps=steps)
+    stepping = dataclasses.replace(stepping, settings=settings)
+    return ResponseFunction(placed, stepping, tuple(z.items))

@@ -1,39 +1,36 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Unpack
 
-import numpy as np
-from jaxtyping import Array, Float
+from tqdm import tqdm
 
+from .._core.execution import Execution
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import chunks, prepare
 from .data import ExperimentData
-from .design.design import Design
-from .variation import vary
+from .inputs import DesignLike
+from .noise import ProcessNoise
+from .options import Options, OptionsByName, Start
 
 
-# Experiments in one part of a stream.
+# Experiments in one part of a stream. Twice as many need twice the memory.
 CHUNK = 640
 
 
 def run_experiments(
     cycle: LimitCycle,
     sections,
-    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    start: str = "cycle",
+    start: Start = "cycle",
     discard: int | None = None,
-    periods: int | None = None,
-    process_noise: float = 0.0,
-    seed: int = 0,
+    process_noise: ProcessNoise | None = None,
     accuracy: float | None = None,
-    scale: Mapping[str, float] | None = None,
-    precision: str = "double",
-    batch: int | None = None,
-    workers: int | None = None,
-    progress: bool = False,
+    record_events: bool = False,
+    execution: Execution | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
@@ -46,53 +43,39 @@ def run_experiments(
 
     - `sections`: a family, or `PlacedSections`.
     - `design`: a `Design`, or inputs (S, n, nu) that are held from section to section, with n a
-        whole number of periods; then `periods` says how many of the last ones are for estimation
-        (by default all that are not discarded).
+        whole number of periods; all that are not discarded are then for estimation.
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
     - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
         linearization predicts, so that there is almost no transient, and "steady" in the periodic
         response itself, found by Newton's method, with none.
     - `discard`: cycles that come before the design's periods and are meant to be discarded. By
         default 20 from the cycle (the paper's) and 0 from a periodic start.
-    - `process_noise`: standard deviation of a random input, held from section to section, that
-        acts beside the excitation and is not recorded. `seed`: of it.
+    - `process_noise`: a random input beside the excitation, which is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
-        every section, relative to `scale`. By default 1e-9, and 1e-4 in single precision.
-        `data.error` is each experiment's own estimate.
-    - `scale`: sizes of states by name (of time as `t`); by default the largest on the cycle.
-    - `precision`: "double" or "single". Single precision computes the experiments in 32 bits, the
-        cycle, the sections and the plan remain in 64. What rounding costs is measured on the
-        cycle and is part of `data.error`.
-    - `batch`: experiments per compiled call, by default what is fastest. Another size compiles
-        another program.
-    - `workers`: threads that run batches at the same time; by default all cores on CPU, and one
-        on an accelerator.
-    - `progress`: show a progress bar over the batches.
+        every section, relative to their largest sizes on the cycle. By default 1e-9, and 1e-4 in
+        single precision. `data.error` is each experiment's own estimate.
+    - `record_events`: whether to record when events happen, as `data.events`.
+    - `execution`: batches, threads, precision, and whether to show a progress bar.
 
     **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
 
     **Raises:** `DefinitionError` for arguments that do not fit together, or for an accuracy that
     single precision cannot give; `ComputationError` for an unstable cycle, from which any
-    experiment would run away.
+    experiment would run away, and where a steady start is not found.
     """
-    campaign = _prepare(
-        cycle, sections, design, outputs, start=start, discard=discard, periods=periods,
-        process_noise=process_noise, seed=seed, accuracy=accuracy, scale=scale,
-        precision=precision, batch=batch, workers=workers,
-    )  # fmt: skip
-    return campaign.run(slice(0, campaign.count), progress)
+    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    campaign = prepare(cycle, sections, design, outputs, options)
+    return campaign.run(progress=campaign.execution.progress)
 
 
 def stream_experiments(
     cycle: LimitCycle,
     sections,
-    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
     chunk: int = CHUNK,
-    batch: int | None = None,
-    workers: int | None = None,
-    **options,
+    **options: Unpack[OptionsByName],
 ) -> Iterator[ExperimentData]:
     """Run experiments chunk by chunk, in memory that does not depend on their number.
 
@@ -106,15 +89,8 @@ def stream_experiments(
     **Returns:** an iterator over `ExperimentData` of consecutive experiments; each chunk is run
     when it is asked for.
 
-    **Raises:** as `run_experiments`, at once.
+    **Raises:** as `run_experiments`; for arguments that do not fit together at once.
     """
-    about = dict(chunk=chunk, batch=batch, workers=workers)
-    campaign = _prepare(cycle, sections, design, outputs, **about, **options)
-    return map(campaign.run, chunks(campaign.count, chunk))
-
-
-def _prepare(*arguments, start="cycle", process_noise=0.0, seed=0, **options):
-    """`prepare`, and what is done beside it."""
-    steady = start == "steady"
-    start = "periodic" if steady else start
-    return vary(prepare(*arguments, start=start, **options), steady, process_noise, seed)
+    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
+    parts = chunks(len(campaign.inputs), chunk)
+    return map(campaign.run, tqdm(parts, "chunks", disable=not campaign.execution.progress))

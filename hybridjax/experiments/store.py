@@ -4,6 +4,7 @@ A folder of experiments holds a file `experiments.json`, which says what they ar
 each chunk, an `ExperimentData` as `save` writes it. A chunk appears complete or not at all.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -11,43 +12,42 @@ import uuid
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from .._core.archive import read_module, write_module
 from ..errors import DefinitionError, FileFormatError
-from ..io import load, save
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import Campaign, chunks, prepare
 from .data import ExperimentData, summary
 from .design.design import Design
+from .inputs import DesignLike
+from .options import Options, OptionsByName
 from .run import CHUNK
 
 
 _MANIFEST = "experiments.json"
-_FORMAT = "hybridjax experiments 1"
-# Cycles found on different machines are the same up to this, relative to their size.
-_SAME = 1e-7
+_FORMAT = "hybridjax experiments 2"
+# Cycles found on different machines are the same up to this, relative to their size. Twice as much
+# takes cycles for the same that differ twice as much.
+_SAME_CYCLE = 1e-7
 
 
 def store_experiments(
     folder: str | os.PathLike,
     cycle: LimitCycle,
     sections,
-    design: Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
     chunk: int = CHUNK,
     share: tuple[int, int] = (0, 1),
-    batch: int | None = None,
-    workers: int | None = None,
-    progress: bool = False,
-    **options,
+    **options: Unpack[OptionsByName],
 ) -> "StoredExperiments":
     """Run experiments and write them to a folder, in memory that does not depend on their number.
 
@@ -70,15 +70,14 @@ def store_experiments(
     rank, size = share
     if not 0 <= rank < size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
-    about = dict(chunk=chunk, batch=batch, workers=workers)
-    campaign = prepare(cycle, sections, design, outputs, **about, **options)
-    parts = chunks(campaign.count, chunk)
+    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
+    parts = chunks(len(campaign.inputs), chunk)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
     missing = [k for k in stored.missing() if k % size == rank]
-    for k in tqdm(missing, "chunks", disable=not progress):
-        save(stored.path(k), campaign.run(parts[k]))
+    for k in tqdm(missing, "chunks", disable=not campaign.execution.progress):
+        write_module(stored.path(k), campaign.run(parts[k]))
     return stored
 
 
@@ -101,7 +100,7 @@ class StoredExperiments:
         self._id = _identity(about)
         self.experiments: int = about["experiments"]
         self.chunk: int = about["chunk"]
-        self.n_sections: int = about["sections"]
+        self.n_sections: int = about["n_sections"]
         known = {self.path(k).name for k in range(len(self))}
         other = sorted(p.name for p in self.folder.glob("[!.]*.npz") if p.name not in known)
         if other:
@@ -137,7 +136,7 @@ class StoredExperiments:
         """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing."""
         self._complete()
         for k in range(len(self)):
-            yield load(self.path(k))
+            yield read_module(self.path(k), {"ExperimentData": ExperimentData})
 
     def summary(self, limit: int = 5) -> str:
         """As `ExperimentData.summary`, of all experiments."""
@@ -145,7 +144,7 @@ class StoredExperiments:
         codes = []
         for k in range(len(self)):
             with np.load(self.path(k)) as file:
-                codes.append((file["result"], file["failed_at"]))
+                codes.append((file["result"], file["simulated.failed_at"]))
         return summary(*map(np.concatenate, zip(*codes, strict=True)), self.n_sections, limit)
 
     def _complete(self) -> None:
@@ -180,7 +179,7 @@ def _open(folder: Path, about: dict[str, Any]) -> None:
         if name == "cycle":
             mine, theirs = np.asarray(value), np.asarray(there.get(name))
             same = mine.shape == theirs.shape and bool(
-                np.allclose(mine, theirs, rtol=_SAME, atol=_SAME * np.abs(mine).max())
+                np.allclose(mine, theirs, rtol=_SAME_CYCLE, atol=_SAME_CYCLE * np.abs(mine).max())
             )
         else:
             same = there.get(name) == value
@@ -206,31 +205,33 @@ def _read(folder: Path) -> dict[str, Any] | None:
 
 def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
     """What makes these experiments what they are."""
-    placed = campaign.placed
-    system, lanes = placed.cycle.system, placed.lanes
-    if isinstance(campaign.source, Design):
-        design = eqx.partition(campaign.source, eqx.is_array)
-        inputs = _digest([*jax.tree_util.tree_leaves(design[0]), repr(design[1].input_names)])
+    placed, inputs, noise = campaign.placed, campaign.inputs, campaign.process_noise
+    system, lanes, stepping = placed.cycle.system, placed.lanes, campaign.stepping
+    if isinstance(inputs.source, Design):
+        design = eqx.partition(inputs.source, eqx.is_array)
+        digest = _digest([*jax.tree_util.tree_leaves(design[0]), repr(design[1].input_names)])
     else:
-        inputs = _digest([campaign.source])
+        digest = _digest([inputs.source])
     return {
         "format": _FORMAT,
-        "experiments": campaign.count,
+        "experiments": len(inputs),
         "chunk": chunk,
-        "cycles": campaign.cycles,
-        "periods": campaign.periods,
-        "sections": placed.n_sections,
-        "start": "cycle" if campaign.model is None else "periodic",
+        "cycles": inputs.cycles,
+        "periods": inputs.periods,
+        "n_sections": placed.n_sections,
+        "start": campaign.start.name,
+        "process_noise": None if noise is None else dataclasses.asdict(noise),
+        "record_events": campaign.record_events,
         "inputs": list(system.inputs),
         "outputs": list(campaign.outputs.names),
         "system": type(system).__qualname__,
         "family": placed.family.label,
         "parameters": _digest(jax.tree_util.tree_leaves((system, placed.family))),
-        "accuracy": campaign.accuracy,
-        "precision": campaign.precision,
-        "design": inputs,
+        "accuracy": stepping.accuracy,
+        "precision": campaign.execution.precision,
+        "design": digest,
         "cycle": np.concatenate(
-            [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, campaign.scales)]
+            [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, stepping.scales)]
         ).tolist(),
     }
 

@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
-from ..orbits.cycle import LimitCycle, find_limit_cycle
+from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
 from .model_fit import ModelFit, Starts
@@ -148,7 +149,7 @@ def _anchored(cycle: LimitCycle) -> LimitCycle:
     a, q = int(charts[k]), cycle.legs.q[:, k]
     return find_limit_cycle(
         cycle.system, Guess(s.names[a], q[: s.dims[a]], cycle.legs.t[k]),
-        turns=cycle.turns, conserved=cycle.conserved, settings=cycle.settings,
+        multiplicity=cycle.multiplicity, conserved=cycle.conserved, settings=cycle.settings,
     )  # fmt: skip
 
 

@@ -13,16 +13,17 @@ from jaxtyping import Array, Bool, Complex, Float
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.plan import Plan
-from ..experiments.respond import observe, respond
+from ..experiments.flow_batch import flow_batch
 from ..experiments.response_function import response_function
-from ..identify.multipliers.weights import check_values, weights_of
+from ..experiments.stepping.plan import Plan
+from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..maps.linearize import linearize
 from ..maps.place import place_sections
 from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
-from ..sections.families import AbstractSections, as_sections
+from ..sections.abstract import AbstractSections
+from ..sections.section_list import FamilyLike, as_family
 from ..systems.structure import Structure
 
 
@@ -68,20 +69,20 @@ class ObservedHTF(AbstractObservation):
     weights: Float[Array, "M F ny nu"]
     weighted: Bool[Array, ""]
 
-    def __init__(self, htf: HTF, sections):
+    def __init__(self, htf: HTF, sections: FamilyLike):
         """**Arguments:** `htf`, of outputs and inputs that the system knows by name; `sections`,
         the family of sections that it was measured at.
 
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
-        self.f, self.H, self.sections = htf.f, htf.H, as_sections(sections)
+        self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
         self.harmonics, self.inputs, self.outputs = htf.harmonics, htf.inputs, htf.outputs
         if self.sections.n_sections != htf.n_sections:
             raise DefinitionError(
                 f"the HTFs belong to {htf.n_sections} sections, the family has "
                 f"{self.sections.n_sections}."
             )
-        self.weights = jnp.asarray(weights_of(htf, check_values(htf)))
+        self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
@@ -119,14 +120,14 @@ class ObservedSeries(AbstractObservation):
     weighted: Bool[Array, ""]
     flow: tuple[Plan, Settings] | None
 
-    def __init__(self, data: ExperimentData, sections, std: Numbers | None = None):
+    def __init__(self, data: ExperimentData, sections: FamilyLike, std: Numbers | None = None):
         """**Arguments:** `data` of experiments with `start="cycle"`; `sections`, their family;
         `std`, the standard deviation of the measurement noise, one number or one for each output.
 
         **Raises:** `DefinitionError` if no experiment ran well, for another number of sections, or
         an `std` that is not positive.
         """
-        self.sections = as_sections(sections)
+        self.sections = as_family(sections)
         if self.sections.n_sections != data.n_sections:
             raise DefinitionError(
                 f"the data have {data.n_sections} sections, the family {self.sections.n_sections}."
@@ -152,14 +153,11 @@ class ObservedSeries(AbstractObservation):
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
-        first = jnp.concatenate([placed.lanes.t[None], placed.lanes.q])[:, :1]
-        start = jnp.broadcast_to(first, (len(first), len(self.u)))
+        start = jnp.tile(placed.section_zero[:, None], len(self.u))
         plan, settings = self.flow
-        y = respond(placed, plan, start, self.u, self.outputs, settings).y
+        y = flow_batch(placed, plan, start, self.u, self.outputs, settings).y
         if not self.absolute:
-            y = y - jnp.tile(
-                _at_sections(placed, self.outputs), (y.shape[1] // placed.n_sections, 1)
-            )
+            y = y - jnp.tile(placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1))
         return ((y - self.y) / self.scale).ravel()
 
     def prepare(self, cycle: LimitCycle) -> "ObservedSeries":
@@ -169,7 +167,10 @@ class ObservedSeries(AbstractObservation):
             )
         response = response_function(cycle, self.sections, self.outputs)
         return eqx.tree_at(
-            lambda o: o.flow, self, (response.plan, response.settings), is_leaf=lambda x: x is None
+            lambda o: o.flow,
+            self,
+            (response.stepping.plan, response.stepping.settings),
+            is_leaf=lambda x: x is None,
         )
 
 
@@ -193,7 +194,7 @@ class ObservedCycle(AbstractObservation):
 
     def __init__(
         self,
-        sections,
+        sections: FamilyLike,
         outputs: Sequence[str] | str = (),
         values: Numbers | None = None,
         *,
@@ -213,7 +214,7 @@ class ObservedCycle(AbstractObservation):
         **Raises:** `DefinitionError` if nothing was observed, for shapes that do not fit, NaN, or
         standard deviations that are not positive.
         """
-        self.sections = as_sections(sections)
+        self.sections = as_family(sections)
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         N, ny = self.sections.n_sections, len(self.outputs)
         given = {
@@ -235,11 +236,13 @@ class ObservedCycle(AbstractObservation):
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
-    def of(cls, cycle: LimitCycle, sections, outputs: Sequence[str] | str = ()) -> "ObservedCycle":
+    def of(
+        cls, cycle: LimitCycle, sections: FamilyLike, outputs: Sequence[str] | str = ()
+    ) -> "ObservedCycle":
         """All that can be seen of a known cycle: what an error-free measurement would give."""
         placed = place_sections(cycle, sections)
         outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        values = _at_sections(placed, outputs) if outputs else None
+        values = placed.observe(outputs) if outputs else None
         return cls(placed.family, outputs, values, times=_times(placed), period=cycle.period)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
@@ -247,7 +250,7 @@ class ObservedCycle(AbstractObservation):
         parts = []
         for name, seen, scale in zip(self.which, self.seen, self.scales, strict=True):
             if name == "values":
-                error = _at_sections(placed, self.outputs) - seen
+                error = placed.observe(self.outputs) - seen
             elif name == "times":
                 error = _times(placed) - seen
                 if cycle.clocked:
@@ -261,12 +264,6 @@ class ObservedCycle(AbstractObservation):
     def prepare(self, cycle: LimitCycle) -> "ObservedCycle":
         place_sections(cycle, self.sections)
         return self
-
-
-def _at_sections(placed: PlacedSections, outputs: tuple[str, ...]) -> Float[Array, "N ny"]:
-    s = Structure(placed.cycle.system)
-    z = s.resolve_outputs(outputs)
-    return observe(s, z, placed.lanes, jnp.zeros((s.nu, placed.n_sections))).T
 
 
 def _times(placed: PlacedSections) -> Float[Array, " N"]:

@@ -10,6 +10,10 @@ from ..errors import DefinitionError
 from .time_response import monodromy
 
 
+Harmonics = int | Iterable
+"""One harmonic, or several: integers of any type, numpy's too."""
+
+
 def all_harmonics(n_sections: int) -> tuple[int, ...]:
     """The `N` harmonics that are distinct, ascending.
 
@@ -18,7 +22,7 @@ def all_harmonics(n_sections: int) -> tuple[int, ...]:
     return tuple(range(-(n_sections // 2), (n_sections + 1) // 2))
 
 
-def check_harmonics(harmonics: int | Iterable | None, n_sections: int) -> tuple[int, ...]:
+def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, ...]:
     """`harmonics` as an ascending tuple; `None` means all of them.
 
     **Raises:** `DefinitionError` for harmonics that are out of range, repeated or no integers.

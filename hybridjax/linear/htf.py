@@ -1,23 +1,28 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from .._core.arguments import names, real_array, require_finite
+from .._core.arguments import Numbers, names, real_array, require_finite
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
-from .frequency_response import check_harmonics
+from .frequency_response import Harmonics, check_harmonics
 
 
-_SAME = 1e-9  # two frequencies (cycles per period) closer than this are the same
+# Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
+# with periods beyond 5e8 are not told apart, instead of 1e9.
+_SAME_FREQUENCY = 1e-9
+# A gap between frequencies is interpolated if it is no wider than so many of the widest step
+# (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
+_WIDEST_GAP = 2
+# Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
+_SILENT_LINE = 1e-10
 
 
 class HTF(eqx.Module):
@@ -43,7 +48,8 @@ class HTF(eqx.Module):
       be seen; None where they do not.
     - `noise_variance` (M, F, ny, nu): the part of it that is noise, from repeated periods. The
       rest is nonlinear distortion, which random phases make random. None where it was not split.
-    - `freedom` (F,): complex degrees of freedom of `variance`; None where it is known exactly.
+    - `variance_freedom` (F,): complex degrees of freedom of `variance`; None where it is known
+      exactly.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -52,7 +58,7 @@ class HTF(eqx.Module):
     H: Complex[Array, "M F ny nu"]
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
-    freedom: Float[Array, " F"] | None
+    variance_freedom: Float[Array, " F"] | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -61,42 +67,42 @@ class HTF(eqx.Module):
 
     def __init__(
         self,
-        f: Any,
-        H: Any,
-        harmonics: int | Iterable,
+        f: Numbers,
+        H: Numbers,
+        harmonics: Harmonics,
         n_sections: int,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         source: str = "estimate",
         *,
-        variance: Any = None,
-        noise_variance: Any = None,
-        freedom: Any = None,
+        variance: Numbers | None = None,
+        noise_variance: Numbers | None = None,
+        variance_freedom: Numbers | None = None,
     ):
-        H = H if isinstance(H, jax.Array) else np.asarray(H)
-        if not np.issubdtype(H.dtype, np.number) or H.ndim != 4:
+        values = H if isinstance(H, jax.Array) else np.asarray(H)
+        if not np.issubdtype(values.dtype, np.number) or values.ndim != 4:
             raise DefinitionError(
                 "`H` must hold complex numbers on the axes (harmonic, frequency, output, input), "
-                f"but it is {H.dtype} of shape {H.shape}."
+                f"but it is {values.dtype} of shape {values.shape}."
             )
         self.f = real_array("f", f, ndim=1)
         require_finite("f", self.f)
-        self.H = jnp.asarray(H, complex)
+        self.H = jnp.asarray(values, complex)
         self.harmonics = check_harmonics(harmonics, n_sections)
-        if H.shape[:2] != (len(self.harmonics), self.f.shape[0]):
+        if values.shape[:2] != (len(self.harmonics), self.f.shape[0]):
             raise DefinitionError(
-                f"`H` has shape {H.shape}, but there are {len(self.harmonics)} harmonics and "
+                f"`H` has shape {values.shape}, but there are {len(self.harmonics)} harmonics and "
                 f"{self.f.shape[0]} frequencies (its first two axes)."
             )
         if tuple(np.atleast_1d(harmonics)) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
-        self.outputs = names("outputs", outputs, H.shape[2])
-        self.inputs = names("inputs", inputs, H.shape[3])
+        self.outputs = names("outputs", outputs, values.shape[2])
+        self.inputs = names("inputs", inputs, values.shape[3])
         self.source = source
-        self.variance = _optional("variance", variance, H.shape)
-        self.noise_variance = _optional("noise_variance", noise_variance, H.shape)
-        self.freedom = _optional("freedom", freedom, self.f.shape)
+        self.variance = _optional("variance", variance, values.shape)
+        self.noise_variance = _optional("noise_variance", noise_variance, values.shape)
+        self.variance_freedom = _optional("variance_freedom", variance_freedom, self.f.shape)
 
     def __repr__(self) -> str:
         count = self.f.shape[-1]
@@ -123,14 +129,14 @@ class HTF(eqx.Module):
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         return self.harmonic(m)
 
-    def select(self, harmonics: int | Iterable) -> "HTF":
+    def select(self, harmonics: Harmonics) -> "HTF":
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
         variance, noise = (None if v is None else v[rows] for v in self._variances)
-        return self._with(self.f, self.H[rows], harmonics, variance, noise, self.freedom)
+        return self._with(self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom)
 
-    def at(self, f: Any) -> "HTF":
+    def at(self, f: Numbers) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
 
         **Raises:** `DefinitionError` for a frequency that was not measured.
@@ -140,14 +146,15 @@ class HTF(eqx.Module):
         wanted, known = np.atleast_1d(np.asarray(f, float)), np.asarray(self.f)
         distance = np.abs(known - wanted[:, None])
         nearest = np.argmin(distance, axis=1)
-        lost = ~(distance.min(axis=1) < _SAME)
+        lost = ~(distance.min(axis=1) < _SAME_FREQUENCY)
         if lost.any():
             raise DefinitionError(
                 f"f = {wanted[lost][0]:.10g} was not excited or not measured; the nearest one is "
                 f"{known[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
             )
         variance, noise = (None if v is None else v[:, nearest] for v in self._variances)
-        freedom = None if self.freedom is None else self.freedom[nearest]
+        known_by = self.variance_freedom
+        freedom = None if known_by is None else known_by[nearest]
         return self._with(
             self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom
         )
@@ -169,12 +176,13 @@ class HTF(eqx.Module):
             )
         if not 0 < level < 1:
             raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
-        if self.freedom is None:
+        if self.variance_freedom is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
-        quantile = self.freedom * jnp.expm1(-np.log1p(-level) / self.freedom)
+        freedom = self.variance_freedom
+        quantile = freedom * jnp.expm1(-np.log1p(-level) / freedom)
         return jnp.sqrt(quantile[:, None, None] * self.variance)
 
-    def interpolate(self, f: Any) -> "HTF":
+    def interpolate(self, f: Numbers) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbors (host side).
 
         If the harmonics are symmetric about 0, the symmetry for real signals adds the negative
@@ -189,23 +197,30 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, self.H, f):
             raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
-        f = np.asarray(real_array("f", np.atleast_1d(f), ndim=1))
+        wanted = np.asarray(real_array("f", np.atleast_1d(f), ndim=1))
         knots, values = self._neighbors(self.H)
         given = np.unique(self.f)
         if len(given) < 2:
             raise DefinitionError("Interpolation needs at least two frequencies.")
         step = np.diff(given)
-        ends = np.flatnonzero(np.diff(knots) > 2 * step[step > _SAME].max() + _SAME) + 1
-        place = np.mod(f, self.n_sections)
-        H = np.full((values.shape[0], len(f), *values.shape[2:]), np.nan, complex)
+        ends = (
+            np.flatnonzero(
+                np.diff(knots) > _WIDEST_GAP * step[step > _SAME_FREQUENCY].max() + _SAME_FREQUENCY
+            )
+            + 1
+        )
+        place = np.mod(wanted, self.n_sections)
+        H = np.full((values.shape[0], len(wanted), *values.shape[2:]), np.nan, complex)
         for run in np.split(np.arange(len(knots)), ends):
-            inside = (place >= knots[run[0]] - _SAME) & (place <= knots[run[-1]] + _SAME)
+            inside = (place >= knots[run[0]] - _SAME_FREQUENCY) & (
+                place <= knots[run[-1]] + _SAME_FREQUENCY
+            )
             if len(run) > 1 and np.any(inside):
                 H[:, inside] = CubicSpline(knots[run], values[:, run], axis=1)(place[inside])
         missing = np.isnan(H[0, :, 0, 0])
         if np.any(missing):
             raise DefinitionError(
-                f"f = {f[missing][0]:g} cycles per period is too far from the frequencies "
+                f"f = {wanted[missing][0]:g} cycles per period is too far from the frequencies "
                 f"measured ({given[0]:g} to {given[-1]:g}) to interpolate."
             )
 
@@ -215,12 +230,13 @@ class HTF(eqx.Module):
             line = make_interp_spline(*self._neighbors(values), k=1, axis=1)
             return line(place)
 
-        freedom = None if self.freedom is None else self.freedom[None, :, None, None]
-        freedom = None if freedom is None else linear(freedom + 0 * self.H.real)[0, :, 0, 0]
+        freedom = self.variance_freedom
+        if freedom is not None:
+            freedom = linear(freedom[None, :, None, None] + 0 * self.H.real)[0, :, 0, 0]
         variance, noise = map(linear, self._variances)
-        return self._with(f, H, self.harmonics, variance, noise, freedom)
+        return self._with(wanted, H, self.harmonics, variance, noise, freedom)
 
-    def predict(self, u: ArrayLike) -> Float[Array, "time ny"]:
+    def predict(self, u: Numbers) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
 
         Harmonics that are not stored count as zero. Differentiable with respect to `H`.
@@ -234,12 +250,12 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
-        u = np.asarray(real_array("u", u, ndim=2))
-        n, nu = u.shape
+        values = np.asarray(real_array("u", u, ndim=2))
+        n, nu = values.shape
         if n == 0 or n % self.n_sections or nu != len(self.inputs):
             raise DefinitionError(
-                f"`u` has shape {u.shape}, but needs a multiple of {self.n_sections} samples and "
-                f"{len(self.inputs)} columns."
+                f"`u` has shape {values.shape}, but needs a multiple of {self.n_sections} samples "
+                f"and {len(self.inputs)} columns."
             )
         mirror = self._mirror()
         if mirror is None:
@@ -247,13 +263,13 @@ class HTF(eqx.Module):
                 f"A real response needs harmonics symmetric about 0, not {self.harmonics}."
             )
         periods = n // self.n_sections
-        U = np.fft.fft(u, axis=0)
-        excited = np.flatnonzero(np.abs(U).max(axis=1) > 1e-10 * np.abs(U).max())
+        U = np.fft.fft(values, axis=0)
+        excited = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
         lines, conjugate, here = [], [], []
         for k in excited:
             for sign in (1, -1):
                 distance = np.abs(self._circle(np.asarray(self.f) - sign * k / periods))
-                if len(distance) and distance.min() < _SAME:
+                if len(distance) and distance.min() < _SAME_FREQUENCY:
                     lines.append(k)
                     conjugate.append(sign < 0)
                     here.append(int(np.argmin(distance)))
@@ -286,7 +302,7 @@ class HTF(eqx.Module):
                     f"Two HTFs with different {name} cannot be compared: {mine} and {its}."
                 )
         if self.f.shape != other.f.shape or not (
-            is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME)
+            is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME_FREQUENCY)
         ):
             raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
         scale = jnp.max(jnp.abs(other.harmonic(0)), axis=(0, 2))
@@ -303,7 +319,7 @@ class HTF(eqx.Module):
     def _with(self, f, H, harmonics, variance, noise_variance, freedom):
         return HTF(
             f, H, harmonics, self.n_sections, self.inputs, self.outputs, self.source,
-            variance=variance, noise_variance=noise_variance, freedom=freedom,
+            variance=variance, noise_variance=noise_variance, variance_freedom=freedom,
         )  # fmt: skip
 
     def _circle(self, f):
@@ -329,18 +345,18 @@ class HTF(eqx.Module):
         if mirror is not None:
             f, H = np.concatenate([f, -f]), np.concatenate([H, H[mirror].conj()], axis=1)
         f = np.mod(f, self.n_sections)
-        f[self.n_sections - f < _SAME] = 0.0
+        f[self.n_sections - f < _SAME_FREQUENCY] = 0.0
         order = np.argsort(f, kind="stable")
-        order = order[np.diff(f[order], prepend=-1.0) > _SAME]
+        order = order[np.diff(f[order], prepend=-1.0) > _SAME_FREQUENCY]
         f, H = f[order], H[:, order]
         turns = np.concatenate([f - self.n_sections, f, f + self.n_sections])
         return turns, np.tile(H, (1, 3, 1, 1))
 
 
-def _optional(name: str, value: Any, shape: tuple[int, ...]):
+def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:
     if value is None:
         return None
-    value = real_array(name, value, ndim=len(shape))
-    if value.shape != shape:
-        raise DefinitionError(f"`{name}` must have the shape {shape}, not {value.shape}.")
-    return value
+    array = real_array(name, value, ndim=len(shape))
+    if array.shape != shape:
+        raise DefinitionError(f"`{name}` must have the shape {shape}, not {array.shape}.")
+    return array

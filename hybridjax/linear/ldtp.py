@@ -1,27 +1,30 @@
 """Linear discrete-time periodic systems whose state dimension may vary over the period."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import names, real_array, require_finite
+from .._core.arguments import Numbers, names, real_array, require_finite
+from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from . import time_response
-from .frequency_response import check_harmonics, harmonic_transfer
+from .frequency_response import Harmonics, check_harmonics, harmonic_transfer
 from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
 
 
-_RTOL = 1e-12  # singular values of a factor below this part of its largest one are zero
-_RESONANCE = 1e-8  # closer than this to a multiplier, z^N leaves less than half of the digits
+# Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier
+# that is carried by so weak a direction counts as zero.
+_RANK_TOLERANCE = 1e-12
+# Distance of z^N from a multiplier, below which less than half of the digits are left of a
+# response. Doubled: responses twice as far from the resonance are refused.
+_RESONANCE = 1e-8
 
 
 class LDTP(eqx.Module):
@@ -57,11 +60,11 @@ class LDTP(eqx.Module):
 
     def __init__(
         self,
-        A: Any,
-        B: Any,
-        C: Any,
-        D: Any = None,
-        dims: Any = None,
+        A: Numbers,
+        B: Numbers,
+        C: Numbers,
+        D: Numbers | None = None,
+        dims: Numbers | None = None,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
@@ -100,10 +103,10 @@ class LDTP(eqx.Module):
     @classmethod
     def from_blocks(
         cls,
-        A: Sequence[ArrayLike],
-        B: Sequence[ArrayLike],
-        C: Sequence[ArrayLike],
-        D: Sequence[ArrayLike] | None = None,
+        A: Sequence[Numbers],
+        B: Sequence[Numbers],
+        C: Sequence[Numbers],
+        D: Sequence[Numbers] | None = None,
         inputs: str | Sequence[str] | None = None,
         outputs: str | Sequence[str] | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
@@ -161,25 +164,25 @@ class LDTP(eqx.Module):
         )
 
     def states(
-        self, u: ArrayLike, x0: ArrayLike | None = None, start: int = 0
+        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), the input from section `start` on; `x0`, the state there,
+        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there,
         either padded (d,) or with its true dimension; by default zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
-        u, x0 = self._input(u), self._state(x0, start)
-        return time_response.states(self.A, self.B, u, x0, self._sections_from(start, u))
+        u, x0 = self._input(u), self._state(x0, first_section)
+        return time_response.states(self.A, self.B, u, x0, self._sections_from(first_section, u))
 
     def simulate(
-        self, u: ArrayLike, x0: ArrayLike | None = None, start: int = 0
+        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
     ) -> Float[Array, "time ny"]:
         """The outputs (n, ny) that an input leads to; arguments as in `states`."""
         u = self._input(u)
-        x = self.states(u, x0, start)[:-1]
-        return time_response.outputs(self.C, self.D, u, x, self._sections_from(start, u))
+        x = self.states(u, x0, first_section)[:-1]
+        return time_response.outputs(self.C, self.D, u, x, self._sections_from(first_section, u))
 
     def impulse_response(self, n_lags: int) -> Float[Array, "N lags ny nu"]:
         """The time-periodic impulse response (Markov parameters).
@@ -193,7 +196,7 @@ class LDTP(eqx.Module):
             raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
         return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
-    def htf(self, f: Any, harmonics: int | Iterable | None = None) -> HTF:
+    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
         """The exact harmonic transfer functions.
 
         **Arguments:**
@@ -228,30 +231,29 @@ class LDTP(eqx.Module):
         """
         return time_response.characteristic_polynomial(self.monodromy())
 
-    def multipliers(self, rtol: float = _RTOL) -> Complex[np.ndarray, " r"]:
+    @remembered
+    def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, computed on the host from the factors `A[n]`.
 
         Their product is never formed, so that multipliers far below `1e-16` of the largest keep
         their digits. Zeros are not found by size: they are counted from the dimensions and the
-        ranks of the factors.
-
-        **Arguments:** `rtol`: singular values of a factor below `rtol` times its largest one
-        count as zero.
+        ranks of the factors (as by `rank`).
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """
-        return product_eigenvalues(self._blocks("multipliers"), rtol)
+        return product_eigenvalues(self._blocks("multipliers"), _RANK_TOLERANCE)
 
-    def rank(self, section: int = 0, rtol: float = _RTOL) -> int:
+    def rank(self, section: int = 0, rtol: float = _RANK_TOLERANCE) -> int:
         """Rank of the monodromy matrix at a section, from the ranks of the factors (host side).
 
-        **Arguments:** `rtol` as in `multipliers`.
+        **Arguments:** `rtol`: singular values of a factor below `rtol` times its largest one
+        count as zero.
         """
         blocks = self._blocks("rank")
         first = section % self.n_sections
         return product_rank([*blocks[first:], *blocks[:first]], rtol)
 
-    def periodic_state(self, u: ArrayLike, periods: int) -> Float[Array, " d"]:
+    def periodic_state(self, u: Numbers, periods: int) -> Float[Array, " d"]:
         r"""The state at section 0 from which the response to a repeated input is periodic.
 
         $x_0 = (I - \Phi^P)^{-1} x_f$, with $x_f$ the state that `u` reaches from rest.
@@ -261,37 +263,45 @@ class LDTP(eqx.Module):
         **Raises:** `DefinitionError` if `u` has another length, or a multiplier is a `P`-th root
         of one within `1e-8`: then no such state exists.
         """
-        u = self._input(u)
-        if periods < 1 or u.shape[0] != periods * self.n_sections:
+        return self.periodic_states(self._input(u)[None], periods)[0]
+
+    def periodic_states(self, u: ArrayLike, periods: int) -> Float[Array, "S d"]:
+        """As `periodic_state`, for S inputs (S, P N, nu) at once."""
+        u = self._input(u, ndim=3)
+        if periods < 1 or u.shape[1] != periods * self.n_sections:
             raise DefinitionError(
-                f"`u` has {u.shape[0]} samples, but {periods} periods of {self.n_sections} "
+                f"`u` has {u.shape[1]} samples, but {periods} periods of {self.n_sections} "
                 f"sections are {periods * self.n_sections}."
             )
         self._refuse_resonance(np.arange(periods) / periods)
-        by_period = u.reshape(periods, self.n_sections, -1)
-        return time_response.periodic_state(self.A, self.B, by_period)
+        by_period = u.reshape(len(u), periods, self.n_sections, -1)
+        return time_response.periodic_states(self.A, self.B, by_period)
 
-    def _sections_from(self, start, u):
-        return (start + jnp.arange(u.shape[0])) % self.n_sections
+    def _sections_from(self, first_section, u):
+        return (first_section + jnp.arange(u.shape[0])) % self.n_sections
 
-    def _input(self, u):
-        u = real_array("u", u, ndim=2)
-        if u.shape[1] != len(self.inputs):
+    def _input(self, u, ndim=2):
+        u = real_array("u", u, ndim)
+        if u.shape[-1] != len(self.inputs):
             raise DefinitionError(
-                f"`u` has {u.shape[1]} columns, but the inputs are ({', '.join(self.inputs)})."
+                f"`u` has {u.shape[-1]} columns, but the inputs are ({', '.join(self.inputs)})."
             )
         return u
 
-    def _state(self, x0, start):
+    def _state(self, x0, first_section):
         d = self.A.shape[-1]
         if x0 is None:
             return jnp.zeros(d)
         x0 = real_array("x0", x0, ndim=1)
-        true = d if is_traced(self.dims) else int(np.asarray(self.dims)[start % self.n_sections])
+        true = (
+            d
+            if is_traced(self.dims)
+            else int(np.asarray(self.dims)[first_section % self.n_sections])
+        )
         if x0.shape[0] not in (d, true):
             raise DefinitionError(
-                f"`x0` has {x0.shape[0]} entries, but section {start % self.n_sections} has {true} "
-                f"coordinates ({d} with padding)."
+                f"`x0` has {x0.shape[0]} entries, but section {first_section % self.n_sections} "
+                f"has {true} coordinates ({d} with padding)."
             )
         return jnp.pad(x0, (0, d - x0.shape[0]))
 
@@ -312,7 +322,7 @@ class LDTP(eqx.Module):
     def _refuse_resonance(self, f):
         if is_traced(self.A, self.dims, f):
             return
-        multipliers, f = self.multipliers(), np.asarray(f)
+        multipliers, f = self.multipliers, np.asarray(f)
         distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)

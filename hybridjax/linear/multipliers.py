@@ -15,6 +15,13 @@ from ..errors import ComputationError
 
 Matrix = Float[np.ndarray, "_ _"]
 
+# Rounds of balancing. Doubled, units that differ by more are evened out.
+_BALANCING = 8
+# QR sweeps for one eigenvalue; two or three are usual. Doubled: failure is noticed later.
+_MOST_SWEEPS = 60
+# After so many sweeps in vain the shift is chosen otherwise. Doubled: a cycle of shifts ends later.
+_EXCEPTIONAL_EVERY = 10
+
 
 def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
     """Rank of the product: the range is carried through the factors on an orthonormal basis.
@@ -24,7 +31,7 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
 
     **Raises:** `ComputationError` for NaN and infinity.
     """
-    basis, _ = _carry_range(factors, np.eye(factors[0].shape[1]), rtol)
+    basis, _ = _carry_range(_balanced(factors), np.eye(factors[0].shape[1]), rtol)
     return basis.shape[1]
 
 
@@ -39,13 +46,31 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
 
     **Raises:** `ComputationError` if the QR algorithm does not converge, or for NaN and infinity.
     """
-    regular = _regular_part(factors, rtol)
+    regular = _regular_part(_balanced(factors), rtol)
     if not regular:
         return np.zeros(0, complex)
     triangular = _periodic_schur([factor.astype(complex) for factor in regular])
     eigenvalues = np.prod([np.diag(factor) for factor in triangular], axis=0)
     eigenvalues = _pair_conjugates(eigenvalues)
     return eigenvalues[np.lexsort((-eigenvalues.imag, -np.abs(eigenvalues)))]
+
+
+def _balanced(factors):
+    """The factors in other units of each coordinate, powers of two, in which what comes in is as
+    large as what goes out (Osborne, J. ACM 7, 1960): so that ranks do not depend on units."""
+    factors = [np.array(factor, float) for factor in factors]
+    if not all(np.all(np.isfinite(factor)) for factor in factors):
+        return factors
+    for _ in range(_BALANCING):
+        for n in range(len(factors)):
+            incoming = np.linalg.norm(factors[n - 1], axis=1)
+            outgoing = np.linalg.norm(factors[n], axis=0)
+            both = (incoming > 0) & (outgoing > 0)
+            ratio = np.divide(outgoing, incoming, out=np.ones_like(incoming), where=both)
+            unit = 2.0 ** np.round(np.log2(ratio) / 2)
+            factors[n - 1] *= unit[:, None]
+            factors[n] /= unit
+    return factors
 
 
 def _carry_range(factors, basis, rtol):
@@ -153,9 +178,9 @@ def _periodic_schur(factors):
         while low > 0 and not small[low - 1]:
             low -= 1
         stalled += 1
-        if stalled > 60:
+        if stalled > _MOST_SWEEPS:
             raise ComputationError("The periodic QR algorithm did not converge.")
-        shift = _shift(factors, low, high, exceptional=stalled % 10 == 0)
+        shift = _shift(factors, low, high, exceptional=stalled % _EXCEPTIONAL_EVERY == 0)
         start = (hessenberg[low, low] - shift, hessenberg[low + 1, low])
         _rotate(factors, low, _rotation(*start))
         for k in range(low + 1, high):

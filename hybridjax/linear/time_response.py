@@ -20,16 +20,16 @@ def states(
     B: Float[Array, "N d nu"],
     u: Float[Array, "n nu"],
     x0: Float[Array, " d"],
-    n_sections: Int[Array, " n"],
+    sections: Int[Array, " n"],
 ) -> Float[Array, "time d"]:
-    """`x0` and the states after each input; `n_sections`, where each input acts."""
+    """`x0` and the states after each input; `sections`, where each input acts."""
 
     def advance(x, step):
         n, u = step
         x = A[n] @ x + B[n] @ u
         return x, x
 
-    _, later = jax.lax.scan(advance, x0, (n_sections, u))
+    _, later = jax.lax.scan(advance, x0, (sections, u))
     return jnp.concatenate([x0[None], later])
 
 
@@ -39,10 +39,10 @@ def outputs(
     D: Float[Array, "N ny nu"],
     u: Float[Array, "n nu"],
     x: Float[Array, "n d"],
-    n_sections: Int[Array, " n"],
+    sections: Int[Array, " n"],
 ) -> Float[Array, "n ny"]:
     """`C x + D u` at each section."""
-    return jnp.einsum("nij,nj->ni", C[n_sections], x) + jnp.einsum("nij,nj->ni", D[n_sections], u)
+    return jnp.einsum("nij,nj->ni", C[sections], x) + jnp.einsum("nij,nj->ni", D[sections], u)
 
 
 @functools.partial(jax.jit, static_argnames="n_lags")
@@ -63,21 +63,22 @@ def impulse_response(
 
 
 @jax.jit
-def periodic_state(
-    A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "P N nu"]
-) -> Float[Array, " d"]:
-    r"""The start of the response with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
+def periodic_states(
+    A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "S P N nu"]
+) -> Float[Array, "S d"]:
+    r"""The starts of responses with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
 
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.
     """
-    periods, n_sections, _ = u.shape
-    rest = jnp.zeros(A.shape[-1])
-    w = jax.vmap(lambda u: states(A, B, u, rest, jnp.arange(n_sections))[-1])(u)
+    _, periods, n_sections, _ = u.shape
+    zero = jnp.zeros(A.shape[-1])
+    after_one = jax.vmap(lambda u: states(A, B, u, zero, jnp.arange(n_sections))[-1])
+    w = jax.vmap(after_one)(u)
     z_N = jnp.exp(2j * jnp.pi * jnp.arange(periods) / periods)
-    lifted = z_N[:, None, None] * jnp.eye(A.shape[-1]) - monodromy(A)
-    x = jnp.linalg.solve(lifted, jnp.fft.fft(w, axis=0)[..., None])
-    return jnp.mean(x[..., 0], axis=0).real
+    resolvent = z_N[:, None, None] * jnp.eye(A.shape[-1]) - monodromy(A)
+    x = jnp.linalg.solve(resolvent, jnp.fft.fft(w, axis=1)[..., None])
+    return jnp.mean(x[..., 0], axis=1).real
 
 
 @jax.jit

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
 from .._core.per_lane import by_lane
@@ -18,12 +19,12 @@ from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from ..systems.structure import Structure
 from .place import as_placed
-from .placed import PlacedSections
+from .placed import PlacedSections, SectionsLike
 
 
 def linearize(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     outputs: Sequence[str | Output] | str | Output | None = None,
     inputs: Sequence[str] | str | None = None,
 ) -> LDTP:
@@ -44,23 +45,11 @@ def linearize(
     lies, or an input that does not exist; `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
-    s = Structure(cycle.system)
-    traced = is_traced(placed)
-    if outputs is None:
-        outputs = [
-            n for n in s.state_names()
-            if all(s.state_function(n, a) is not None for a in range(len(s.charts)))
-        ]  # fmt: skip
-    z = s.resolve_outputs(outputs)
+    s, traced = placed.structure(), is_traced(placed)
+    z = s.resolve_outputs(_states_everywhere(s) if outputs is None else outputs)
     for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
-    names = cycle.system.inputs if inputs is None else _as_tuple(inputs)
-    for name in names:
-        if name not in cycle.system.inputs:
-            raise DefinitionError(
-                f"there is no input '{name}'; inputs are {', '.join(cycle.system.inputs)}."
-            )
-    columns = np.array([cycle.system.inputs.index(n) for n in names], int)
+    names, columns = _inputs(s, inputs)
     A, B = _section_jacobians(placed)
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1
@@ -69,21 +58,37 @@ def linearize(
         d = int(np.max(np.asarray(placed.dims)))
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
-        inputs=tuple(names), outputs=z.names,
+        inputs=names, outputs=z.names,
         coordinates=None if traced else placed.coordinates(),
     )  # fmt: skip
 
 
-def _as_tuple(names):
-    return (names,) if isinstance(names, str) else tuple(names)
+def _states_everywhere(s: Structure) -> list[str]:
+    """The states that every chart defines."""
+    charts = range(len(s.charts))
+    return [n for n in s.state_names() if all(s.state_function(n, a) is not None for a in charts)]
+
+
+def _inputs(
+    s: Structure, inputs: Sequence[str] | str | None
+) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
+    """Names of inputs, all by default, and their indices."""
+    known = s.system.inputs
+    names = known if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    for name in names:
+        if name not in known:
+            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
+    return names, np.array([known.index(n) for n in names], int)
 
 
 @quick_jit
-def _section_jacobians(placed: PlacedSections):
-    """A (N, c, c) and B (N, c, nu), padded; NaN where the flow failed."""
+def _section_jacobians(
+    placed: PlacedSections,
+) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
+    """A and B, padded; NaN where the flow failed."""
     n = 1 + placed.lanes.q.shape[0]
     following, _, target = placed.onwards()
-    jacobian, _ = tape_jacobian(Structure(placed.cycle.system), placed.lanes, target, placed.tape)
+    jacobian, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
     jacobian = jnp.where((placed.result == Result.OK)[:, None, None], jacobian, jnp.nan)
     embed, select = placed.frames()
     after = select[following]
@@ -91,9 +96,11 @@ def _section_jacobians(placed: PlacedSections):
 
 
 @quick_jit
-def _output_jacobians(placed: PlacedSections, outputs):
-    """C (N, ny, c) and D (N, ny, nu), padded."""
-    s, lanes = Structure(placed.cycle.system), placed.lanes
+def _output_jacobians(
+    placed: PlacedSections, outputs: tuple[str | Output, ...]
+) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
+    """C and D, padded."""
+    s, lanes = placed.structure(), placed.lanes
     z = s.resolve_outputs(outputs)
     n, ny = 1 + s.d, len(outputs)
 

@@ -1,18 +1,29 @@
 """A section family that was placed on a limit cycle."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.compile import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.tape import Tape
 from ..engine.target import Target
 from ..orbits.cycle import LimitCycle
-from ..sections.families import AbstractSections, Bound
+from ..sections.abstract import AbstractSections, BoundSections
+from ..sections.section_list import FamilyLike
+from ..systems.output import Output
 from ..systems.structure import Structure
+from .outputs import observe
+
+
+# A flow that does not arrive at its section gives up so many periods after the cycle itself would
+# have arrived. Doubled: failures are noticed later, at the cost of a longer flow.
+_GRACE = 0.5
 
 
 class PlacedSections(eqx.Module):
@@ -34,7 +45,7 @@ class PlacedSections(eqx.Module):
 
     cycle: LimitCycle
     family: AbstractSections
-    bound: Bound
+    bound: BoundSections
     lanes: Lanes
     tape: Tape
     duration: Float[Array, " N"]
@@ -46,6 +57,23 @@ class PlacedSections(eqx.Module):
     @property
     def n_sections(self) -> int:
         return self.family.n_sections
+
+    @property
+    def section_zero(self) -> Float[Array, " n"]:
+        """Time and padded state at which the cycle meets section 0."""
+        return jnp.append(self.lanes.t[0], self.lanes.q[:, 0])
+
+    def structure(self) -> Structure:
+        """The system by the indices of its charts and transitions, made anew."""
+        return Structure(self.cycle.system)
+
+    def observe(self, outputs: Sequence[str | Output] | str | Output) -> Float[Array, "N ny"]:
+        """Outputs of the cycle at the sections, without input; NaN where a chart does not define
+        them.
+
+        **Raises:** `DefinitionError` for a name that is no output.
+        """
+        return _observe(self, tuple(self.structure().resolve_outputs(outputs).items))
 
     @property
     def time_is_state(self) -> Bool[Array, " N"]:
@@ -60,7 +88,7 @@ class PlacedSections(eqx.Module):
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
-        s = Structure(self.cycle.system)
+        s = self.structure()
         names = []
         about = self.lanes.chart, self.drop, self.time_is_state
         for a, drop, timed in np.stack(about, axis=1):
@@ -74,7 +102,7 @@ class PlacedSections(eqx.Module):
     ) -> Target:
         """The target of lanes that flow to section i, `turns` periods after the first turn.
 
-        A lane gives up half a period after the cycle itself would have arrived.
+        Lanes that do not arrive give up in the end.
         """
         arrival = self.lanes.t[i] + turns * self.cycle.period
         time = self.bound.time[i] + turns * self.cycle.period
@@ -82,7 +110,7 @@ class PlacedSections(eqx.Module):
             jnp.broadcast_to(time, t.shape),
             i,
             self.bound.event[i],
-            jnp.maximum(arrival, t) + 0.5 * self.cycle.period,
+            jnp.maximum(arrival, t) + _GRACE * self.cycle.period,
             None,
             self.bound.levels,
             Result.SECTION_MISSED,
@@ -93,6 +121,17 @@ class PlacedSections(eqx.Module):
         following = (jnp.arange(self.n_sections) + 1) % self.n_sections
         turns = (following == 0).astype(jnp.int32)
         return following, turns, self.target(following, self.lanes.t, turns)
+
+
+SectionsLike = FamilyLike | PlacedSections
+"""A family, a single section, a list of sections, or a family that was placed on the cycle."""
+
+
+@quick_jit
+def _observe(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> Float[Array, "N ny"]:
+    s = placed.structure()
+    u = jnp.zeros((s.nu, placed.n_sections))
+    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
 
 
 def _frames(
@@ -107,10 +146,10 @@ def _frames(
     n = normal.shape[0]
     k = jnp.arange(n)
     kept = (k != drop) & ((k > 0) | with_time)
-    order = jnp.argsort(~kept, stable=True)
+    kept_first = jnp.argsort(~kept, stable=True)
     # One column more than a chart has states is never needed: (t, q) less the dropped entry.
     valid = jnp.arange(n) < dim
-    select = jnp.where(valid[:, None], jnp.eye(n)[order], 0.0)
+    select = jnp.where(valid[:, None], jnp.eye(n)[kept_first], 0.0)
     slope = -normal / jnp.where(drop >= 0, normal[drop], 1.0)
     along = jnp.where((k == drop)[:, None], slope[None, :], 0.0)
     embed = (jnp.eye(n) + jnp.where(drop >= 0, along, 0.0)) @ select.T

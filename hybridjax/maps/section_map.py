@@ -6,6 +6,7 @@ from typing import NamedTuple, SupportsIndex
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from .._core.compile import quick_jit
@@ -14,9 +15,8 @@ from .._core.tracing import is_traced
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..systems.structure import Structure
 from .place import as_placed
-from .placed import PlacedSections
+from .placed import PlacedSections, SectionsLike
 
 
 class Arrival(NamedTuple):
@@ -54,7 +54,9 @@ class SectionMap(eqx.Module):
         """The cycle's state at section i."""
         return self.placed.lanes.q[: self.dims[0], self.i]
 
-    def __call__(self, q, u=None, t=None) -> Arrival:
+    def __call__(
+        self, q: ArrayLike, u: ArrayLike | None = None, t: ArrayLike | None = None
+    ) -> Arrival:
         q = jnp.asarray(q, float)
         if q.shape != self.fixed_point.shape:
             raise DefinitionError(
@@ -73,7 +75,9 @@ class SectionMap(eqx.Module):
         return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
 
 
-def section_map(cycle: LimitCycle, sections, i: SupportsIndex, j: SupportsIndex) -> SectionMap:
+def section_map(
+    cycle: LimitCycle, sections: SectionsLike, i: SupportsIndex, j: SupportsIndex
+) -> SectionMap:
     """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
 
     For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
@@ -86,14 +90,14 @@ def section_map(cycle: LimitCycle, sections, i: SupportsIndex, j: SupportsIndex)
             raise DefinitionError(
                 f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
             )
-    s, chart = Structure(cycle.system), placed.lanes.chart
+    s, chart = placed.structure(), placed.lanes.chart
     dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
     return SectionMap(placed, i, j, dims)
 
 
 @quick_jit
-def _map(placed, i, j, q, u, t) -> Arrival:
-    s = Structure(placed.cycle.system)
+def _map(placed: PlacedSections, i: int, j: int, q, u, t) -> Arrival:
+    s = placed.structure()
     pick = slice(i, i + 1)
     lanes = placed.lanes
     q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)

@@ -12,16 +12,25 @@ from ..engine.tape import IDLE
 from ..engine.target import Target
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError
-from ..sections.families import Crossing
-from ..systems.structure import Structure
+from ..sections.crossing import Crossing
 from .placed import PlacedSections
 
 
-# Crossings are looked for in so many parts of every step, of which so many are compiled at once.
-_PARTS, _STEPS = 16, 256
-# A section is tangent to the cycle if its level changes slower than this fraction of its fastest
-# rate.
-_STEEP = 1e-4
+# None of these has a unit of the model's: all are numbers, or relative to the cycle itself.
+# Further crossings of a section are looked for in this many parts of every step that the flow took.
+# Doubled: two crossings half as far apart are still told apart, at twice the cost.
+_PARTS_OF_A_STEP = 16
+# The number of steps is rounded up to a multiple of this. Doubled: other cycles are compiled anew
+# half as often, and short ones are searched for longer.
+_STEPS_AT_ONCE = 256
+# A section is tangent to the cycle if its level changes there at less than this fraction of its
+# fastest rate on the cycle. Doubled: sections crossed at twice the angle are refused.
+_LEAST_STEEPNESS = 1e-4
+# The ways from section to section make one period, up to this fraction of it: less or more is a
+# section crossed twice, or out of order. Doubled: nothing changes, these are off by whole ways.
+_ROUND = 1e-6
+# Sections less than this fraction of a period apart are one. Doubled: so are those twice as far.
+_SAME = 1e-9
 
 
 def refuse_unsound(placed: PlacedSections, first: int) -> None:
@@ -29,9 +38,9 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
     N = placed.n_sections
     describe = placed.family.describe
     if first != Result.OK:
-        if isinstance(placed.family.start, Crossing):
+        if isinstance(placed.family.anchor, Crossing):
             raise ComputationError(
-                f"the cycle has no point where {placed.family.start} (the anchor of section 0): "
+                f"the cycle has no point where {placed.family.anchor} (the anchor of section 0): "
                 f"{Result(first).message}."
             )
         raise ComputationError(
@@ -55,12 +64,12 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
         )
     period, duration = float(placed.cycle.period), np.asarray(placed.duration)
     total = float(duration.sum())
-    if total < (1 - 1e-6) * period:
+    if total < (1 - _ROUND) * period:
         raise ComputationError(
             f"{describe(0)} is crossed more than once in one period; a section must be crossed "
             "once. Restrict it to a chart, or choose another phase."
         )
-    if total > (1 + 1e-6) * period:
+    if total > (1 + _ROUND) * period:
         late = int(np.argmax(duration))
         raise ComputationError(
             f"the sections are out of order: {describe((late + 1) % N)} comes before section "
@@ -68,14 +77,14 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
             "periods."
         )
     short = int(np.argmin(duration))
-    if duration[short] <= 1e-9 * period:
+    if duration[short] <= _SAME * period:
         raise ComputationError(
             f"{describe((short + 1) % N)} coincides with section {short} on the cycle; sections "
             "must be distinct."
         )
     counts, steepness = _crossings(placed)
     for i in range(N):
-        if steepness[i] < _STEEP:
+        if steepness[i] < _LEAST_STEEPNESS:
             raise ComputationError(
                 f"{describe(i)} is tangent to the cycle: its level changes there at "
                 f"{steepness[i]:.1g} of its fastest rate. Choose another level."
@@ -91,7 +100,7 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     """How often one period of the cycle crosses each section, and how steeply: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
     event = np.asarray(placed.bound.event)
-    counts = np.array([placed.cycle.order.count(g) if g >= 0 else 1 for g in event])
+    counts = np.array([placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event])
     steepness = np.ones(placed.n_sections)
     if placed.bound.levels is None:
         return counts, steepness
@@ -118,7 +127,7 @@ def _steps(placed: PlacedSections):
     chart = start(lanes.chart, tape.chart[row, section])
     q = start(lanes.q.T, tape.after[row, :, section])
     parts = t, chart, q, end - t, tape.before[row, :, section], np.where(first, section, -1)
-    idle = np.zeros(-len(section) % _STEPS, int)
+    idle = np.zeros(-len(section) % _STEPS_AT_ONCE, int)
     t, chart, q, h, after, section = (np.concatenate([x, x[idle]]) for x in parts)
     h[len(row) :] = 0
     return t, chart, q, h, after, section
@@ -128,13 +137,13 @@ def _steps(placed: PlacedSections):
 def _levels_along(placed: PlacedSections, t, chart, q, h, after, section):
     """How often the cycle's steps cross each section (N,) but for where it lies, the fastest rate
     of its level (N,), and the rate there (N,)."""
-    s, N = Structure(placed.cycle.system), placed.n_sections
-    points = len(t) * (_PARTS + 1)
+    s, N = placed.structure(), placed.n_sections
+    points = len(t) * (_PARTS_OF_A_STEP + 1)
     still = jnp.zeros((s.nu, len(t)))
     f0, f1 = slopes(s, t, chart, q.T, still), slopes(s, t + h, chart, after.T, still)
-    x = jnp.linspace(0.0, 1.0, _PARTS + 1)[:, None]
+    x = jnp.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
     q = interpolate(x, h, q.T[:, None], after.T[:, None], f0[:, None], f1[:, None])
-    t, chart, q = (t + h * x).ravel(), jnp.tile(chart, _PARTS + 1), q.reshape(s.d, points)
+    t, chart, q = (t + h * x).ravel(), jnp.tile(chart, _PARTS_OF_A_STEP + 1), q.reshape(s.d, points)
     far, u, everywhere = (
         jnp.full(points, jnp.inf),
         jnp.zeros((s.nu, points)),
@@ -145,7 +154,7 @@ def _levels_along(placed: PlacedSections, t, chart, q, h, after, section):
         index, never = jnp.full(points, i), jnp.full(points, -1)
         target = Target(far, index, never, far, None, placed.bound.levels, Result.OK)
         seen = watch(s, t, chart, q, u, target, everywhere)
-        level = seen.value[-1].reshape(_PARTS + 1, -1)
+        level = seen.value[-1].reshape(_PARTS_OF_A_STEP + 1, -1)
         falls = (level[:-1] > 0) & (level[1:] <= 0) & (h > 0)
         # Around the section itself, rounding decides the signs.
         falls = falls.at[0].set(falls[0] & (section != i))

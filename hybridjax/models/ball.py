@@ -1,9 +1,7 @@
 """A ball that bounces on fixed ground: one chart, one event."""
 
-from jaxtyping import Array, Float
-
 from ..systems.chart import Chart
-from ..systems.system import HybridSystem, parameter
+from ..systems.system import HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -22,8 +20,8 @@ class BouncingBall(HybridSystem):
     (Zeno), and the ball has no cycle but rest.
     """
 
-    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", doc="gravity")
-    restitution: Float[Array, ""] = parameter(0.7, doc="speed kept at a bounce")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.7, doc="speed kept at a bounce")
 
     def charts(self):
         return {"fall": Fall(self)}

@@ -7,10 +7,11 @@ period, and each touchdown changes the speed at which the other foot comes down.
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -40,35 +41,35 @@ class TwoLeggedBar(HybridSystem):
     length again.
     """
 
-    m: Float[Array, ""] = parameter(1.0, unit="kg", doc="mass of the bar")
-    J: Float[Array, ""] = parameter(0.2, unit="kg m^2", doc="moment of inertia of the bar")
-    hind: Float[Array, ""] = parameter(-0.5, unit="m", doc="position of the hind hip")
-    front: Float[Array, ""] = parameter(0.55, unit="m", doc="position of the front hip")
-    k: Float[Array, ""] = parameter(15.0, unit="N/m", doc="stiffness of a leg")
-    b: Float[Array, ""] = parameter(1.0, unit="N s/m", doc="damping of a leg")
-    l0: Float[Array, ""] = parameter(1.0, unit="m", doc="rest length of a leg")
-    g: Float[Array, ""] = parameter(10.0, unit="m/s^2", doc="gravity")
-    rho: Float[Array, ""] = parameter(0.8, doc="relative speed of a foot kept when it lands")
-    A: Float[Array, ""] = parameter(0.2, unit="m", doc="amplitude of the table")
-    T: Float[Array, ""] = parameter(1.0, unit="s", doc="period of the table")
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of the bar")
+    J: Parameter = parameter(0.2, unit="kg m^2", doc="moment of inertia of the bar")
+    hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
+    front: Parameter = parameter(0.55, unit="m", doc="position of the front hip")
+    k: Parameter = parameter(15.0, unit="N/m", doc="stiffness of a leg")
+    b: Parameter = parameter(1.0, unit="N s/m", doc="damping of a leg")
+    l0: Parameter = parameter(1.0, unit="m", doc="rest length of a leg")
+    g: Parameter = parameter(10.0, unit="m/s^2", doc="gravity")
+    rho: Parameter = parameter(0.8, doc="relative speed of a foot kept when it lands")
+    A: Parameter = parameter(0.2, unit="m", doc="amplitude of the table")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the table")
 
-    def hip(self, leg):
+    def hip(self, leg: str) -> Parameter:
         """Position of a leg's hip along the bar."""
         return self.hind if leg == "hind" else self.front
 
-    def length(self, leg, t, state):
+    def length(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Length of a standing leg less its rest length: the foot's height while in the air."""
         y, _, q, _ = state
         table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
         return y + self.hip(leg) * q - table - self.l0
 
-    def speed(self, leg, t, state):
+    def speed(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Rate of `length`."""
         _, v, _, p = state
         rate = 2 * jnp.pi / self.T
         return v + self.hip(leg) * p - self.A * rate * jnp.cos(rate * t)
 
-    def force(self, leg, t, state):
+    def force(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Force of a standing leg on the bar."""
         return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
 

@@ -5,10 +5,11 @@ E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans. Circuits
 """
 
 import equinox as eqx
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
 
 
@@ -32,17 +33,17 @@ class BuckConverter(HybridSystem):
     anew once a period; that is a scheduled event. Input `u` is added to the reference voltage.
     """
 
-    R: Float[Array, ""] = parameter(22.0, unit="ohm", doc="load")
-    C: Float[Array, ""] = parameter(47e-6, unit="F", doc="capacitor")
-    L: Float[Array, ""] = parameter(20e-3, unit="H", doc="coil")
-    Vin: Float[Array, ""] = parameter(20.0, unit="V", doc="supply")
-    Vref: Float[Array, ""] = parameter(11.3, unit="V", doc="reference")
-    gain: Float[Array, ""] = parameter(8.4, doc="gain of the error amplifier")
-    lower: Float[Array, ""] = parameter(3.8, unit="V", doc="start of the ramp")
-    upper: Float[Array, ""] = parameter(8.2, unit="V", doc="end of the ramp")
-    T: Float[Array, ""] = parameter(400e-6, unit="s", doc="period of the ramp")
+    R: Parameter = parameter(22.0, unit="ohm", doc="load")
+    C: Parameter = parameter(47e-6, unit="F", doc="capacitor")
+    L: Parameter = parameter(20e-3, unit="H", doc="coil")
+    Vin: Parameter = parameter(20.0, unit="V", doc="supply")
+    Vref: Parameter = parameter(11.3, unit="V", doc="reference")
+    gain: Parameter = parameter(8.4, doc="gain of the error amplifier")
+    lower: Parameter = parameter(3.8, unit="V", doc="start of the ramp")
+    upper: Parameter = parameter(8.2, unit="V", doc="end of the ramp")
+    T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
 
-    def control(self, t, q, u):
+    def control(self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]
 

@@ -7,10 +7,9 @@ J. Robotics Research 17(12), 1998.
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -41,12 +40,12 @@ class CompassGait(HybridSystem):
     been positive, past the scuff, may it fire.
     """
 
-    mH: Float[Array, ""] = parameter(10.0, unit="kg", doc="mass of the hip")
-    m: Float[Array, ""] = parameter(5.0, unit="kg", doc="mass of a leg")
-    a: Float[Array, ""] = parameter(0.5, unit="m", doc="from the foot to the leg's mass")
-    b: Float[Array, ""] = parameter(0.5, unit="m", doc="from the leg's mass to the hip")
-    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", doc="gravity")
-    slope: Float[Array, ""] = parameter(3.0 * math.pi / 180, unit="rad", doc="angle of the slope")
+    mH: Parameter = parameter(10.0, unit="kg", doc="mass of the hip")
+    m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
+    a: Parameter = parameter(0.5, unit="m", doc="from the foot to the leg's mass")
+    b: Parameter = parameter(0.5, unit="m", doc="from the leg's mass to the hip")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    slope: Parameter = parameter(3.0 * math.pi / 180, unit="rad", doc="angle of the slope")
 
     @property
     def l(self):  # noqa: E743

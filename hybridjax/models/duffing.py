@@ -5,10 +5,9 @@ T. Mook, Nonlinear oscillations, Wiley 1979, Sec. 4.1.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Line(Chart):
@@ -29,11 +28,11 @@ class Duffing(HybridSystem):
     folds there are three responses to one `rate`, the middle one unstable.
     """
 
-    alpha: Float[Array, ""] = parameter(1.0, unit="1/s^2", doc="linear stiffness")
-    beta: Float[Array, ""] = parameter(0.05, unit="1/(m^2 s^2)", doc="cubic stiffness")
-    damping: Float[Array, ""] = parameter(0.1, unit="1/s", doc="delta")
-    amplitude: Float[Array, ""] = parameter(0.5, unit="m/s^2", doc="gamma, of the force")
-    rate: Float[Array, ""] = parameter(0.5, unit="rad/s", doc="omega, of the force")
+    alpha: Parameter = parameter(1.0, unit="1/s^2", doc="linear stiffness")
+    beta: Parameter = parameter(0.05, unit="1/(m^2 s^2)", doc="cubic stiffness")
+    damping: Parameter = parameter(0.1, unit="1/s", doc="delta")
+    amplitude: Parameter = parameter(0.5, unit="m/s^2", doc="gamma, of the force")
+    rate: Parameter = parameter(0.5, unit="rad/s", doc="omega, of the force")
 
     def charts(self):
         return {"line": Line(self)}

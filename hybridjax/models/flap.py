@@ -5,10 +5,9 @@ rotor stability, J. American Helicopter Society 16(2), 1971 (without reversed fl
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Blade(Chart):
@@ -29,9 +28,9 @@ class RotorFlap(HybridSystem):
     Input `u` is a flapping moment over the moment of inertia, such as pitch makes.
     """
 
-    lock: Float[Array, ""] = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")
-    p: Float[Array, ""] = parameter(1.0, doc="natural frequency over the rotor's")
-    mu: Float[Array, ""] = parameter(0.3, doc="advance ratio")
+    lock: Parameter = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")
+    p: Parameter = parameter(1.0, doc="natural frequency over the rotor's")
+    mu: Parameter = parameter(0.3, doc="advance ratio")
 
     def charts(self):
         return {"blade": Blade(self)}

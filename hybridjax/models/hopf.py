@@ -5,10 +5,9 @@ fields, Springer 1983, Sec. 3.4.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Plane(Chart):
@@ -28,8 +27,8 @@ class HopfOscillator(HybridSystem):
     Input `u` is added to the rate of x.
     """
 
-    mu: Float[Array, ""] = parameter(0.1, unit="1/s", doc="growth rate at the origin")
-    T: Float[Array, ""] = parameter(1.0, unit="s", doc="period")
+    mu: Parameter = parameter(0.1, unit="1/s", doc="growth rate at the origin")
+    T: Parameter = parameter(1.0, unit="s", doc="period")
 
     def charts(self):
         return {"plane": Plane(self)}

@@ -7,10 +7,11 @@ CDC-ECC 2011, and HSCC 2013, whose parameters these are.
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -43,17 +44,17 @@ class VerticalHopper(HybridSystem):
     speed of the upper mass by r.
     """
 
-    m: Float[Array, ""] = parameter(1.0, unit="kg", doc="mass of the foot")
-    M: Float[Array, ""] = parameter(2.0, unit="kg", doc="mass of the body")
-    k: Float[Array, ""] = parameter(10.0, unit="N/m", doc="stiffness of the leg")
-    b: Float[Array, ""] = parameter(5.0, unit="N s/m", doc="damping of the foot in flight")
-    l0: Float[Array, ""] = parameter(2.0, unit="m", doc="rest length of the leg")
-    a: Float[Array, ""] = parameter(20.0, unit="N", doc="amplitude of the actuator")
-    g: Float[Array, ""] = parameter(2.0, unit="m/s^2", doc="gravity")
-    omega: Float[Array, ""] = parameter(2 * math.pi, unit="rad/s", doc="rate of the actuator")
-    retention: Float[Array, ""] = parameter(1.0, doc="speed of the body kept at touchdown")
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of the foot")
+    M: Parameter = parameter(2.0, unit="kg", doc="mass of the body")
+    k: Parameter = parameter(10.0, unit="N/m", doc="stiffness of the leg")
+    b: Parameter = parameter(5.0, unit="N s/m", doc="damping of the foot in flight")
+    l0: Parameter = parameter(2.0, unit="m", doc="rest length of the leg")
+    a: Parameter = parameter(20.0, unit="N", doc="amplitude of the actuator")
+    g: Parameter = parameter(2.0, unit="m/s^2", doc="gravity")
+    omega: Parameter = parameter(2 * math.pi, unit="rad/s", doc="rate of the actuator")
+    retention: Parameter = parameter(1.0, doc="speed of the body kept at touchdown")
 
-    def leg(self, t, yM, ym):
+    def leg(self, t: ArrayLike, yM: ArrayLike, ym: ArrayLike) -> Array:
         """Force of the leg on the body."""
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
 

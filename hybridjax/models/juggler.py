@@ -5,10 +5,11 @@ Vibration 84, 1982.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -27,16 +28,16 @@ class PaddleJuggler(HybridSystem):
     freely, so that everything is known in closed form (`exact`).
     """
 
-    A: Float[Array, ""] = parameter(0.15, unit="m", doc="amplitude of the paddle")
-    T: Float[Array, ""] = parameter(1.0, unit="s", doc="period of the paddle")
-    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", doc="gravity")
-    restitution: Float[Array, ""] = parameter(0.7, doc="relative speed kept at an impact")
+    A: Parameter = parameter(0.15, unit="m", doc="amplitude of the paddle")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the paddle")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.7, doc="relative speed kept at an impact")
 
     @property
     def rate(self):
         return 2 * jnp.pi / self.T
 
-    def paddle(self, t):
+    def paddle(self, t: ArrayLike) -> tuple[Array, Array]:
         """Height and speed of the paddle."""
         phase = self.rate * t
         return self.A * jnp.sin(phase), self.A * self.rate * jnp.cos(phase)

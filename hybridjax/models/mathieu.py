@@ -4,10 +4,9 @@ A. H. Nayfeh, D. T. Mook, Nonlinear oscillations, Wiley 1979, Ch. 5.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Line(Chart):
@@ -27,9 +26,9 @@ class Mathieu(HybridSystem):
     exists, and the argument of a multiplier does not say how often the state went round.
     """
 
-    delta: Float[Array, ""] = parameter(1.0, doc="stiffness")
-    epsilon: Float[Array, ""] = parameter(0.4, doc="amplitude of the stiffness's oscillation")
-    damping: Float[Array, ""] = parameter(0.1, doc="c")
+    delta: Parameter = parameter(1.0, doc="stiffness")
+    epsilon: Parameter = parameter(0.4, doc="amplitude of the stiffness's oscillation")
+    damping: Parameter = parameter(0.1, doc="c")
 
     def charts(self):
         return {"line": Line(self)}

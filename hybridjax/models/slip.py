@@ -8,11 +8,12 @@ stability, J. Theoretical Biology 232, 2005.
 import math
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
 from ..systems.output import Output
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -46,13 +47,13 @@ class SLIPRunner(HybridSystem):
     `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.
     """
 
-    m: Float[Array, ""] = parameter(80.0, unit="kg", doc="mass")
-    k: Float[Array, ""] = parameter(20000.0, unit="N/m", doc="stiffness of the leg")
-    l0: Float[Array, ""] = parameter(1.0, unit="m", doc="rest length of the leg")
-    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", doc="gravity")
-    angle: Float[Array, ""] = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
+    m: Parameter = parameter(80.0, unit="kg", doc="mass")
+    k: Parameter = parameter(20000.0, unit="N/m", doc="stiffness of the leg")
+    l0: Parameter = parameter(1.0, unit="m", doc="rest length of the leg")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
-    def energy(self, t, q, u):
+    def energy(self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q
         spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0

@@ -3,10 +3,8 @@
 B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926).
 """
 
-from jaxtyping import Array, Float
-
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Oscillation(Chart):
@@ -21,7 +19,7 @@ class Oscillation(Chart):
 class VanDerPol(HybridSystem):
     """x'' = mu (1 - x^2) x' - x + u, with an attracting cycle for mu > 0."""
 
-    mu: Float[Array, ""] = parameter(1.0, doc="strength of the nonlinear damping")
+    mu: Parameter = parameter(1.0, doc="strength of the nonlinear damping")
 
     def charts(self):
         return {"oscillation": Oscillation(self)}

@@ -5,10 +5,9 @@ and scaling, J. Biomechanical Engineering 120, 1998.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -32,7 +31,7 @@ class SimplestWalker(HybridSystem):
     guard rises, and that is no event.
     """
 
-    slope: Float[Array, ""] = parameter(0.009, unit="rad", doc="angle of the slope")
+    slope: Parameter = parameter(0.009, unit="rad", doc="angle of the slope")
 
     def charts(self):
         return {"step": Step(self)}

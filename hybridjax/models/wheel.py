@@ -5,10 +5,9 @@ thesis, Cornell University, 1998.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, parameter
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
@@ -29,9 +28,9 @@ class RimlessWheel(HybridSystem):
     cycle and its multiplier cos^2(2 alpha) are known in closed form (`exact`).
     """
 
-    rate: Float[Array, ""] = parameter(1.0, unit="1/s^2", doc="g / l")
-    spokes: Float[Array, ""] = parameter(8.0, doc="number of spokes")
-    slope: Float[Array, ""] = parameter(0.08, unit="rad", doc="angle of the slope")
+    rate: Parameter = parameter(1.0, unit="1/s^2", doc="g / l")
+    spokes: Parameter = parameter(8.0, doc="number of spokes")
+    slope: Parameter = parameter(0.08, unit="rad", doc="angle of the slope")
 
     @property
     def alpha(self):

@@ -1,28 +1,33 @@
 """Where the search for a limit cycle begins: from a guess to a state on the section."""
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from .._core.compile import quick_jit
 from .._core.results import Result
 from ..engine.events import start_lanes
+from ..engine.lanes import Lanes
 from ..engine.move import move
+from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError, DefinitionError
-from ..sections.families import AtEvent, Crossing, ListLevels
+from ..sections.crossing import AtEvent, Crossing
+from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
-from ..systems.system import Guess
+from ..systems.system import Guess, HybridSystem
 from ..systems.transition import Scheduled
 
 
 class _Plane(eqx.Module):
-    """The hyperplane through a point, across the flow."""
+    """The hyperplane through a point, across the flow (in sizes of the states)."""
 
     point: Array
     normal: Array
@@ -31,8 +36,22 @@ class _Plane(eqx.Module):
         return jnp.dot(q - self.point, self.normal)
 
 
-def begin(system, guess, section, turns, settle, max_period, settings):
-    """Start state, base section and expected period, from a guess."""
+class Beginning(NamedTuple):
+    """Where Newton's method begins."""
+
+    anchor: Lanes
+    """The lane there."""
+    base: Crossing | AtEvent | None
+    """The section on which it lies; `None` for a clocked system."""
+    expected: Float[Array, ""]
+    """The period to be expected."""
+
+
+def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
+    """The lane at a guess, by default the model's own.
+
+    **Raises:** `DefinitionError` if there is none, or it does not fit the system.
+    """
     s = Structure(system)
     guess = system.guess() if guess is None else guess
     if not isinstance(guess, Guess | None):
@@ -51,10 +70,26 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         )
     if not np.isfinite(guess.time):
         raise DefinitionError(f"the guess's time must be finite; got {guess.time}.")
-    if not isinstance(turns, int | np.integer) or turns < 1:
-        raise DefinitionError(f"turns must be a whole number, at least 1; got {turns}.")
+    q = np.zeros((s.d, 1))
+    q[: s.dims[a], 0] = guess.state
+    return start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
+
+
+def check_beginning(
+    system: HybridSystem,
+    section: Crossing | AtEvent | None,
+    multiplicity: int,
+    settle: ArrayLike,
+    max_period: ArrayLike | None,
+) -> None:
+    """**Raises:** `DefinitionError` for arguments of `find_limit_cycle` that make no sense."""
+    s = Structure(system)
+    if not isinstance(multiplicity, int | np.integer) or multiplicity < 1:
+        raise DefinitionError(
+            f"multiplicity must be a whole number, at least 1; got {multiplicity}."
+        )
     for name, value in (("settle", settle), ("max_period", max_period)):
-        if not (np.isfinite(value) and value >= 0):
+        if value is not None and not (np.isfinite(value) and value >= 0):
             raise DefinitionError(f"{name} must be a finite time, not negative; got {value}.")
     period = system.period()
     if period is not None and not (np.isfinite(period) and period > 0):
@@ -74,9 +109,22 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         )
     if section is not None:
         section.check(s)
-    q = np.zeros((s.d, 1))
-    q[: s.dims[a], 0] = guess.state
-    lanes = start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
+
+
+def begin(
+    system: HybridSystem,
+    lanes: Lanes,
+    section: Crossing | AtEvent | None,
+    multiplicity: int,
+    settle: ArrayLike,
+    max_period: float,
+    settings: Settings,
+) -> Beginning:
+    """From a guess to a state on the section, and the period to be expected.
+
+    **Raises:** `ComputationError` where the flow does not lead there, or nothing moves.
+    """
+    s, period = Structure(system), system.period()
     if settle:
         wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
@@ -85,7 +133,7 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         if period is not None:
             lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - wait)
     if period is not None:
-        return lanes, None, turns * jnp.asarray(period, float)
+        return Beginning(lanes, None, multiplicity * jnp.asarray(period, float))
     a = int(lanes.chart[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
     f, level, rate = jax.device_get(_at_start(system, lanes, section))
@@ -97,7 +145,9 @@ def begin(system, guess, section, turns, settle, max_period, settings):
         )
     on_section = rate < 0 and abs(level) <= -1e-9 * max_period * rate
     if section is None:
-        plane = _Plane(jnp.asarray(q), jnp.asarray(f / np.linalg.norm(f)))
+        sizes = np.ones(s.d) if settings.scale is None else np.asarray(settings.scale[a])
+        sizes = sizes[: s.dims[a]]
+        plane = _Plane(jnp.asarray(q), jnp.asarray(f / sizes**2 / np.linalg.norm(f / sizes)))
         section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
 
@@ -110,9 +160,9 @@ def begin(system, guess, section, turns, settle, max_period, settings):
     if not on_section:
         lanes = next_meeting(lanes, "looking for the section")
     back = lanes
-    for _ in range(turns):
+    for _ in range(multiplicity):
         back = next_meeting(back, "looking for the return to the section")
-    return lanes, section, back.t[0] - lanes.t[0]
+    return Beginning(lanes, section, back.t[0] - lanes.t[0])
 
 
 @quick_jit

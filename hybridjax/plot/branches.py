@@ -68,7 +68,7 @@ def branch(
 
 def _first_state(branch: Branch) -> str:
     cycle = branch[0]
-    return Structure(cycle.system).charts[int(cycle.start.chart[0])].states[0]
+    return Structure(cycle.system).charts[int(cycle.anchor.chart[0])].states[0]
 
 
 def _parts(branch: Branch) -> list[tuple[slice, bool]]:

@@ -289,10 +289,10 @@ def _spread(known, values, count: int) -> np.ndarray:
 def _evaluate(fit: Fit, f, harmonic: int, output: str, input: str | int) -> np.ndarray:
     i = _index(fit.outputs, output)
     if isinstance(fit, StructuredFit):
-        return np.asarray(fit.evaluate(f, harmonic).H)[0, :, i, _index(fit.inputs, input)]
+        return np.asarray(fit.htf(f, harmonic).H)[0, :, i, _index(fit.inputs, input)]
     if fit.harmonic != harmonic:
         raise DefinitionError(f"the rational fit is of H_{fit.harmonic}, not of H_{harmonic}.")
-    return fit.evaluate(f)[:, i]
+    return np.asarray(fit.htf(f).H)[0, :, i, 0]
 
 
 def _legend(ax: Axes, htfs: Sequence[HTF]) -> None:

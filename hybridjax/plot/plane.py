@@ -1,15 +1,16 @@
 """Floquet multipliers, poles and zeros in the complex plane."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import compare_multipliers
-from ..identify.multipliers.estimate import MultiplierEstimate
+from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -26,13 +27,15 @@ from .look import (
 )
 
 
+Numbers = ArrayLike | Sequence[complex | float]
+
 _MARKERS = "osD^vP*X"
 _RATIO = 2.4  # width of a panel of poles_zeros, in heights
 
 
 def multipliers(
-    true: Any,
-    estimates: Mapping[str, Any] | None = None,
+    true: LimitCycle | LDTP | MultiplierEstimate | Numbers,
+    estimates: Mapping[str, RationalFit | MultiplierEstimate | Numbers] | None = None,
     *,
     zoom: bool = True,
     labels: Mapping[str, str] | None = None,
@@ -53,7 +56,7 @@ def multipliers(
 
     **Raises:** `DefinitionError` if there are no multipliers.
     """
-    true = _values(true.multipliers() if isinstance(true, LDTP) else true)
+    true = _values(true.multipliers if isinstance(true, LDTP) else true)
     if true.size == 0:
         raise DefinitionError("there is no multiplier to draw.")
     series = _series(estimates or {}, labels)

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Complex
 
-from ..identify.series.fit import SeriesFit
+from ..identify.series.series_fit import SeriesFit
+from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
-from ..recordings.phase import Phase
-from ..recordings.sampling import SectionData
+from ..recordings.phase.winding import Phase
 from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
@@ -58,7 +58,7 @@ def section_data(
             values = np.concatenate(
                 [np.concatenate([r.u, r.y], axis=1)[:, i] for r in data.records]
             )
-            at = np.concatenate([(r.start + np.arange(len(r.u))) % N for r in data.records])
+            at = np.concatenate([(r.first_section + np.arange(len(r.u))) % N for r in data.records])
             thin = slice(None, None, max(1, len(at) // 20000))
             spread.plot(at[thin] / N, values[thin], ",", color=COLORS["gray"], rasterized=True)
             std = np.array([np.nanstd(values[at == n]) for n in range(N)])
@@ -71,7 +71,7 @@ def section_data(
             else:
                 most = int(np.argmax(std))
                 each = [
-                    np.flatnonzero((r.start + np.arange(len(r.u))) % N == most)
+                    np.flatnonzero((r.first_section + np.arange(len(r.u))) % N == most)
                     for r in data.records
                 ]
                 y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]

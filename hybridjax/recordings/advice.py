@@ -1,7 +1,7 @@
 """What the data cannot carry, in plain words."""
 
+from collections.abc import Iterator
 from itertools import combinations
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -9,116 +9,47 @@ from jaxtyping import Complex, Float
 
 from .._core.results import Result
 from ..errors import DefinitionError
+from ..experiments.record import RecordedData
 from ..identify.multipliers.compare import compare_multipliers
-from ..identify.multipliers.estimate import roots_of
-from ..identify.series.fit import SeriesFit, fit_series, quick_fit, refuse_order
-from ..identify.series.layout import Record, lay_out, pieces_of
-from ..identify.series.prediction import predict
-from ..identify.series.regression import Delayed, delayed_outputs, initial, linearize, set_up
-from ..identify.series.validation import Validation, validate
-from .sampling import SectionData
+from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
+from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.output_error import OutputErrorProblem
+from ..identify.series.series_fit import SeriesFit
+from .data import SectionData
 from .spectra import input_band, input_spectrum
 
 
-_FEW = 0.25  # of the samples of a section left over by the unknowns: fewer are few
-_WEAK = 0.02  # of its mean power: an input this weak near a multiplier's frequency tells little
-_LOST = 0.2  # of all samples
-_ALIKE = 0.98  # median of the correlations of two outputs at the sections: they say the same
-ENOUGH = 1000  # cycles to choose an order from, and to try it on
-_TIE = 0.02  # relative difference of misfits that are as good as equal
+# Of the samples of a section, the share that the unknowns must leave over. Doubled: more recordings
+# are said to have few strides.
+_FEW_LEFT_OVER = 0.25
+# Of its mean power, what an input has near a multiplier's frequency; less is weak. Doubled: more
+# inputs are.
+_WEAK_POWER = 0.02
+# How near a multiplier's frequency is, in cycles per period. Doubled: power further off counts.
+_NEAR = 0.1
+# Of all samples, the share that may be missing unsaid. Doubled: recordings with more gaps pass.
+_MANY_MISSING = 0.2
+# Two outputs say the same if the median of their correlations at the sections is larger. (Not to be
+# doubled: it lies below 1.)
+_SAME_OUTPUTS = 0.98
+# Standard errors by which plain regression must be off before it is said. Doubled: it is said less
+# often.
+_BIASED = 2
+# Of N/2 cycles per period, the highest frequency of all, the share up to which an input must have
+# power. Doubled: the edge is named for all inputs.
+_WHOLE_BAND = 0.9
+# Numbers of strides whose standard errors are foretold.
+_STRIDES = (100, 300, 1000, 3000)
 
 
-def plain_regression(
-    data: SectionData | tuple[Record, ...], order: int
-) -> Complex[np.ndarray, " d"]:
+def plain_regression(data: RecordedData, order: int) -> Complex[np.ndarray, " d"]:
     """Multipliers by least squares on chi y = B u (ARX), which noise in y biases towards zero.
 
     To see by how much: `fit_series` has no such bias.
     """
-    layout = lay_out(data.records if isinstance(data, SectionData) else data)
-    problem = set_up(layout, order, layout.y.shape[2], False)
-    return _plain(delayed_outputs(problem, order))
-
-
-def _plain(delayed: Delayed) -> Complex[np.ndarray, " d"]:
-    gram = delayed.gram.sum(axis=0)
-    return roots_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
-
-
-def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
-    """The number of multipliers that predicts best what it was not fitted to.
-
-    For each number a first, consistent estimate (total least squares) is made from all but the last
-    `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
-    within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
-
-    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
-    """
-    early, late = _split(data, share)
-    layout = lay_out(early)
-    rest = pieces_of(late).pieces
-    misfits = []
-    for d in range(1, most + 1):
-        problem = set_up(layout, d, layout.y.shape[2], False)
-        c = initial(delayed_outputs(problem, d))
-        found = linearize(problem, c)
-        if (found.freedom <= 2 * d).any():
-            break
-        fit = quick_fit(problem, c, found, layout)
-        error = np.concatenate([predict(fit, p, True) - p.y for p in rest])
-        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
-    if not misfits:
-        raise DefinitionError(
-            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
-            "sections: record more, or take fewer sections."
-        )
-    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _TIE))
-
-
-class HeldOut(NamedTuple):
-    """A fit to the first part of each record, tried on the rest."""
-
-    fit: SeriesFit
-    validation: Validation
-
-
-def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
-    """Fit all but the last `share` of every record, and simulate that.
-
-    Of long recordings the first 1000 cycles are looked at.
-
-    **Raises:** `DefinitionError` if too few cycles are left for either.
-    """
-    if not 0 < share < 1:
-        raise DefinitionError(f"share must lie between 0 and 1, not {share}.")
-    early, late = _split(data, share)
-    fit = fit_series(early, order, check=False)
-    return HeldOut(fit, validate(fit, late))
-
-
-def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
-    early, late = [], []
-    enough = min(1.0, ENOUGH / data.cycles)
-    for r in data.records:
-        end = round(len(r.u) * enough)
-        cut = round(end * (1 - share))
-        early.append(_part(r, slice(0, cut)))
-        late.append(_part(r, slice(cut, end)))
-    return early, late
-
-
-def _part(record: Record, rows: slice) -> Record:
-    start = (record.start + rows.start) % record.n_sections
-    return Record(
-        record.u[rows],
-        record.y[rows],
-        n_sections=record.n_sections,
-        start=start,
-        inputs=record.inputs,
-        outputs=record.outputs,
-        lead=record.lead,
-        drift=record.drift,
-    )
+    grid = CycleGrid.from_data(data)
+    problem = OutputErrorProblem.from_grid(grid, order, grid.n_sections, free_start=True)
+    return ordinary_least_squares(delayed_outputs(problem, order))
 
 
 class Advice(eqx.Module):
@@ -152,84 +83,98 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
     intervals that reach the unit circle, an iteration that did not end.
     """
-    found = []
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    layout = lay_out(data.records)
-    sampled = np.isfinite(layout.y).all(axis=3).sum(axis=(0, 1)).min()
-    unknown = R * nu + len(layout.y) * (d + 1)
-    if sampled - unknown < _FEW * sampled:
-        found.append(
+    grid = CycleGrid.from_data(data)
+    overhang = R - 1 - fit.lead - d * N
+    problem = OutputErrorProblem.from_grid(grid, d, overhang, free_start=True)
+    delayed = delayed_outputs(problem, d)
+    sampled = int(np.isfinite(grid.y).all(axis=3).sum(axis=(0, 1)).min())
+    unknown = R * nu + len(grid.y) * (d + 1)
+    plain = ordinary_least_squares(delayed)
+    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
+    band = input_band(data)
+    warnings = []
+    if sampled - unknown < _FEW_LEFT_OVER * sampled:
+        warnings.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "
             "record more, take fewer sections, or excite fewer inputs."
         )
-    problem = set_up(layout, d, R - 1 - fit.lead - d * N, False)
-    delayed = delayed_outputs(problem, d)
     try:
         refuse_order(delayed.rescale(fit.noise / problem.scale))
     except DefinitionError:
-        found.append(
+        warnings.append(
             f"Order: the data do not carry {d} multipliers. The weakest may be noise alone (or "
             "nearly zero in truth); neither its value nor its interval then means anything."
         )
+    warnings += _about_excitation(data, fit, band)
+    warnings += _about_outputs(grid, fit)
+    if bias > _BIASED * fit.standard_errors.max():
+        warnings.append(
+            f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
+            "use it here."
+        )
+    warnings += _about_the_fit(fit)
+    if data.missing > _MANY_MISSING:
+        warnings.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
+    # Variances go down with the number of strides that the unknowns leave over.
+    now = max(sampled - unknown, 1)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in _STRIDES], float)
+    with np.errstate(divide="ignore"):
+        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
+    return Advice(tuple(warnings), plain, bias, tuple(band), _STRIDES, expected)
+
+
+def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> Iterator[str]:
+    """Whether the inputs had power where the multipliers are seen, and how far up."""
     f, power = input_spectrum(data)
     resonance = np.abs(np.angle(fit.multipliers)) / (2 * np.pi)
     for i, name in enumerate(fit.inputs):
         mean = power[:, i].mean()
-        for m, at in zip(fit.multipliers, resonance, strict=True):
-            near = np.abs((f - at + 0.5) % 1 - 0.5) < 0.1
-            mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < 0.1
-            if m.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK * mean:
-                found.append(
+        for z, at in zip(fit.multipliers, resonance, strict=True):
+            near = np.abs((f - at + 0.5) % 1 - 0.5) < _NEAR
+            mirrored = np.abs((f + at + 0.5) % 1 - 0.5) < _NEAR
+            if z.imag >= 0 and power[near | mirrored, i].max(initial=0) < _WEAK_POWER * mean:
+                yield (
                     f"Weak excitation: {name} has next to no power at the frequencies "
-                    f"{at:.2f} + k cycles per period, where the multiplier {m:.3g} is seen."
+                    f"{at:.2f} + k cycles per period, where the multiplier {z:.3g} is seen."
                 )
-    band = input_band(data)
     for name, edge in zip(fit.inputs, band, strict=True):
         if edge < 1:
-            found.append(
+            yield (
                 f"Narrow excitation: {name} has power only up to {edge:.2g} cycles per period, so "
                 "that responses at different phases can hardly be told apart."
             )
-        elif edge < 0.9 * N / 2:
-            found.append(
+        elif edge < _WHOLE_BAND * fit.n_sections / 2:
+            yield (
                 f"Transfer functions are determined up to f = {edge:.3g} cycles per period only, "
                 f"where the power of {name} ends."
             )
-    for i, j in combinations(range(layout.y.shape[3]), 2):
-        if _correlation(layout.y[..., i], layout.y[..., j]) > _ALIKE:
-            found.append(
+
+
+def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[str]:
+    """Whether two of them are one number."""
+    for i, j in combinations(range(grid.y.shape[3]), 2):
+        if _correlation(grid.y[..., i], grid.y[..., j]) > _SAME_OUTPUTS:
+            yield (
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "
-                "crossing to crossing (`CrossingPhase`, `--crossing`) may make multipliers "
-                "much surer."
+                "crossing to crossing (a `Crossing` as the phase, `--crossing`) may make "
+                "multipliers much surer."
             )
-    plain = _plain(delayed)
-    bias = float(compare_multipliers(plain, fit.multipliers).max_error)
-    if bias > 2 * fit.standard_errors.max():
-        found.append(
-            f"Noise: plain regression (ARX) would give {_list(plain)}, off by {bias:.2g}; do not "
-            "use it here."
-        )
+
+
+def _about_the_fit(fit: SeriesFit) -> Iterator[str]:
+    """Whether it is stable for sure, and ended."""
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
         if z.imag >= 0 and abs(z) + 2 * error > 1:
-            found.append(
-                f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
-            )
+            yield f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
     if fit.result != Result.OK:
-        found.append(f"The fit did not end: {Result(fit.result).message}.")
-    if data.missing > _LOST:
-        found.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
-    strides = (100, 300, 1000, 3000)
-    now = max(sampled - unknown, 1)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
-    with np.errstate(divide="ignore"):
-        expected = fit.standard_errors * np.sqrt(now / later)[:, None]
-    return Advice(tuple(found), plain, bias, tuple(band), strides, expected)
+        yield f"The fit did not end: {Result(fit.result).message}."
 
 
 def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
-    """Its modulus, the median over the sections."""
+    """The modulus of the correlation at each section, the median over the sections."""
     seen = np.isfinite(x) & np.isfinite(y)
     both = np.where(seen, [x, y], 0.0)
     mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(seen.sum(axis=(0, 1)), 1)
@@ -238,5 +183,5 @@ def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -
     return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
 
 
-def _list(values) -> str:
+def _list(values: Complex[np.ndarray, " d"]) -> str:
     return ", ".join(f"{z:.4f}" for z in values)

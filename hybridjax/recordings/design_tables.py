@@ -9,9 +9,13 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
-from .phase import Phase
+from .phase.winding import Phase
 from .read import read_columns
 from .recording import Recording
+
+
+# Rounding of times, in sections, where a held value changes. Doubled: nothing changes.
+_ROUNDING = 1e-9
 
 
 def write_design(
@@ -40,7 +44,7 @@ def write_design(
     u = np.asarray(design.inputs(cycles or design.periods))
     S, n, _ = u.shape
     N = design.n_sections
-    if period is None:
+    if period is None or rate is None:
         header = ["experiment", "cycle", "section", "phase"]
         k = np.arange(n)
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)
@@ -49,7 +53,7 @@ def write_design(
             raise DefinitionError(f"period and rate must be positive, not {period} and {rate}.")
         header = ["experiment", "time"]
         time = np.arange(int(n / N * period * rate)) / rate
-        u = u[:, np.minimum((time * N / period + 1e-9).astype(int), n - 1)]
+        u = u[:, np.minimum((time * N / period + _ROUNDING).astype(int), n - 1)]
         place = time[:, None]
     path = Path(path)
     temporary = path.with_name(f".{path.name}.part")
@@ -121,6 +125,7 @@ def add_command(
         signals = dict(zip(recording.signals, trial.values.T, strict=True))
         signals |= dict(zip(command, added.T, strict=True))
         units = dict(zip(recording.signals, recording.units, strict=True))
-        about = {"events": trial.events, "units": units, "name": trial.name}
-        trials.append(Recording(trial.time, signals, **about))
+        trials.append(
+            Recording(trial.time, signals, events=trial.events, units=units, name=trial.name)
+        )
     return Recording.join(trials)

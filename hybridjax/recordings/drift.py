@@ -6,12 +6,16 @@ import equinox as eqx
 import numpy as np
 
 from ..errors import DefinitionError
-from .phase import Phase
+from .phase.winding import Phase
 from .recording import Recording, Trial
 from .smoothing import FEWEST, gaps, inside, means, spline
 
 
-_GAP = 0.25  # of a cycle: with a longer one its mean is not known
+# The longest gap, in cycles, in a cycle whose mean is known. Doubled: means of cycles with half of
+# their samples count.
+_LONGEST_GAP = 0.25
+# The least number of cycles that drift takes. Doubled: faster drift is refused.
+_FASTEST_DRIFT = 4
 
 
 def without_drift(
@@ -28,7 +32,7 @@ def without_drift(
     """
     signals = (signals,) if isinstance(signals, str) else signals
     columns = [recording.column(x) for x in signals]
-    if not cycles >= 4:
+    if not cycles >= _FASTEST_DRIFT:
         raise DefinitionError(f"drift takes four cycles or more, not {cycles}.")
     if len(phase.stretches) != len(recording.trials):
         raise DefinitionError(
@@ -41,7 +45,7 @@ def without_drift(
         whole = [w.when(np.arange(np.ceil(w.phase[0]), w.phase[-1])) for w in stretches]
         for k in columns:
             x = values[:, k]
-            holes = gaps(trial.time, np.isfinite(x), _GAP * phase.period)
+            holes = gaps(trial.time, np.isfinite(x), _LONGEST_GAP * phase.period)
             middles, levels = [np.zeros(0)], [np.zeros(0)]
             for edges in whole:
                 known = ~inside(holes, edges[:-1], edges[1:])

@@ -1,17 +1,21 @@
 """All steps from a recording to multipliers, in one call."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Literal
 
 import equinox as eqx
 
-from ..identify.series.fit import SeriesFit, fit_series
-from .advice import ENOUGH, Advice, HeldOut, advise, choose_order, hold_out
+from ..identify.series.fit import fit_series
+from ..identify.series.series_fit import SeriesFit
+from .advice import Advice, advise
+from .data import SectionData
 from .drift import without_drift
+from .held_out import CYCLES_LOOKED_AT, HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
-from .phase import AnglePhase, CrossingPhase, Definition, Phase, estimate_phase
+from .phase.estimation import PhaseDefinition, estimate_phase, signals_of
+from .phase.winding import Phase
 from .recording import Recording
-from .sampling import SectionData, section_data
+from .sampling import section_data
 
 
 class Identification(eqx.Module):
@@ -36,14 +40,16 @@ class Identification(eqx.Module):
 
 def identify_recording(
     recording: Recording,
-    phase: Phase | Definition,
+    phase: Phase | PhaseDefinition,
     *,
     inputs: str | Sequence[str],
     outputs: str | Sequence[str],
-    n_sections: int = 32,
     order: int | None = None,
+    n_sections: int | None = None,
+    bandwidth: int | float | None = None,
+    sampled: Literal["mean", "middle"] = "mean",
+    timing: Literal["clock", "duration"] | None = None,
     drift: int | float | None = None,
-    **options: Any,
 ) -> Identification:
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
     them.
@@ -52,36 +58,41 @@ def identify_recording(
 
     - `order`: the number of multipliers; None lets `choose_order` find it.
     - `drift`: changes that take longer than so many cycles are no response to the inputs: they are
-      taken out of the outputs, and of the signals of an `AnglePhase`, before the phase is found;
+      taken out of the outputs, and of the signals that define the phase, before the phase is found;
       the fit allows for what is left.
 
     **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
     """
-    definition = phase
-    if not isinstance(phase, Phase):
-        phase = estimate_phase(recording, definition)
+    definition = None if isinstance(phase, Phase) else phase
+    found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
         moved = {outputs} if isinstance(outputs, str) else set(outputs)
-        if isinstance(definition, AnglePhase):
-            moved |= {definition.position, definition.velocity}
-        if isinstance(definition, CrossingPhase):
-            moved |= {definition.signal}
-        recording = without_drift(recording, phase, sorted(moved), drift)
-        if not isinstance(definition, Phase):
-            phase = estimate_phase(recording, definition)
-    about = {"inputs": inputs, "outputs": outputs, "n_sections": n_sections, "drift": drift}
-    data = section_data(recording, phase, **about, **options)
+        moved |= set() if definition is None else signals_of(definition)
+        recording = without_drift(recording, found, sorted(moved), drift)
+        found = found if definition is None else estimate_phase(recording, definition)
+    data = section_data(
+        recording,
+        found,
+        inputs=inputs,
+        outputs=outputs,
+        n_sections=n_sections,
+        bandwidth=bandwidth,
+        sampled=sampled,
+        timing=timing,
+        drift=drift,
+    )
     order = choose_order(data) if order is None else order
     held = hold_out(data, order)
-    # A long recording need not be asked again whether it has a part of second order that pays.
-    known = data.cycles > ENOUGH and not held.fit.distortion
-    fit = fit_series(data.records, order, check=False, distortion=False if known else None)
+    # Where the held-out fit saw only the beginning of a long recording and found no part of second
+    # order that pays, the whole is not asked again.
+    known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
+    fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
-        recording,
-        phase,
-        data,
-        fit,
-        held,
-        impulse_responses(fit, data),
-        advise(data, fit),
+        recording=recording,
+        phase=found,
+        data=data,
+        fit=fit,
+        held_out=held,
+        responses=impulse_responses(fit, data),
+        advice=advise(data, fit),
     )

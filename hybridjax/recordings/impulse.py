@@ -1,13 +1,25 @@
 """Phase-dependent impulse responses: what a brief push at each phase does, and for how long."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import DefinitionError
-from ..identify.series.fit import SeriesFit
-from .sampling import SectionData
+from ..identify.series.series_fit import SeriesFit
+from .data import SectionData
 from .spectra import input_band
+
+
+# Of the Nyquist frequency: an input that reaches so far needs no smoothing of the push. Doubled: no
+# input does.
+_WHOLE_BAND = 0.9
+# Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
+# Doubled: pushes are twice as wide, and have no power at all beyond the band.
+_SPECTRUM_REACH = 2.5
+# Standard deviations after which the push is cut off. Doubled: nothing changes but a part in 1000.
+_PUSH_REACH = 3
 
 
 class ImpulseResponses(eqx.Module):
@@ -67,23 +79,52 @@ def impulse_responses(
                 f"fit and data have different {name}: {getattr(fit, name)} and "
                 f"{getattr(data, name)}."
             )
-    N, R, ny, nu = fit.numerators.shape
+    N, R = fit.numerators.shape[:2]
     lags = round(cycles * N) + 1
     if width is None:
-        # The spectrum of the push is down to 4 % at the edge of the narrowest band.
         edge = min(input_band(data))
-        width = 2.5 / (2 * np.pi * edge) if edge < 0.9 * N / 2 else 0.0
+        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
     if lags < 2 or width < 0:
         raise DefinitionError(f"cycles and width must be positive, not {cycles} and {width}.")
-    reach = int(np.ceil(3 * width * N))
-    push = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
-    push /= push.sum()
-    longest, d = max(fit.lead + lags + reach, R), len(fit.coefficients)
-    # The responses, what they owe to each coefficient, and to noise in the numerators: all obey
-    # the same recursion from cycle to cycle.
+    reach = int(np.ceil(_PUSH_REACH * width * N))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
+    responses = _responses(fit, max(fit.lead + lags + reach, R))
+    h, slope, root = (_pushed(x, weights / weights.sum(), lags, fit.lead) for x in responses)
+    by_numerators = (root**2).sum(axis=4) * fit.noise[:, None] ** 2
+    by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
+    errors = np.sqrt(by_numerators + by_coefficients)
+    step = data.period / N
+    # From the section of the response to that of the push.
+    m, r = np.arange(N)[:, None], np.arange(lags)
+    place = (r, (m + r) % N)
+    return ImpulseResponses(
+        values=h[place] / step,
+        errors=errors[place] / step,
+        phase=np.arange(N) / N,
+        lag=np.arange(lags) / N,
+        width=float(width),
+        period=data.period,
+        inputs=fit.inputs,
+        outputs=fit.outputs,
+    )
+
+
+class _Responses(NamedTuple):
+    """Responses to a unit input that was held for one section, r sections earlier."""
+
+    h: Float[np.ndarray, "r N ny nu"]
+    slope: Float[np.ndarray, "r d N ny nu"]
+    """Derivatives of h by each coefficient of the denominator."""
+    root: Float[np.ndarray, "r N ny nu k"]
+    """A square root of the covariance of h that comes from the numerators."""
+
+
+def _responses(fit: SeriesFit, longest: int) -> _Responses:
+    """Up to lag `longest`, which all three reach by the same recursion from cycle to cycle."""
+    N, R, ny, nu = fit.numerators.shape
     h = np.zeros((longest, N, ny, nu))
     h[:R] = fit.numerators.swapaxes(0, 1)
-    slope = np.zeros((longest, d, N, ny, nu))
+    slope = np.zeros((longest, len(fit.coefficients), N, ny, nu))
     slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
     root = np.zeros((longest, N, ny, nu, fit.roots.shape[4]))
     root[:R] = fit.roots.transpose(2, 0, 1, 3, 4)
@@ -94,29 +135,16 @@ def impulse_responses(
             slope[r] -= c * slope[before]
             slope[r, j - 1] -= h[before]
             root[r] -= c * root[before]
+    return _Responses(h, slope, root)
 
-    def pushed(x):  # the push begins `reach` sections before its middle, and ends as much later
-        out = np.zeros((lags, *x.shape[1:]))
-        for k, weight in zip(range(-reach, reach + 1), push, strict=True):
-            first = max(0, k - fit.lead)
-            out[first:] += weight * x[first - k + fit.lead : lags - k + fit.lead]
-        return out
 
-    h, slope, root = pushed(h), pushed(slope), pushed(root)
-    by_b = (root**2).sum(axis=4) * fit.noise[:, None] ** 2
-    by_c = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
-    errors = np.sqrt(by_b + by_c)
-    step = data.period / N
-    # From the section of the response to that of the push.
-    m, r = np.arange(N)[:, None], np.arange(lags)
-    place = (r, (m + r) % N)
-    return ImpulseResponses(
-        h[place] / step,
-        errors[place] / step,
-        np.arange(N) / N,
-        np.arange(lags) / N,
-        float(width),
-        data.period,
-        fit.inputs,
-        fit.outputs,
-    )
+def _pushed(
+    x: Float[np.ndarray, "r ..."], weights: Float[np.ndarray, " k"], lags: int, lead: int
+) -> Float[np.ndarray, "lags ..."]:
+    """The response to a push, from those to inputs of one section: the push begins some sections
+    before its middle, and ends as many later."""
+    out, reach = np.zeros((lags, *x.shape[1:])), len(weights) // 2
+    for k, weight in zip(range(-reach, reach + 1), weights, strict=True):
+        first = max(0, k - lead)
+        out[first:] += weight * x[first - k + lead : lags - k + lead]
+    return out

@@ -14,7 +14,9 @@ from ..errors import DefinitionError, FileFormatError
 from .recording import Recording
 
 
+# What stands for a missing sample in text files, in any case of letters.
 _MISSING = {"", "nan", "na", "n/a", "null"}
+# What the names of columns with events begin with.
 _EVENT = "event "
 
 

@@ -1,14 +1,20 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import DefinitionError
+from ..sections.crossing import Crossing
 from .smoothing import spline
+
+
+# Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
+# nothing changes, this is rounding.
+_BISECTIONS = 50
 
 
 class Trial(eqx.Module):
@@ -161,37 +167,33 @@ class Recording(eqx.Module):
         return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
 
     def mark(
-        self,
-        event: str,
-        signal: str,
-        *,
-        level: int | float = 0.0,
-        direction: Literal["rising", "falling"] = "rising",
-        bandwidth: int | float = np.inf,
+        self, event: str, crossing: Crossing, *, bandwidth: int | float = np.inf
     ) -> "Recording":
         """The same with one more event: a signal crosses a level.
 
         Jumps against the direction (an angle that begins anew) are no events, jumps along it are.
         What crosses a level several times within a cycle, in noise, makes doubled events, which
-        `EventPhase` leaves out.
+        `estimate_phase` leaves out.
 
-        **Arguments:** `event`: its name. `bandwidth`: in Hz, of the smoothing spline whose
-        crossings are taken; by default it interpolates.
+        **Arguments:** `event`: its name. `crossing`: of a signal, by name. `bandwidth`: in Hz, of
+        the smoothing spline whose crossings are taken; by default it interpolates.
 
-        **Raises:** `DefinitionError` for a signal that is not there or never crosses the level.
+        **Raises:** `DefinitionError` for a signal that is not there or never crosses the level, and
+        a crossing of a function or in charts, which recordings do not have.
         """
+        signal, level = signal_of(crossing), float(crossing.value)
         column, trials = self.column(signal), []
-        sign = 1.0 if direction == "rising" else -1.0
+        sign = 1.0 if crossing.direction == "rising" else -1.0
         for trial in self.trials:
             curve = spline(trial.time, trial.values[:, column], bandwidth)
             t, y = curve.time, sign * (curve.values - level)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
             if not len(at):
                 raise DefinitionError(
-                    f"trial '{trial.name}': {signal} never crosses {level:g}, {direction}."
+                    f"trial '{trial.name}': {signal} never crosses {level:g}, {crossing.direction}."
                 )
             low, high = t[at], t[at + 1]
-            for _ in range(50):  # bisection
+            for _ in range(_BISECTIONS):
                 middle = (low + high) / 2
                 below = sign * (curve(middle) - level) < 0
                 low, high = np.where(below, middle, low), np.where(below, high, middle)
@@ -229,6 +231,18 @@ class Recording(eqx.Module):
         pairs = zip(self.signals, self.units, strict=True)
         names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
         return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
+
+
+def signal_of(crossing: Crossing) -> str:
+    """The name of the signal that crosses a level.
+
+    **Raises:** `DefinitionError` for a crossing of a function or in charts.
+    """
+    if not isinstance(crossing.function, str) or crossing.charts is not None:
+        raise DefinitionError(
+            "a recording holds samples: the Crossing of one names a signal, and no charts."
+        )
+    return crossing.function
 
 
 def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:

@@ -8,106 +8,37 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
-from ..experiments.data import ExperimentData
-from ..identify.series.layout import Record
-from .phase import Definition, Phase, Winding, estimate_phase
+from ..experiments.record import Record
+from .data import SectionData
+from .phase.estimation import PhaseDefinition, estimate_phase
+from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
 from .smoothing import gaps, inside, means, nearest, spline
 
 
-_GAP = 1.0  # times the time between sections: a longer one leaves a sample out
-
-
-class SectionData(eqx.Module):
-    """Inputs and outputs of a recording at N sections of each cycle, as deviations from it.
-
-    **Fields:**
-
-    - `records`: `Record`s for `fit_series`, `validate`, ...: one for each stretch that is not
-      interrupted. Samples in gaps are NaN, so that no equation reaches across one.
-    - `times`: for each record, when it crossed its sections. `trials`: the index of its trial.
-    - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
-    - `period`: the median. `bandwidth`: of the splines through the outputs, in Hz.
-    - `n_sections`, `inputs`, `outputs`, `units` (of inputs, then outputs).
-    """
-
-    records: tuple[Record, ...]
-    times: tuple[Float[np.ndarray, " _"], ...]
-    trials: tuple[int, ...] = eqx.field(static=True)
-    cycle_inputs: Float[np.ndarray, "N nu"]
-    cycle_outputs: Float[np.ndarray, "N ny"]
-    period: float = eqx.field(static=True)
-    bandwidth: float = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
-
-    @property
-    def n_sections(self) -> int:
-        return self.records[0].n_sections
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return self.records[0].inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.records[0].outputs
-
-    @property
-    def cycles(self) -> float:
-        """How many cycles of samples there are."""
-        return sum(len(r.u) for r in self.records) / self.n_sections
-
-    @property
-    def missing(self) -> float:
-        """The share of samples with a missing input or output."""
-        lost = [(np.isnan(r.y).any(axis=1) | np.isnan(r.u).any(axis=1)).sum() for r in self.records]
-        return float(sum(lost)) / sum(len(r.u) for r in self.records)
-
-    def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
-        """Root mean squares of the deviations of inputs and outputs."""
-        u, y = (np.concatenate([getattr(r, x) for r in self.records]) for x in "uy")
-        return np.sqrt(np.nanmean(u**2, axis=0)), np.sqrt(np.nanmean(y**2, axis=0))
-
-    def experiments(self, periods: int) -> ExperimentData:
-        """The records as experiments with periodic inputs, for `estimate_htf` and its like.
-
-        Every record is cut to whole cycles from section 0, and all to the same length.
-
-        **Arguments:** `periods`: P, after which the inputs repeat.
-
-        **Raises:** `DefinitionError` for records that are shorter than P, or have gaps.
-        """
-        N, parts = self.n_sections, []
-        for r in self.records:
-            first = -r.start % N
-            parts.append((r.u[first:], r.y[first:]))
-        cycles = min(len(u) for u, _ in parts) // N
-        u = np.stack([u[: cycles * N] for u, _ in parts])
-        y = np.stack([y[: cycles * N] for _, y in parts])
-        about = {"inputs": self.inputs, "outputs": self.outputs, "family": "recorded"}
-        return ExperimentData(u, y, n_sections=N, periods=periods, **about)
-
-    def __repr__(self) -> str:
-        u, y = self.rms()
-        values = zip(self.inputs + self.outputs, (*u, *y), self.units, strict=True)
-        shown = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
-        lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
-        return (
-            f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: {shown})"
-        )
+# The longest gap that a spline bridges: so many times from section to section, but not less than
+# so many samples (three, and rounding). Doubled: samples are made up in the middle of gaps twice as
+# long.
+_GAP_SECTIONS, _GAP_SAMPLES = 1.0, 3.001
+# The number of sections where neither the call nor the phase says it. Doubled: half the time from
+# section to section, twice the bandwidth.
+_N_SECTIONS = 32
+# The least number of cycles that drift may take. Doubled: faster drift is refused.
+_FASTEST_DRIFT = 4
+# Rounding of the phase, in sections, at the ends of a stretch. Doubled: nothing changes.
+_ROUNDING = 1e-9
 
 
 def section_data(
     recording: Recording,
-    phase: Phase | Definition,
+    phase: Phase | PhaseDefinition,
     *,
     inputs: str | Sequence[str],
     outputs: str | Sequence[str],
-    n_sections: int = 32,
+    n_sections: int | None = None,
     bandwidth: int | float | None = None,
     sampled: Literal["mean", "middle"] = "mean",
-    time: Literal["clock", "duration"] | None = None,
+    timing: Literal["clock", "duration"] | None = None,
     drift: int | float | None = None,
     max_gap: int | float | None = None,
 ) -> SectionData:
@@ -117,13 +48,14 @@ def section_data(
 
     - `phase`: what `estimate_phase` found, or what it should find.
     - `inputs`, `outputs`: names of signals.
-    - `n_sections`: N, equally spaced in phase.
+    - `n_sections`: N, equally spaced in phase; by default the family's of a `KinematicPhase`, and
+      32 for other phases.
     - `bandwidth`: in Hz, of the smoothing splines through the outputs (see `spline`); by default N
       per period, which averages over about one section. Infinite: interpolating cubic splines.
     - `sampled`: inputs are their "mean" from each section to the next (they are taken as
       linear between samples), or the sample next to the "middle", for one that is held from section
       to section.
-    - `time`: an extra output that tells when a section was crossed: "clock" for systems that are
+    - `timing`: an extra output that tells when a section was crossed: "clock" for systems that are
       driven by a clock, the time minus the clock's; "duration" for others, the time since the
       section before.
     - `drift`: the outputs may drift, more slowly than in so many cycles, for reasons other than
@@ -134,19 +66,13 @@ def section_data(
     - `max_gap`: the longest time without a sample that a spline may bridge; by default the
       mean time between sections, but not less than three samples.
 
-    **Raises:** `DefinitionError` for names that are not there, and a recording without a whole
-    cycle.
+    **Raises:** `DefinitionError` for names that are not there, constant signals, another number of
+    sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
     inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    for name in (*inputs, *outputs):
-        column = [t.values[:, recording.column(name)] for t in recording.trials]
-        if not any(np.nanmax(x) > np.nanmin(x) for x in column if np.isfinite(x).any()):
-            kind = "input" if name in inputs else "output"
-            raise DefinitionError(f"the {kind} {name} is constant in all trials.")
-    if n_sections < 1:
-        raise DefinitionError(f"there must be one section or more, not {n_sections}.")
-    if drift is not None and drift < 4:
+    _refuse_constant(recording, inputs, outputs)
+    if drift is not None and drift < _FASTEST_DRIFT:
         raise DefinitionError(f"drift takes more than four cycles, not {drift}.")
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
@@ -155,41 +81,80 @@ def section_data(
             f"the phase is of {len(phase.stretches)} trials, the recording has "
             f"{len(recording.trials)}."
         )
-    bandwidth = n_sections / phase.period if bandwidth is None else bandwidth
+    N = _number_of_sections(n_sections, phase)
+    bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
     found, trials = [], []
     for number, trial in enumerate(recording.trials):
         sampler = _Sampler(recording, trial, inputs, outputs, bandwidth, sampled)
         longest = max_gap
         if longest is None:
             step = float(np.median(np.diff(trial.time)))
-            longest = max(_GAP * phase.period / n_sections, 3.001 * step)
-        parts = [sampler(s, n_sections, longest) for s in phase.stretches[number]]
+            longest = max(_GAP_SECTIONS * phase.period / N, _GAP_SAMPLES * step)
+        parts = [sampler(s, N, longest) for s in phase.stretches[number]]
         parts = [p for p in parts if p is not None]
-        if time is not None:
-            parts = _with_times(parts, n_sections, phase.period, time)
-        found += _deviations(parts, n_sections)
+        if timing is not None:
+            parts = _with_times(parts, N, phase.period, timing)
+        found += _deviations(parts, N)
         trials += [number] * len(parts)
     if not found:
         raise DefinitionError("the recording holds no whole cycle to sample.")
-    names = outputs if time is None else (*outputs, "time" if time == "clock" else "duration")
-    # A smoothing spline averages over neighbors to both sides.
-    lead = phase.lead * n_sections + (0 if np.isinf(bandwidth) else 1)
-    about = {"n_sections": n_sections, "inputs": inputs, "outputs": names, "lead": lead}
-    about["drift"] = np.inf if drift is None else drift
-    records = [Record(p.u, p.y, start=int(p.k[0]) % n_sections, **about) for p, _ in found]
     units = [recording.unit(name) for name in (*inputs, *outputs)]
-    weights = [len(p.k) for p, _ in found]
+    if timing is not None:
+        outputs, units = (*outputs, _TIME[timing]), [*units, "s"]
+    # A smoothing spline averages over neighbors to both sides.
+    lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
+    records = [
+        Record(
+            part.u,
+            part.y,
+            n_sections=N,
+            first_section=int(part.k[0]) % N,
+            inputs=inputs,
+            outputs=outputs,
+            lead=lead,
+            drift=np.inf if drift is None else drift,
+        )
+        for part, _ in found
+    ]
+    weights = [len(part.k) for part, _ in found]
     cycle = np.average([mean for _, mean in found], axis=0, weights=weights)
     return SectionData(
-        tuple(records),
-        tuple(p.t for p, _ in found),
-        tuple(trials),
-        cycle[:, : len(inputs)],
-        cycle[:, len(inputs) :],
-        phase.period,
-        float(bandwidth),
-        (*units, *([] if time is None else ["s"])),
+        records=tuple(records),
+        times=tuple(part.t for part, _ in found),
+        trials=tuple(trials),
+        cycle_inputs=cycle[:, : len(inputs)],
+        cycle_outputs=cycle[:, len(inputs) :],
+        period=phase.period,
+        bandwidth=bandwidth,
+        units=tuple(units),
     )
+
+
+# Names of the outputs that `timing` adds.
+_TIME = {"clock": "time", "duration": "duration"}
+
+
+def _refuse_constant(
+    recording: Recording, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> None:
+    for name in (*inputs, *outputs):
+        column = [t.values[:, recording.column(name)] for t in recording.trials]
+        if not any(np.nanmax(x) > np.nanmin(x) for x in column if np.isfinite(x).any()):
+            kind = "input" if name in inputs else "output"
+            raise DefinitionError(f"the {kind} {name} is constant in all trials.")
+
+
+def _number_of_sections(given: int | None, phase: Phase) -> int:
+    """N, which the call or the phase's family may say."""
+    if None not in (given, phase.n_sections) and given != phase.n_sections:
+        raise DefinitionError(
+            f"n_sections is {given}, but the phase is that of a family of {phase.n_sections} "
+            "sections: give it once."
+        )
+    N = next((n for n in (given, phase.n_sections) if n is not None), _N_SECTIONS)
+    if N < 1:
+        raise DefinitionError(f"there must be one section or more, not {N}.")
+    return N
 
 
 class _Part(eqx.Module):
@@ -204,15 +169,25 @@ class _Part(eqx.Module):
 class _Sampler:
     """The signals of a trial as functions of time."""
 
-    def __init__(self, recording: Recording, trial: Trial, inputs, outputs, bandwidth, sampled):
+    def __init__(
+        self,
+        recording: Recording,
+        trial: Trial,
+        inputs: tuple[str, ...],
+        outputs: tuple[str, ...],
+        bandwidth: float,
+        sampled: Literal["mean", "middle"],
+    ):
         self.time, self.sampled = trial.time, sampled
         self.inputs = [trial.values[:, recording.column(name)] for name in inputs]
         self.outputs = [trial.values[:, recording.column(name)] for name in outputs]
         self.curves = [spline(trial.time, x, bandwidth) for x in self.outputs]
 
     def __call__(self, winding: Winding, n_sections: int, longest: int | float) -> _Part | None:
+        """At the sections of one stretch, if that holds a whole cycle; NaN in gaps that are longer
+        than `longest`."""
         first, last = winding.phase[[0, -1]] * n_sections
-        k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(int)
+        k = np.arange(np.ceil(first - _ROUNDING), np.floor(last + _ROUNDING) + 1).astype(int)
         if len(k) <= n_sections:
             return None
         t = winding.when(k / n_sections)
@@ -223,7 +198,9 @@ class _Sampler:
             y[inside(holes, t[:-1], t[:-1]), i] = np.nan
         return _Part(k[:-1], t[:-1], u, y)
 
-    def _input(self, x, t, longest: int | float):
+    def _input(
+        self, x: Float[np.ndarray, " n"], t: Float[np.ndarray, " m1"], longest: int | float
+    ) -> Float[np.ndarray, " m"]:
         seen = np.isfinite(x)
         if self.sampled == "middle":
             u = nearest(self.time, x, (t[:-1] + t[1:]) / 2)
@@ -233,14 +210,17 @@ class _Sampler:
         return u
 
 
-def _with_times(parts: list[_Part], N: int, period: float, kind: str) -> list[_Part]:
+def _with_times(
+    parts: list[_Part], N: int, period: float, timing: Literal["clock", "duration"]
+) -> list[_Part]:
     """The time of crossing as one more output."""
-    if kind == "duration":
+    if timing == "duration":
         return [
             eqx.tree_at(lambda p: p.y, p, np.column_stack([p.y, np.diff(p.t, prepend=np.nan)]))
             for p in parts
         ]
-    # t = T cycle + a[section]: cycles are counted through gaps.
+    # A line through the times of each section, t = T cycle + a[section], all with the same slope T;
+    # cycles are counted through gaps.
     cycles = [
         p.k // N + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
         for p in parts
@@ -258,7 +238,7 @@ def _with_times(parts: list[_Part], N: int, period: float, kind: str) -> list[_P
     ]
 
 
-def _deviations(parts: list[_Part], N: int):
+def _deviations(parts: list[_Part], N: int) -> list[tuple[_Part, Float[np.ndarray, "N nuy"]]]:
     """Each part minus the trial's average cycle, and that cycle."""
     if not parts:
         return []

@@ -8,7 +8,8 @@ from scipy.linalg import solveh_banded
 from ..errors import DefinitionError
 
 
-FEWEST = 5  # samples that a spline is drawn through
+# Samples that a spline is drawn through, at least. Doubled: shorter stretches are left out.
+FEWEST = 5
 
 
 class Spline(eqx.Module):

@@ -1,4 +1,4 @@
-"""What a family of Poincaré sections is; subclass `AbstractSections` for another one."""
+"""Families of Poincaré sections; subclass `AbstractSections` to add one."""
 
 import lazy_loader
 

@@ -2,10 +2,17 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
+
+
+if TYPE_CHECKING:
+    # Type checkers take equinox's own form for a field of the constructor.
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
 
 
 class Chart(eqx.Module):
@@ -33,7 +40,7 @@ class Chart(eqx.Module):
         ask for them there, e.g. `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """
 
-    states: eqx.AbstractClassVar[tuple[str, ...]]
+    states: AbstractClassVar[tuple[str, ...]]
     inputs: ClassVar[tuple[str, ...] | None] = None
     absent: ClassVar[Mapping[str, float]] = {}
 

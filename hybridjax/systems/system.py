@@ -13,11 +13,18 @@ from .output import Output
 from .transition import Transition
 
 
+Parameter = Float[Array, ""] | float
+"""The type of a parameter: an array, made from any number by `parameter`."""
+
+
 def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
     An array is differentiable and may change its value without recompilation; a Python float
-    would be neither.
+    would be neither. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
+
+    **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
+    `unit`, in words.
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
@@ -37,8 +44,8 @@ class HybridSystem(eqx.Module):
 
     ```python
     class Ball(hj.HybridSystem):
-        g: jax.Array = hj.parameter(9.81)
-        restitution: jax.Array = hj.parameter(0.7)
+        g: hj.Parameter = hj.parameter(9.81)
+        restitution: hj.Parameter = hj.parameter(0.7)
 
         def charts(self):
             return {"flight": Flight(self)}

@@ -1,3 +1,4 @@
-from .dirt import spoil as spoil
-from .simulated import random_force as random_force, simulate_recording as simulate_recording
-from .synthetic import synthetic_ldtp as synthetic_ldtp
+from .dirt import Dirt as Dirt, spoil as spoil
+from .perturbation import random_force as random_force
+from .simulated_recording import simulate_recording as simulate_recording
+from .synthetic_system import synthetic_ldtp as synthetic_ldtp

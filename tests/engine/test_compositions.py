@@ -208,9 +208,9 @@ def test_a_map_that_does_not_arrive(relay_map):
 
 
 PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g", "retention")
-ISOCHRONS = hj.ClockPhase(4, start=APEX)
+ISOCHRONS = hj.ClockPhase(4, anchor=APEX)
 ANGLES = hj.KinematicPhase(
-    4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), start=APEX
+    4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
 
 

@@ -17,7 +17,7 @@ class Straight(hj.Chart):
 
 
 class Sine(hj.HybridSystem):
-    rate: jax.Array = hj.parameter(10.0)
+    rate: hj.Parameter = hj.parameter(10.0)
 
     def charts(self):
         return {"line": Straight()}

@@ -5,11 +5,12 @@ import pytest
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random, simulate_blocks
+from ..conftest import unchecked
+from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
-DESIGN = hj.multisine(n_sections=4, periods=5, f_max=2.0, inputs=("a", "b"))
+DESIGN = hj.multisine(n_sections=4, periods=5, band=(0, 2.0), inputs=("a", "b"))
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +18,7 @@ def model():
     return hj.LDTP.from_blocks(*BLOCKS, inputs=("a", "b"))
 
 
-def test_simulation_from_rest_is_the_definition(model):
+def test_simulation_from_the_cycle_is_the_definition(model):
     data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
@@ -36,19 +37,15 @@ def test_periodic_start_has_no_transient(model):
 @pytest.mark.parametrize(
     "message, arguments",
     {
-        "start must be": dict(start="cycle"),
+        "start is 'cycle' or": dict(start="rest"),
         "discard must not be negative": dict(discard=-1),
-        "the design is for N = 5": dict(design=hj.multisine(5, 4, 2.0, inputs=2)),
-        "and 1 inputs": dict(design=hj.multisine(4, 4, 2.0)),
+        "the design is for N = 5": dict(design=hj.multisine(5, 4, (0, 2.0), inputs=2)),
+        "and 1 inputs": dict(design=hj.multisine(4, 4, (0, 2.0))),
     }.items(),
 )
 def test_bad_simulations(model, message, arguments):
-    # The hook that checks types in these tests would be the first to refuse a wrong `start`.
-    simulate = getattr(
-        hj.experiments.simulate_experiments, "__wrapped__", hj.experiments.simulate_experiments
-    )
     with pytest.raises(hj.DefinitionError, match=message):
-        simulate(model, **(dict(design=DESIGN) | arguments))
+        unchecked(hj.experiments.simulate_experiments)(model, **(dict(design=DESIGN) | arguments))
 
 
 def test_failed_experiments_are_named():
@@ -57,7 +54,12 @@ def test_failed_experiments_are_named():
     result, failed_at = np.zeros(80, int), np.full(80, -1)
     result[17], failed_at[17] = hj.Result.SECTION_MISSED, 41 * 32 + 21
     data = hj.ExperimentData(
-        np.ones_like(y), y, n_sections=32, periods=64, result=result, failed_at=failed_at
+        np.ones_like(y),
+        y,
+        n_sections=32,
+        periods=64,
+        result=result,
+        simulated=hj.experiments.Simulated(failed_at),
     )
     assert data.summary() == (
         "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"
@@ -83,7 +85,7 @@ HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
         "y must hold real numbers, not complex128": dict(y=1j * np.ones((3, 12, 2))),
         "u is not a rectangular array": dict(u=[[[1.0]], [[1.0, 2.0]]]),
         "experiment 0: u is NaN or infinite at sample 7": dict(u=HOLE),
-        "result, failed_at and error": dict(result=[0, 0]),
+        "result, failed_at, error and events": dict(result=[0, 0]),
         "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
         "`outputs` is": dict(outputs=("yM",)),
         "must be at least 1": dict(n_sections=0),

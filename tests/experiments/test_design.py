@@ -30,14 +30,14 @@ bands = st.tuples(st.integers(1, 9), st.integers(2, 12)).flatmap(
 @given(
     bands,
     st.integers(0, 5),
-    st.sampled_from(["skip", "two-phase"]),
+    st.sampled_from(["all", "two-phase"]),
     st.integers(1, 3),
     st.integers(0, 9),
 )
-def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, halves, nu, more):
+def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, lines, nu, more):
     N, P, top = band
-    arguments = dict(n_sections=N, periods=P, f_max=top / P, half_integers=halves, inputs=nu)
-    wanted = [j for j in range(top + 1) if halves == "two-phase" or (2 * j) % P]
+    arguments = dict(n_sections=N, periods=P, band=(0, top / P), lines=lines, inputs=nu)
+    wanted = [j for j in range(top + 1) if lines == "two-phase" or (2 * j) % P]
     if not wanted:
         with pytest.raises(hj.DefinitionError, match="take more periods or a wider band"):
             hj.multisine(**arguments, seed=seed)
@@ -72,7 +72,7 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(band, seed, halves
 
 def test_the_numbers_of_the_paper():
     paper, smallest = hj.paper_design(), hj.multisine()
-    both = hj.multisine(half_integers="two-phase")
+    both = hj.multisine(lines="two-phase")
     assert len(paper.frequencies) == len(smallest.frequencies) == 620
     assert (paper.experiments, smallest.experiments) == (80, 20)
     assert set(np.bincount(paper.experiment)) == {7, 8}
@@ -90,7 +90,7 @@ def test_the_seed_decides():
 
 
 def test_signals_are_sums_of_cosines():
-    design = hj.multisine(7, 6, 3.5, 0.2, half_integers="two-phase", inputs=("left", "right"))
+    design = hj.multisine(7, 6, (0, 3.5), 0.2, lines="two-phase", inputs=("left", "right"))
     n = np.arange(9 * 7)
     expected = np.zeros((design.experiments, len(n), 2))
     for e, j, i, a, phase in zip(
@@ -169,12 +169,12 @@ def test_bad_arguments_of_a_design(message, arguments):
 @pytest.mark.parametrize(
     "message, arguments",
     {
-        "must lie in": dict(f_max=17.0),
-        "f_min = 3": dict(f_min=3.0, f_max=2.0),
+        "must lie in": dict(band=(0, 17.0)),
+        "the band from 3.0 to 2.0": dict(band=(3.0, 2.0)),
         "periods .* must be at least 1": dict(periods=-2),
         "not a positive number": dict(amplitude=0.0),
         "more than the 620": dict(experiments=621),
-        "wider band": dict(f_max=0.01),
+        "wider band": dict(band=(0, 0.01)),
         "need at least 40 for 2 inputs": dict(experiments=39, inputs=2),
     }.items(),
 )

@@ -10,7 +10,7 @@ from ..conftest import OUTPUTS
 
 
 N, CYCLES = 32, 84
-BATCH = dict(batch=40)
+SINGLE = hj.Execution(batch=40, precision="single")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def both(request, hopper_cycle, design):
         {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}[request.param]
     )
     run = lambda precision: hj.run_experiments(  # noqa: E731
-        hopper_cycle, placed, design, OUTPUTS, precision=precision, **BATCH
+        hopper_cycle, placed, design, OUTPUTS, execution=hj.Execution(batch=40, precision=precision)
     )
     return placed, run("double"), run("single")
 
@@ -50,9 +50,7 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, both, desig
     placed, _, single = both
     u = design.inputs(CYCLES)
     u[17, 3 * N : 4 * N] = 60.0
-    broken = hj.run_experiments(
-        hopper_cycle, placed, u, OUTPUTS, discard=20, precision="single", **BATCH
-    )
+    broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20, execution=SINGLE)
     assert list(np.flatnonzero(~broken.ok)) == [17]
     others = np.arange(80) != 17
     difference = np.max(np.abs(broken.y[others] - single.y[others]), axis=(1, 2))
@@ -63,12 +61,7 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, both, desig
 def test_what_single_precision_cannot_give_is_refused(hopper_cycle, both, design):
     placed = both[0]
     with pytest.raises(hj.DefinitionError, match="single precision leaves errors of about .*e-0"):
-        hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, precision="single", accuracy=1e-7)
-
-
-def test_other_precisions_are_refused(hopper_cycle, placed_isochrons, design):
-    with pytest.raises(hj.DefinitionError, match="precision is 'double' or 'single', not 'half'"):
-        hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS, precision="half")
+        hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, accuracy=1e-7, execution=SINGLE)
 
 
 def test_thresholds_are_those_of_the_precision_at_hand():

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments import steady
+
+from ..conftest import no_compilation
 
 
 SECTIONS = hj.KinematicPhase(4, position="x", velocity="v")
-DESIGN = hj.multisine(4, 3, 1.2, 0.05, seed=1)
+DESIGN = hj.multisine(4, 3, (0, 1.2), 0.05, seed=1)
+ALONE = hj.Execution(workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +36,39 @@ def test_experiments_start_in_their_periodic_response(vanderpol_cycle):
     n = DESIGN.inputs().shape[1]
     for start, least, most in (("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)):
         data = hj.run_experiments(
-            vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start=start, discard=3, workers=1
+            vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start=start, discard=3, execution=ALONE
         )
         transient = np.abs(data.y[:, :n] - data.y[:, n:]).max()
         assert least <= transient < most
+
+
+@pytest.mark.parametrize("start", ["periodic", "steady"])
+def test_calls_that_are_repeated_compile_nothing(vanderpol_cycle, start):
+    def run(seed):
+        design = hj.multisine(4, 3, (0, 1.2), 0.05, seed)
+        call = vanderpol_cycle, placed, design, ("x", "v")
+        return hj.run_experiments(*call, start=start, execution=ALONE)
+
+    placed = hj.place_sections(vanderpol_cycle, SECTIONS)
+    run(1)
+    with no_compilation():
+        run(2)
+
+
+def test_linear_experiments_that_are_repeated_compile_nothing():
+    A = 0.3 * np.random.default_rng(0).normal(size=(4, 2, 2))
+    model = hj.LDTP(A, np.ones((4, 2, 1)), np.ones((4, 1, 2)))
+    simulate = hj.experiments.simulate_experiments
+    simulate(model, DESIGN, start="periodic")
+    with no_compilation():
+        simulate(model, DESIGN.realizations(1, seed=3), start="periodic")
+
+
+def test_a_steady_start_that_is_not_there_is_named(vanderpol_cycle, monkeypatch):
+    monkeypatch.setattr(steady, "MOST_STEPS", 1)
+    u = np.tile(DESIGN.inputs()[:1], (3, 1, 1)) * np.array([0.0, 1.0, 0.0])[:, None, None]
+    with pytest.raises(hj.ComputationError, match="experiment 1: no periodic response was found"):
+        hj.run_experiments(vanderpol_cycle, SECTIONS, u, "x", start="steady", execution=ALONE)
 
 
 @pytest.mark.slow
@@ -45,7 +78,7 @@ def test_the_response_repeats_from_the_first_sample_on(vanderpol_cycle, settled)
     n = u.shape[1]
     np.testing.assert_allclose(y[:, :n], y[:, n:], atol=1e-8)
     data = hj.run_experiments(
-        vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="steady", discard=3, workers=1
+        vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="steady", discard=3, execution=ALONE
     )
     np.testing.assert_allclose(data.y + np.tile(data.cycle_outputs, (6, 1)), y, atol=1e-8)
 
@@ -73,10 +106,11 @@ def test_process_noise_acts_but_is_not_recorded(vanderpol_cycle):
     def run(noise):
         return hj.run_experiments(
             vanderpol_cycle, SECTIONS, DESIGN, ("x", "v"), start="periodic", discard=3,
-            process_noise=noise, workers=1,
+            process_noise=None if noise is None else hj.experiments.ProcessNoise(noise),
+            execution=ALONE,
         )  # fmt: skip
 
-    still, noisy, again = run(0.0), run(1e-3), run(1e-3)
+    still, noisy, again = run(None), run(1e-3), run(1e-3)
     np.testing.assert_array_equal(noisy.u, DESIGN.inputs(6))
     np.testing.assert_array_equal(noisy.y, again.y)
     change = np.std(noisy.y - still.y)

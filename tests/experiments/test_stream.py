@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.campaign import divide
+from hybridjax.experiments.batches import divide
 
 from ..conftest import OUTPUTS, no_compilation
 
 
 COUNT = 100
 DESIGN = hj.multisine(experiments=COUNT)
-BATCH = dict(batch=40)
+BATCH = dict(execution=hj.Execution(batch=40))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,8 @@ def test_inputs_may_lie_on_disk(arguments, whole, tmp_path):
 def test_workers_and_batches_change_nothing(arguments, whole):
     with no_compilation():
         for workers in (1, 3):
-            data = hj.run_experiments(*arguments, workers=workers, **BATCH)
+            execution = hj.Execution(batch=40, workers=workers)
+            data = hj.run_experiments(*arguments, execution=execution)
             np.testing.assert_array_equal(data.y, whole.y)
             np.testing.assert_array_equal(data.error, whole.error)
 
@@ -82,14 +83,15 @@ def test_workers_and_batches_change_nothing(arguments, whole):
 def test_batches_are_alike_and_keep_all_workers_busy():
     for S in (1, 20, 80, 1000, 1001, 99_999):
         for workers in (1, 2, 7, 64):
-            size, used = divide(S, None, workers)
+            divided = divide(S, hj.Execution(workers=workers))
+            size, used = divided.batch, divided.workers
             assert 1 <= used <= workers and 1 <= size <= min(S, 320)
             number = -(-S // size)
             assert used == min(workers, number)
             if S >= 64 * workers:  # every worker has about the same to do
                 assert used == workers and number * size < 1.2 * S
-    assert divide(1000, 256, 8) == (256, 4)
-    assert divide(80, None, 2) == (40, 2)
+    assert divide(1000, hj.Execution(256, 8)) == hj.Execution(256, 4)
+    assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(stored, whole):
@@ -126,14 +128,14 @@ def test_processes_share_the_chunks(arguments, whole, tmp_path):
 def test_an_interruption_leaves_whole_chunks_only(arguments, tmp_path, monkeypatch):
     import hybridjax.experiments.store
 
-    save = hybridjax.experiments.store.save
+    write = hybridjax.experiments.store.write_module
 
     def interrupted(path, thing):
         if "000001" in path.name:
             raise KeyboardInterrupt
-        save(path, thing)
+        write(path, thing)
 
-    monkeypatch.setattr(hybridjax.experiments.store, "save", interrupted)
+    monkeypatch.setattr(hybridjax.experiments.store, "write_module", interrupted)
     with pytest.raises(KeyboardInterrupt):
         hj.experiments.store_experiments(tmp_path, *arguments, chunk=40, **BATCH)
     assert hj.experiments.StoredExperiments(tmp_path).missing() == [1, 2]
@@ -149,6 +151,8 @@ def test_an_interruption_leaves_whole_chunks_only(arguments, tmp_path, monkeypat
         (dict(chunk=7), "chunk"),
         (dict(discard=1), "cycles"),
         (dict(accuracy=1e-8), "accuracy"),
+        (dict(process_noise=hj.experiments.ProcessNoise(1e-3)), "process_noise"),
+        (dict(start="steady"), "cycles"),
     ],
 )
 def test_another_design_in_the_folder_is_refused(stored, arguments, change, what):
@@ -195,8 +199,6 @@ def test_folders_without_experiments(tmp_path, arguments):
     [
         (dict(chunk=0), "chunk is the number"),
         (dict(share=(2, 2)), "0 <= rank < size"),
-        (dict(batch=0), "batch is the number"),
-        (dict(workers=0), "workers is the number"),
     ],
 )
 def test_bad_numbers(arguments, tmp_path, change, message):

@@ -1,4 +1,3 @@
-import jax
 import numpy as np
 import pytest
 
@@ -8,7 +7,7 @@ from ..conftest import APEX, OUTPUTS
 
 
 HOPPER = ("m", "M", "k", "b", "l0", "a", "g")
-SECTIONS = hj.ClockPhase(8, start=APEX)
+SECTIONS = hj.ClockPhase(8, anchor=APEX)
 
 
 class Charge(hj.Chart):
@@ -24,9 +23,9 @@ class Charge(hj.Chart):
 class Oscillator(hj.HybridSystem):
     """Van der Pol's, with a damping of which only the product of two factors can be seen."""
 
-    p: jax.Array = hj.parameter(0.5)
-    q: jax.Array = hj.parameter(2.0)
-    w: jax.Array = hj.parameter(1.0)
+    p: hj.Parameter = hj.parameter(0.5)
+    q: hj.Parameter = hj.parameter(2.0)
+    w: hj.Parameter = hj.parameter(1.0)
 
     def charts(self):
         return {"charge": Charge(self)}

@@ -9,7 +9,7 @@ from ..conftest import OUTPUTS
 from .conftest import HOPPER, SECTIONS, Oscillator
 
 
-PHASES = hj.ClockPhase(4, start=hj.Crossing("v", "falling"))
+PHASES = hj.ClockPhase(4, anchor=hj.Crossing("v", "falling"))
 
 
 STD = {"std": 1e-3, "period_std": 1e-3}
@@ -106,7 +106,7 @@ def test_the_hopper_comes_back_from_its_htfs(hopper_cycle, hopper_htf, seen_in_h
 
 @pytest.mark.slow
 def test_the_hopper_comes_back_from_experiments(hopper_cycle):
-    u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.count, 1))
+    u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
     data = hj.run_experiments(hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
     wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
     fit = hj.fit_model(

@@ -33,7 +33,7 @@ class Rounded(hj.HybridSystem):
     """An event that changes nothing: its guard is zero afterwards, but for rounding errors, which
     grow with the state and with time."""
 
-    level: jax.Array = hj.parameter(0.0)
+    level: hj.Parameter = hj.parameter(0.0)
 
     def charts(self):
         return {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
@@ -49,9 +49,9 @@ class Layer(hj.HybridSystem):
     """A point on the unit circle; an event where it enters the layer |x - level| < width, and
     perhaps one where x falls through `other`. Neither changes anything."""
 
-    level: jax.Array = hj.parameter()
-    width: jax.Array = hj.parameter()
-    other: jax.Array = hj.parameter()
+    level: hj.Parameter = hj.parameter()
+    width: hj.Parameter = hj.parameter()
+    other: hj.Parameter = hj.parameter()
 
     def charts(self):
         return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}

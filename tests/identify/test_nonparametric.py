@@ -8,13 +8,13 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 DESIGNS = {
     "paper": hj.paper_design(),
     "minimum": hj.multisine(),
-    "two-phase": hj.multisine(half_integers="two-phase"),
+    "two-phase": hj.multisine(lines="two-phase"),
 }
 
 
@@ -48,7 +48,7 @@ def test_any_system_is_identified_exactly(shape, seed):
     model = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
     N = len(dims)
     top = N * periods // 2 / periods
-    design = hj.multisine(N, periods, top, 1.0, seed, half_integers="two-phase", inputs=nu)
+    design = hj.multisine(N, periods, (0, top), 1.0, seed, lines="two-phase", inputs=nu)
     estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
     np.testing.assert_array_equal(estimate.f, design.frequencies)
     exact = model.htf(estimate.f)
@@ -111,10 +111,10 @@ def test_a_lost_phase_loses_the_frequency(hopper):
 
 def record(*cosines, n_sections=8, periods=8, cycles=8):
     """One experiment per argument, a list of (f, phase); the output repeats the input."""
-    n = np.arange(sections * cycles)
-    u = [sum(np.cos(2 * np.pi * f * n / sections + phase) for f, phase in c) for c in cosines]
+    n = np.arange(n_sections * cycles)
+    u = [sum(np.cos(2 * np.pi * f * n / n_sections + phase) for f, phase in c) for c in cosines]
     u = np.stack(u)[..., None]
-    return hj.ExperimentData(u, u, sections=sections, periods=periods)
+    return hj.ExperimentData(u, u, n_sections=n_sections, periods=periods)
 
 
 def test_half_integers_need_two_phases():

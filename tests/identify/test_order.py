@@ -79,7 +79,10 @@ def test_bad_requests(small):
 def test_aaa_finds_the_roots_of_the_multipliers(exact, multipliers):
     """All 64 poles of H_0, from twice that many coefficients."""
     fit = hj.identify.fit_aaa(exact)
-    assert [c.max_error < 1e-6 for c in fit.compare(multipliers)] == [True, True]
+    comparison = fit.compare(multipliers)
+    assert comparison.max_error < 1e-6 and comparison.outputs == ("yM", "yM", "vM", "vM")
+    assert fit.compare(multipliers, "vM").max_error == comparison.error[2:].max()
+    assert "yM" in repr(comparison)
     assert np.all(fit.residual < 1e-11)
     assert fit.outputs == ("yM", "vM") and "poles, residual" in repr(fit)
     with pytest.raises(hj.DefinitionError, match="no input 'v'"):

@@ -18,7 +18,7 @@ BIAS = {
 @pytest.mark.parametrize("form, weighting", BIAS)
 def test_the_bias_on_exact_data(form, weighting, exact, multipliers):
     fit = hj.fit_rational(exact, form=form, weighting=weighting)
-    errors = [comparison.max_error for comparison in fit.compare(multipliers)]
+    errors = [fit.compare(multipliers, name).max_error for name in fit.outputs]
     np.testing.assert_allclose(errors, *BIAS[form, weighting][:1], atol=BIAS[form, weighting][1])
     assert np.all(fit.result == hj.Result.OK)
     np.testing.assert_array_equal(fit.multipliers, fit.poles**32)
@@ -57,7 +57,7 @@ def test_no_start_finds_a_better_fit(form, weighting, exact):
 
 @pytest.mark.parametrize("form", ["delayed", "direct"])
 def test_a_rational_function_is_found_exactly(form):
-    """Three poles, two zeros; evaluate, poles, zeros and gain of what was put in."""
+    """Three poles, two zeros; HTF, poles, zeros and gain of what was put in."""
     f, numerator = np.linspace(0.1, 2.4, 40), np.array([2.0, -1.0, 0.3])
     poles = np.array([0.9 + 0.3j, 0.9 - 0.3j, -0.5])
     h = rational(f, numerator, np.poly(poles).real, 5, int(form == "delayed"))
@@ -65,7 +65,7 @@ def test_a_rational_function_is_found_exactly(form):
     np.testing.assert_allclose(fit.poles[0], poles, atol=1e-7)
     np.testing.assert_allclose(fit.numerator[0], numerator, atol=1e-6)
     np.testing.assert_allclose(np.sort_complex(fit.zeros[0]), np.roots(numerator)[::-1], atol=1e-6)
-    np.testing.assert_allclose(fit.evaluate(f)[:, 0], h, atol=1e-6)
+    np.testing.assert_allclose(fit.htf(f).H[0, :, 0, 0], h, atol=1e-6)
     assert fit.residual[0] < 1e-7
     # More poles than there are: the fit stays good and the true ones are among them.
     more = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3, form=form)

@@ -31,7 +31,7 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     """620 frequencies up to 10 of 16 cycles per period."""
     model = hj.identify.realize(exact)
     np.testing.assert_array_equal(model.dims, MINIMAL)
-    np.testing.assert_allclose(model.multipliers(), multipliers, atol=1e-11)
+    np.testing.assert_allclose(model.multipliers, multipliers, atol=1e-11)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
     assert model.inputs == ("u",) and model.outputs == ("yM", "vM")
 
@@ -62,7 +62,7 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     model = hj.identify.realize(fit, order=2)
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
     assert model.htf(F).error(hopper.htf(F)).max() < 2e-3
-    assert np.abs(model.multipliers()[:2] - multipliers).max() < 2e-3
+    assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
     small = hj.identify.realize(fit, 2)
     np.testing.assert_array_equal(small.dims, 2)
 
@@ -77,7 +77,7 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     )  # fmt: skip
     model = hj.identify.realize(noisy, order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
-    assert np.abs(model.multipliers()[:2] - multipliers).max() < 2e-3
+    assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
 
 
 def test_bad_requests(hopper, exact):

@@ -9,7 +9,7 @@ import hybridjax as hj
 
 
 N, P = 4, 16
-LINES = hj.multisine(N, P, 2.0, 0.1, experiments=4)
+LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +19,14 @@ def model():
     return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
-def realized(model, count, repeats=1, noise=0.0, seed=0, **more):
+def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
     design = LINES.realizations(count, seed)
     data = hj.experiments.simulate_experiments(
-        model, design, start="periodic", discard=(repeats - 1) * P, seed=seed, **more
+        model,
+        design,
+        start="periodic",
+        discard=(repeats - 1) * P,
+        process_noise=hj.experiments.ProcessNoise(process_noise, seed),
     )
     return hj.experiments.add_noise(data, std=noise, seed=seed)
 
@@ -56,13 +60,13 @@ def test_the_parts_of_the_variance(model):
     """White noise: both parts are the same; their mean is the formula of the design."""
     data = realized(model, 40, 8, noise=0.2)
     estimate = hj.estimate_htf(data, repeats=8)
-    np.testing.assert_array_equal(estimate.freedom, 39)
+    np.testing.assert_array_equal(estimate.variance_freedom, 39)
     once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
     np.testing.assert_allclose(np.mean(estimate.variance), once, rtol=0.03)
     np.testing.assert_allclose(np.mean(estimate.noise_variance), once, rtol=0.03)
     alone = hj.estimate_htf(data, repeats=8, variance="noise")
     np.testing.assert_array_equal(alone.variance, estimate.noise_variance)
-    np.testing.assert_array_equal(alone.freedom, 40 * 7)
+    np.testing.assert_array_equal(alone.variance_freedom, 40 * 7)
     assert alone.noise_variance is None
 
 
@@ -84,13 +88,13 @@ def test_sums_of_parts_are_those_of_the_whole(model):
         for k in range(0, 16, 4)
     ]
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
-    for name in ("H", "variance", "noise_variance", "freedom"):
+    for name in ("H", "variance", "noise_variance", "variance_freedom"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
 
 
 def test_without_repeats_or_realisations_nothing_is_known(model):
     estimate = hj.estimate_htf(realized(model, 1))
-    assert estimate.variance is None and estimate.freedom is None
+    assert estimate.variance is None and estimate.variance_freedom is None
     with pytest.raises(hj.DefinitionError, match="several realizations"):
         estimate.confidence_radius()
 
@@ -158,7 +162,7 @@ def test_noise_by_its_ratio(model):
     for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
         with pytest.raises(hj.DefinitionError):
             hj.experiments.add_noise(data, **bad)
-    with pytest.raises(hj.DefinitionError, match="process_noise must be finite"):
+    with pytest.raises(hj.DefinitionError, match="std of process noise must be finite"):
         realized(model, 1, process_noise=-1.0)
 
 
@@ -184,7 +188,7 @@ def test_any_record_is_estimated_or_refused(model, sections, periods, samples, r
     rng = np.random.default_rng(samples)
     u, y = rng.normal(size=(2, samples, 1)), rng.normal(size=(2, samples, 1))
     try:
-        data = hj.ExperimentData(u, y, sections=sections, periods=periods)
+        data = hj.ExperimentData(u, y, n_sections=sections, periods=periods)
         estimate = hj.estimate_htf(data, repeats=repeats, half_integers="skip")
     except hj.DefinitionError as error:
         assert str(error).endswith(".") and len(str(error)) > 20

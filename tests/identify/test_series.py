@@ -2,20 +2,21 @@
 
 import numpy as np
 import pytest
-from hybridjax.identify.series.fit.layout import lay_out
-from hybridjax.identify.series.fit.regression import delayed_outputs, linearize, rescale, set_up
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.identify.series.arx import delayed_outputs
+from hybridjax.identify.series.cycle_grid import CycleGrid
+from hybridjax.identify.series.output_error import OutputErrorProblem, linearize
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 from .test_uncertainty import covered
 
 
 def scaled(seed, dims, ny, nu, modulus=0.7):
     """A random system whose largest multiplier has this modulus."""
     A, B, C, D = blocks_at_random(seed, dims, ny, nu)
-    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers()[0])
+    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
     factor = (modulus / size) ** (1 / len(dims))
     return hj.LDTP.from_blocks([a * factor for a in A], B, C, D)
 
@@ -25,13 +26,13 @@ def small():
     return scaled(3, (2, 3, 4, 2), 2, 1)
 
 
-def record(model, samples, seed=0, noise=0.0, start=0, x0=None):
+def record(model, samples, seed=0, noise=0.0, first_section=0, x0=None):
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(samples, len(model.inputs)))
-    y = np.array(model.simulate(u, x0, start))
+    y = np.array(model.simulate(u, x0, first_section))
     y += noise * rng.normal(size=y.shape)
-    about = dict(inputs=model.inputs, outputs=model.outputs)
-    return hj.Record(u, y, n_sections=model.n_sections, start=start, **about)
+    about = dict(n_sections=model.n_sections, inputs=model.inputs, outputs=model.outputs)
+    return hj.Record(u, y, first_section=first_section, **about)
 
 
 def test_the_hopper_is_found_exactly(hopper, multipliers):
@@ -55,16 +56,16 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     rng = np.random.default_rng(seed)
     records = []
     for k in range(2):
-        start = (first + k) % N
-        x0 = rng.normal(size=dims[start])
-        one = record(model, 60 * N + 1 + k, seed + k, start=start, x0=x0)
+        section = (first + k) % N
+        x0 = rng.normal(size=dims[section])
+        one = record(model, 60 * N + 1 + k, seed + k, first_section=section, x0=x0)
         u, y = one.u.copy(), one.y.copy()
         y[rng.random(y.shape) < 0.02] = np.nan
         u[25 * N + 2, 0] = np.nan
         about = dict(inputs=model.inputs, outputs=model.outputs)
-        records.append(hj.Record(u, y, n_sections=N, start=start, **about))
+        records.append(hj.Record(u, y, n_sections=N, first_section=section, **about))
     fit = hj.fit_series(records, model)
-    np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers()).real[1:], atol=1e-7)
+    np.testing.assert_allclose(fit.coefficients, np.poly(model.multipliers).real[1:], atol=1e-7)
     lags = fit.numerators.shape[1]
     np.testing.assert_allclose(fit.impulse_response(lags), model.impulse_response(lags), atol=1e-7)
 
@@ -78,11 +79,12 @@ def test_outputs_do_not_meddle(small, alike):
     c, unit = np.array([-0.5, 0.2]), np.array([2.0, 0.1])
 
     def of(outputs):
-        problem = set_up(lay_out(hj.Record(whole.u, y[:, outputs], n_sections=4)), 2, 4, False)
+        grid = CycleGrid.from_data(hj.Record(whole.u, y[:, outputs], n_sections=4))
+        problem = OutputErrorProblem.from_grid(grid, 2, 4, free_start=True)
         return problem, linearize(problem, c), delayed_outputs(problem, 2)
 
     problem, both, delayed = of([0, 1])
-    other = rescale(problem, unit)
+    other = problem.rescale(unit)
     for i in range(2):
         _, alone, one = of([i])
         np.testing.assert_allclose(both.residual[..., [i], :], alone.residual, atol=1e-12)
@@ -104,7 +106,7 @@ def test_outputs_do_not_meddle(small, alike):
 
 def test_regions_cover(small):
     """Of multipliers and of the HTFs at fixed frequencies; the error is what is said."""
-    true, runs, f = small.multipliers(), 40, np.array([0.1, 0.9, 1.6])
+    true, runs, f = small.multipliers, 40, np.array([0.1, 0.9, 1.6])
     exact = small.htf(f, (-1, 0, 1))
     fits = [hj.fit_series(record(small, 4 * 120, seed, 0.3), 2) for seed in range(runs)]
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
@@ -122,7 +124,7 @@ def test_regions_cover(small):
 
 def test_process_noise_is_seen_in_the_residuals(small):
     """A random input nobody recorded: regions from white errors would be too small."""
-    true, runs = small.multipliers(), 40
+    true, runs = small.multipliers, 40
     hits = 0
     for seed in range(runs):
         clean = record(small, 4 * 100, seed)
@@ -140,10 +142,26 @@ def test_experiments_are_used_from_their_start(hopper, multipliers):
         data.u, data.y, n_sections=32, periods=40, inputs="u", outputs=("yM", "vM"),
         result=[0] * 19 + [hj.Result.BLOW_UP],
     )  # fmt: skip
-    for start in ("free", "rest"):
+    for start in ("free", "cycle"):
         fit = hj.fit_series(data, 2, start=start)
         assert fit.compare(multipliers).max_error < 1e-8
         assert "SeriesFit(multipliers -0.2489" in repr(fit)
+
+
+def test_all_data_are_made_of_records(hopper, small):
+    """A record, experiments, and mixtures of these are the same data."""
+    data = hj.experiments.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
+    fits = [
+        hj.fit_series(same, 2, start="cycle", distortion=False)
+        for same in (data, data.records, [data], iter(data.records))
+    ]
+    for fit in fits[1:]:
+        np.testing.assert_array_equal(fit.coefficients, fits[0].coefficients)
+    whole = record(small, 100, first_section=1)
+    assert whole.records == (whole,) and isinstance(data, hj.experiments.HasRecords)
+    part = whole.part(10, 20)
+    assert part.first_section == 3 and part.outputs == whole.outputs
+    np.testing.assert_array_equal(part.y, whole.y[10:20])
 
 
 def test_a_chirp_will_do(hopper, multipliers):
@@ -215,7 +233,7 @@ def test_drift_is_no_response(small):
         hj.fit_series(hj.Record(plain.u, y, **about), 2) for y in (plain.y, plain.y + wave[:, None])
     ]
     np.testing.assert_allclose(fits[0].coefficients, fits[1].coefficients, atol=1e-6)
-    assert fits[1].contains(small.multipliers(), 0.999).all()
+    assert fits[1].contains(small.multipliers, 0.999).all()
     found = hj.validate(fits[1], hj.Record(plain.u, plain.y + wave[:, None], **about))
     assert found.fit.min() > 90
     with pytest.raises(hj.DefinitionError, match="positive number of cycles"):
@@ -238,8 +256,8 @@ def test_bad_records(small):
         hj.fit_series(hj.Record(good.u * np.nan, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match=r"not \(400, 1\) and \(399, 2\)"):
         hj.Record(good.u, good.y[1:], n_sections=4)
-    with pytest.raises(hj.DefinitionError, match="start from 0 to sections - 1"):
-        hj.Record(good.u, good.y, n_sections=4, start=4)
+    with pytest.raises(hj.DefinitionError, match="first_section from 0 to n_sections - 1"):
+        hj.Record(good.u, good.y, n_sections=4, first_section=4)
     with pytest.raises(hj.DefinitionError, match="y is infinite at sample 7"):
         y = good.y.copy()
         y[7] = np.inf

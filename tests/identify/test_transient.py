@@ -5,12 +5,12 @@ import pytest
 
 import hybridjax as hj
 
-from ..periodic.conftest import hopper as hopper
+from ..linear.conftest import hopper as hopper
 
 
 @pytest.fixture(scope="module")
 def full():
-    return hj.multisine(periods=12, f_max=3.0)
+    return hj.multisine(periods=12, band=(0, 3.0))
 
 
 def errors(model, data, harmonics=(-1, 0, 1)):
@@ -28,10 +28,10 @@ def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full, known
     ):
         data = hj.experiments.simulate_experiments(hopper, design, discard=discard)
         assert errors(hopper, data) > 1e-3
-        given = hopper.multipliers() if known else None
+        given = hopper.multipliers if known else None
         fit = hj.identify.remove_transient(data, 2, multipliers=given)
         assert errors(hopper, fit.data) < 1e-9
-        assert np.abs(fit.multipliers - hopper.multipliers()).max() < 1e-8
+        assert np.abs(fit.multipliers - hopper.multipliers).max() < 1e-8
         assert fit.data.u.shape[1] == data.u.shape[1] - 32
         assert "removed rms up to" in repr(fit)
 
@@ -44,7 +44,7 @@ def test_noise_is_not_mistaken_for_a_transient(hopper, full):
     still = hj.ExperimentData(still.u, still.y + data.y - rest.y, n_sections=32, periods=12)
     fit = hj.identify.remove_transient(data)
     assert len(fit.multipliers) == 2
-    assert np.abs(fit.multipliers - hopper.multipliers()).max() < 0.03
+    assert np.abs(fit.multipliers - hopper.multipliers).max() < 0.03
     assert errors(hopper, fit.data) < 1.2 * errors(hopper, still)
 
 

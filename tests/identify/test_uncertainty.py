@@ -6,7 +6,7 @@ from scipy import stats
 
 import hybridjax as hj
 
-from ..periodic.conftest import blocks_at_random
+from ..linear.conftest import blocks_at_random
 
 
 def noisy(htf, variance, rng, correlation=0.0):
@@ -20,7 +20,7 @@ def noisy(htf, variance, rng, correlation=0.0):
 def with_variance(htf, H, variance, freedom=None):
     return hj.HTF(
         htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-        variance=variance, freedom=freedom,
+        variance=variance, variance_freedom=freedom,
     )  # fmt: skip
 
 
@@ -28,7 +28,7 @@ def with_variance(htf, H, variance, freedom=None):
 def small():
     """Four sections, two multipliers of modulus 0.7, states that die soon; its HTFs."""
     A, B, C, D = blocks_at_random(3, (2, 3, 4, 2), 2, 1)
-    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers()[0])
+    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
     model = hj.LDTP.from_blocks([a * (0.7 / size) ** 0.25 for a in A], B, C, D)
     return model, model.htf(np.linspace(0.01, 1.99, 80))
 
@@ -51,7 +51,7 @@ def covered(hits, runs, level=0.95):
 def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
-    true, runs = model.multipliers(), 60
+    true, runs = model.multipliers, 60
     bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance)).standard_errors
     fits = [
         hj.fit_multipliers(
@@ -71,7 +71,7 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
 
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
     model, htf = small
-    true = model.multipliers()
+    true = model.multipliers
     square = np.zeros(2)
     for seed in range(25):
         rng = np.random.default_rng(seed)
@@ -94,7 +94,7 @@ def test_without_variances_the_misfit_tells(small):
     data = noisy(htf, variance, np.random.default_rng(0))
     blind = hj.fit_multipliers(with_variance(htf, data.H, None), 2)
     np.testing.assert_allclose(blind.standard_errors, said, rtol=0.3)
-    assert blind.contains(model.multipliers(), 0.999).all()
+    assert blind.contains(model.multipliers, 0.999).all()
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ def test_the_true_model_leaves_white_noise(small):
     """Both p-values are uniformly distributed, though starts are unknown and samples missing."""
     p = []
     for seed in range(60):
-        data = record(small, 4 * 100, seed, 0.3, start=1, x0=np.ones(3))
+        data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
@@ -30,7 +30,7 @@ def test_the_true_model_leaves_white_noise(small):
 
 def test_the_fit_is_the_share_explained(small):
     data = record(small, 4 * 200, 0, 0.3)
-    found = hj.validate(small, data, start="rest")
+    found = hj.validate(small, data, start="cycle")
     clean = np.asarray(small.simulate(data.u))
     np.testing.assert_allclose(found.simulated, clean, atol=1e-12)
     left = np.sqrt(np.mean((data.y - clean) ** 2, axis=0))
@@ -71,14 +71,14 @@ def test_identified_beside_held_out_data(hopper):
     np.testing.assert_allclose(found.fit, 99.0, atol=0.4)
 
 
-@pytest.mark.parametrize("start", ["free", "rest"])
+@pytest.mark.parametrize("start", ["free", "cycle"])
 def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     """Neither residuals nor p-values of the true model change, however large the drift is."""
-    plain = record(small, 4 * 150, 0, 0.3, start=1)
+    plain = record(small, 4 * 150, 0, 0.3, first_section=1)
     plain.y[5:9, 0] = np.nan
     cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
     wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
-    about = dict(n_sections=4, start=1, outputs=plain.outputs, drift=50)
+    about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
     still, moved = (
         hj.validate(small, hj.Record(plain.u, plain.y + x, **about), start=start)
         for x in (0.0, wave[:, None] * [1.0, -2.0])
@@ -116,7 +116,7 @@ def test_amplitudes(small):
 
 def test_bad_requests(small, hopper):
     data = record(small, 4 * 50)
-    with pytest.raises(hj.DefinitionError, match="different sections: 32 and 4"):
+    with pytest.raises(hj.DefinitionError, match="different n_sections: 32 and 4"):
         hj.validate(hopper, data)
     with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
         hj.validate(small, record(small, 20))

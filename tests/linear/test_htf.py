@@ -268,7 +268,7 @@ def test_bad_use(synthetic, hopper):
         (lambda: synthetic.htf(0.25).interpolate([0.3]), "at least two"),
         (lambda: htf.error(htf.select((0, 1))), "different harmonics"),
         (lambda: htf.error(synthetic.htf([0.25, 0.7], (-1, 0, 1))), "different frequencies"),
-        (lambda: htf.error(hopper.htf([0.25, 0.75], (-1, 0, 1))), "different sections"),
+        (lambda: htf.error(hopper.htf([0.25, 0.75], (-1, 0, 1))), "different n_sections"),
         (lambda: htf.select(1).error(htf.select(1)), "Harmonic 0 is not stored"),
         (lambda: jax.jit(lambda u: htf.predict(u))(u), "outside of jit"),
     ]

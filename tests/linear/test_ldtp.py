@@ -42,7 +42,7 @@ def test_impulse_response_is_the_response_to_impulses(synthetic):
         for j in range(2):
             u = np.zeros((lags, 2))
             u[0, j] = 1
-            y = synthetic.simulate(u, start=k)
+            y = synthetic.simulate(u, first_section=k)
             for r in range(lags):
                 np.testing.assert_allclose(response[(k + r) % N, r, :, j], y[r], atol=1e-14)
 
@@ -126,7 +126,7 @@ def test_names_and_repr(synthetic, hopper):
     jax.jit(lambda ldtp: repr(ldtp) and 0)(hopper)
     ldtp = hj.LDTP(np.zeros((2, 1, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)), outputs="height")
     assert (ldtp.inputs, ldtp.outputs) == (("u",), ("height",))
-    assert ldtp.multipliers().shape == (0,)
+    assert ldtp.multipliers.shape == (0,)
 
 
 GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1, 3))}
@@ -185,7 +185,8 @@ def test_bad_calls(synthetic):
     with pytest.raises(hj.DefinitionError, match="`u` must have 2 axes"):
         synthetic.simulate(u[:, 0])
     with pytest.raises(hj.DefinitionError, match="`x0` has 3 entries, but section 1 has 2"):
-        hj.LDTP.from_blocks(*blocks_at_random(0, (4, 2), 1, 2)).states(u, np.zeros(3), start=1)
+        varying = hj.LDTP.from_blocks(*blocks_at_random(0, (4, 2), 1, 2))
+        varying.states(u, np.zeros(3), first_section=1)
     with pytest.raises(hj.DefinitionError, match="`u` has 6 samples, but 2 periods of 6"):
         synthetic.periodic_state(u, 2)
     with pytest.raises(hj.DefinitionError, match="`n_lags` must be at least 1"):

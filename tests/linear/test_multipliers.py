@@ -164,34 +164,34 @@ def test_defective_and_cyclic_products():
 def test_synthetic_system(synthetic):
     expected = 0.3270675 + 0.0596405918293070j
     np.testing.assert_allclose(
-        synthetic.multipliers(), [expected, expected.conjugate()], rtol=0, atol=1e-14
+        synthetic.multipliers, [expected, expected.conjugate()], rtol=0, atol=1e-14
     )
     assert [synthetic.rank(n) for n in range(6)] == [2] * 6
 
 
 def test_hopper(hopper, reference):
     data = reference("ldtp_isochron")
-    found = hopper.multipliers()
+    found = hopper.multipliers
     np.testing.assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
     assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
     np.testing.assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
 
 
 def test_multipliers_agree_at_every_section(hopper):
-    first = hopper.multipliers()
+    first = hopper.multipliers
     for n in (3, 17):
         rolled = hj.LDTP(
             *(jnp.roll(a, -n, axis=0) for a in (hopper.A, hopper.B, hopper.C, hopper.D)),
             dims=jnp.roll(hopper.dims, -n),
         )
-        np.testing.assert_allclose(rolled.multipliers(), first, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(rolled.multipliers, first, rtol=0, atol=1e-13)
 
 
 def test_characteristic_polynomial(synthetic, hopper):
     for ldtp in (synthetic, hopper):
-        r = len(ldtp.multipliers())
+        r = len(ldtp.multipliers)
         coefficients = np.asarray(ldtp.characteristic_polynomial())
-        expected = np.poly(ldtp.multipliers()).real
+        expected = np.poly(ldtp.multipliers).real
         np.testing.assert_allclose(coefficients[: r + 1], expected, rtol=0, atol=1e-13)
         np.testing.assert_allclose(coefficients[r + 1 :], 0, atol=1e-13)
 
@@ -213,7 +213,7 @@ def test_factors_that_are_not_finite():
 
 def test_multipliers_refuse_to_be_traced(synthetic):
     with pytest.raises(hj.DefinitionError, match="works on the host"):
-        jax.jit(lambda ldtp: ldtp.multipliers())(synthetic)
+        jax.jit(lambda ldtp: ldtp.multipliers)(synthetic)
     with pytest.raises(hj.DefinitionError, match="one LDTP at a time"):
         batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
         batch.rank()

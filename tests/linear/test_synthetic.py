@@ -39,7 +39,7 @@ def model():
 def test_multipliers(model):
     assert list(model.dims) == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
-    np.testing.assert_allclose(model.multipliers(), [pair, pair.conjugate()], rtol=1e-13)
+    np.testing.assert_allclose(model.multipliers, [pair, pair.conjugate()], rtol=1e-13)
 
 
 @pytest.mark.parametrize("f, m", TRUTH)
@@ -49,6 +49,6 @@ def test_transfer_functions(model, f, m):
 
 
 def test_experiments_find_its_transfer_functions(model):
-    design = hj.multisine(n_sections=6, periods=16, f_max=2.0, inputs=2, amplitude=0.1)
+    design = hj.multisine(n_sections=6, periods=16, band=(0, 2.0), inputs=2, amplitude=0.1)
     estimate = hj.estimate_htf(hj.experiments.simulate_experiments(model, design, start="periodic"))
     assert np.max(estimate.error(model.htf(estimate.f, estimate.harmonics))) < 1e-12

@@ -19,7 +19,7 @@ def an_htf(**more):
 @pytest.fixture
 def htf():
     size = np.random.default_rng(1).uniform(1, 2, (3, len(F), 2, 1))
-    return an_htf(variance=2 * size, noise_variance=size, freedom=np.full(len(F), 4.0))
+    return an_htf(variance=2 * size, noise_variance=size, variance_freedom=np.full(len(F), 4.0))
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
@@ -35,13 +35,13 @@ def test_variances_go_along(htf):
     one = htf.select((0, 1))
     np.testing.assert_array_equal(one.variance, htf.variance[1:])
     np.testing.assert_array_equal(one.noise_variance, htf.noise_variance[1:])
-    np.testing.assert_array_equal(one.freedom, htf.freedom)
+    np.testing.assert_array_equal(one.variance_freedom, htf.variance_freedom)
     between = htf.interpolate([0.1, 0.125])
     np.testing.assert_allclose(between.variance[:, 0], htf.variance[:, 1])
     np.testing.assert_allclose(
         between.variance[:, 1], (htf.variance[:, 1] + htf.variance[:, 2]) / 2
     )
-    np.testing.assert_allclose(between.freedom, 4.0)
+    np.testing.assert_allclose(between.variance_freedom, 4.0)
     assert an_htf().interpolate([0.1]).variance is None
 
 
@@ -59,5 +59,5 @@ def test_bad_variances(htf):
         an_htf().confidence_radius()
     with pytest.raises(hj.DefinitionError, match="level must lie between 0 and 1"):
         htf.confidence_radius(1.0)
-    with pytest.raises(hj.DefinitionError, match="`freedom` must have the shape"):
-        an_htf(freedom=np.ones(3))
+    with pytest.raises(hj.DefinitionError, match="`variance_freedom` must have the shape"):
+        an_htf(variance_freedom=np.ones(3))

@@ -5,7 +5,6 @@ s the paddle's acceleration at the impact (Holmes 1982): all three kinds of poin
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ def test_fold_and_flip_of_the_juggler(juggling):
         trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi) ** 2 * y / float(p.g)
         np.testing.assert_allclose(np.sum(cycle.multipliers).real, trace, rtol=1e-9)
         again = hj.find_limit_cycle(cycle.system, cycle)
-        np.testing.assert_allclose(again.start.q, cycle.start.q, rtol=1e-11)
+        np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
 
 def test_neimark_sacker_of_the_juggler(juggling):
@@ -108,14 +107,16 @@ def test_bad_input(juggling):
         follow(juggling, "A", (0.1, 0.2), step=0.0)
     with pytest.raises(hj.DefinitionError, match="outside of JAX transformations"):
         eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
-    with pytest.raises(hj.DefinitionError, match="turns must be a whole number, at least 1; got 0"):
-        hj.find_limit_cycle(juggling.system, turns=0)
+    with pytest.raises(
+        hj.DefinitionError, match="multiplicity must be a whole number, at least 1; got 0"
+    ):
+        hj.find_limit_cycle(juggling.system, multiplicity=0)
     with pytest.raises(hj.DefinitionError, match="closes after 1 turns, not 2"):
-        hj.find_limit_cycle(juggling.system, juggling, turns=2)
+        hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
 
 class Spring(eqx.Module):
-    k: jax.Array = hj.parameter(1.5)
+    k: hj.Parameter = hj.parameter(1.5)
 
 
 class Pushed(hj.HybridSystem):
@@ -145,7 +146,7 @@ def test_a_parameter_of_a_part():
     truth = np.exp(2 * np.pi * rate)
     truth = truth.real + 1j * np.abs(truth.imag)
     np.testing.assert_allclose(branch.multipliers[:, 0], truth, atol=1e-10)
-    x = [float(branch[k].start.q[0, 0]) for k in (0, -1)]
+    x = [float(branch[k].anchor.q[0, 0]) for k in (0, -1)]
     k = branch.values[[0, -1]]
     np.testing.assert_allclose(x, (k - 1) / ((k - 1) ** 2 + 0.04), rtol=1e-10)
 
@@ -196,15 +197,15 @@ def test_resonance_of_the_duffing_oscillator():
         return [*(end - z[:2]), np.linalg.det(monodromy - np.eye(2))]
 
     for point in branch.points:
-        q = np.asarray(branch[point.index].start.q[:, 0])
+        q = np.asarray(branch[point.index].anchor.q[:, 0])
         rough = np.round([*q, point.value], 2)
         np.testing.assert_allclose([*q, point.value], fsolve(fold, rough, xtol=1e-12), rtol=1e-8)
     # At 1.2 there are three responses, the middle one unstable.
     at = np.flatnonzero(branch.values == 1.2)
     assert list(branch.stable[at]) == [True, False, True]
     for k in at:
-        end, monodromy = _duffing_turn(np.asarray(branch[k].start.q[:, 0]), 1.2)
-        np.testing.assert_allclose(end, branch[k].start.q[:, 0], atol=1e-9)
+        end, monodromy = _duffing_turn(np.asarray(branch[k].anchor.q[:, 0]), 1.2)
+        np.testing.assert_allclose(end, branch[k].anchor.q[:, 0], atol=1e-9)
         mine, scipys = np.sort(branch[k].multipliers), np.sort(np.linalg.eigvals(monodromy))
         np.testing.assert_allclose(mine, scipys, atol=1e-9)
 
@@ -232,7 +233,7 @@ def test_period_doubling_of_the_buck_converter():
 def test_period_2_of_the_buck_converter():
     """It ends in the flip of the cycle of period 1, where the two halves change places."""
     buck = m.BuckConverter(Vin=25.0)
-    cycle = hj.find_limit_cycle(buck, hj.Guess("open", (12.04, 0.627, 3.8)), turns=2)
+    cycle = hj.find_limit_cycle(buck, hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2)
     np.testing.assert_allclose(cycle.period, 800e-6)
     np.testing.assert_allclose(
         [cycle.state["v"], cycle.state["i"]], [12.0384992252652, 0.626948841497016], rtol=1e-11
@@ -265,12 +266,12 @@ def test_period_doubling_of_the_long_gait():
     )  # fmt: skip
     # Two steps make one round of the gait beyond it.
     beyond = branch[-1]
-    th, phi, w, p = np.asarray(beyond.start.q[:, 0])
+    th, phi, w, p = np.asarray(beyond.anchor.q[:, 0])
     guess = hj.Guess("step", (1.02 * th, 2 * 1.02 * th, 1.02 * w, 1.02 * p))
     limping = hj.find_limit_cycle(
-        beyond.system, guess, section=hj.AtEvent("heelstrike"), turns=2, settle=400.0
+        beyond.system, guess, section=hj.AtEvent("heelstrike"), multiplicity=2, settle=400.0
     )
-    assert len(limping.order) == 2 and limping.stable
+    assert len(limping.event_sequence) == 2 and limping.stable
     assert abs(float(limping.period) - 2 * float(beyond.period)) > 1e-6
 
 
@@ -284,6 +285,6 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     np.testing.assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
     assert branch.ends[1].message == "the values end" and not branch.points
-    assert branch.values[-1] == 30.0 and float(branch[-1].start.t[0]) != 0.5
+    assert branch.values[-1] == 30.0 and float(branch[-1].anchor.t[0]) != 0.5
     again = hj.find_limit_cycle(branch[-1].system, branch[-1])
     np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)

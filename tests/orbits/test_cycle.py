@@ -26,7 +26,7 @@ def vanderpol(mu, guess=None, section=FALL, **options):
 
 
 def check_hopper(cycle, data):
-    np.testing.assert_allclose(cycle.start.q[:2, 0], data["state_clock_half"], atol=1e-10)
+    np.testing.assert_allclose(cycle.anchor.q[:2, 0], data["state_clock_half"], atol=1e-10)
     assert cycle.result == hj.Result.OK and cycle.stable
     assert cycle.period == 1.0 and cycle.residual < 1e-12
 
@@ -63,7 +63,7 @@ def test_the_hopper_after_settling(reference):
 
 def test_the_lossy_hopper(lossy_cycle):
     state = [1.87978886663710, 1.75832736962547]
-    np.testing.assert_allclose(lossy_cycle.start.q[:2, 0], state, atol=1e-10)
+    np.testing.assert_allclose(lossy_cycle.anchor.q[:2, 0], state, atol=1e-10)
     multiplier = -0.317897006349938 + 0.694628822735891j
     np.testing.assert_allclose(lossy_cycle.multipliers[0], multiplier, atol=1e-9)
     events = [e.time % 1 for e in lossy_cycle.trajectory().events]
@@ -72,7 +72,7 @@ def test_the_lossy_hopper(lossy_cycle):
 
 def test_the_two_legged_bar(bar_cycle):
     state = [0.400516754055274, -0.764126541534894, -0.00728487463290610, 0.399159213578728]
-    np.testing.assert_allclose(bar_cycle.start.q[:, 0], state, atol=1e-9)
+    np.testing.assert_allclose(bar_cycle.anchor.q[:, 0], state, atol=1e-9)
     first = -0.153520955429110 + 0.361043052961495j
     second = 0.151655665357578 + 0.227749294883360j
     truth = [first, np.conj(first), second, np.conj(second)]
@@ -91,10 +91,10 @@ def test_the_two_legged_bar(bar_cycle):
 def test_van_der_pol(mu):
     amplitude, period, multiplier = VANDERPOL[mu]
     cycle = vanderpol(mu)
-    np.testing.assert_allclose(cycle.start.q[:, 0], [amplitude, 0.0], atol=1e-9)
+    np.testing.assert_allclose(cycle.anchor.q[:, 0], [amplitude, 0.0], atol=1e-9)
     np.testing.assert_allclose(cycle.period, period, atol=1e-9)
     np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-7, atol=0)
-    assert not cycle.clocked and cycle.order == ()
+    assert not cycle.clocked and cycle.event_sequence == ()
 
 
 def test_van_der_pol_on_the_plane_through_a_guess_off_the_cycle():
@@ -109,7 +109,7 @@ def test_unstable_cycles(mu, guess):
     """In reversed time, mu -> -mu, the cycle is the same and its multiplier the reciprocal."""
     amplitude, period, multiplier = VANDERPOL[mu]
     cycle = vanderpol(-mu, (guess, 0.0))
-    np.testing.assert_allclose(cycle.start.q[0, 0], amplitude, atol=1e-9)
+    np.testing.assert_allclose(cycle.anchor.q[0, 0], amplitude, atol=1e-9)
     np.testing.assert_allclose(cycle.period, period, atol=1e-9)
     np.testing.assert_allclose(cycle.multipliers * multiplier, [1.0], rtol=1e-8)
     assert not cycle.stable
@@ -127,7 +127,7 @@ def test_a_conservative_system_has_a_family_of_cycles(amplitude):
         vanderpol(0.0, (amplitude, 0.0))
     cycle = vanderpol(0.0, (amplitude, 0.0), throw=False)
     assert cycle.result == hj.Result.SINGULAR
-    np.testing.assert_allclose(cycle.start.q[0, 0], amplitude, rtol=1e-8)
+    np.testing.assert_allclose(cycle.anchor.q[0, 0], amplitude, rtol=1e-8)
     np.testing.assert_allclose(cycle.period, 2 * np.pi, rtol=1e-9)
 
 
@@ -162,7 +162,7 @@ def test_scheduled_events():
     system = Switched(duty=0.3)
     cycle = hj.find_limit_cycle(system)
     grow = np.exp(0.5)  # from the middle of the stay in `off` to its end, backwards
-    np.testing.assert_allclose(cycle.start.q[0, 0], system.exact() * grow, rtol=1e-11)
+    np.testing.assert_allclose(cycle.anchor.q[0, 0], system.exact() * grow, rtol=1e-11)
     np.testing.assert_allclose(cycle.multipliers, [np.exp(-1.0)], atol=1e-11)
     # Sections at the very instants of the switches: the state after the switch, each just once.
     placed = hj.place_sections(cycle, hj.ClockPhase(10))
@@ -180,7 +180,7 @@ def test_derivatives_of_scheduled_events():
     cycle = hj.find_limit_cycle(system)
 
     def start(system):
-        return hj.find_limit_cycle(system, cycle).start.q[0, 0]
+        return hj.find_limit_cycle(system, cycle).anchor.q[0, 0]
 
     exact = jax.grad(lambda duty: Switched(duty=duty).exact())(0.3)
     np.testing.assert_allclose(eqx.filter_grad(start)(system).duty, exact * np.exp(0.5), rtol=1e-9)
@@ -215,4 +215,4 @@ def test_more_bad_arguments():
     with pytest.raises(hj.DefinitionError, match="clock's period must be positive"):
         hj.find_limit_cycle(hj.models.VerticalHopper(omega=-1.0))
     with pytest.raises(hj.DefinitionError, match="needs a LimitCycle as its guess"):
-        eqx.filter_jit(lambda h: hj.find_limit_cycle(h).start.q)(hj.models.VerticalHopper())
+        eqx.filter_jit(lambda h: hj.find_limit_cycle(h).anchor.q)(hj.models.VerticalHopper())

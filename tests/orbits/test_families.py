@@ -50,7 +50,7 @@ def test_the_family_along_a_parameter(running):
     (flip,) = branch.points
     assert flip.kind == "flip" and branch.stable[flip.index + 1 :].all()
     runner = running.system
-    energy = [runner.energy(0.0, jnp.asarray(branch[k].start.q[:3, 0]), 0.0) for k in (0, -1)]
+    energy = [runner.energy(0.0, jnp.asarray(branch[k].anchor.q[:3, 0]), 0.0) for k in (0, -1)]
     np.testing.assert_allclose(energy, 1784.8, rtol=1e-11)
 
 
@@ -58,7 +58,7 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
     def height(k, energy):
         runner = eqx.tree_at(lambda x: x.k, running.system, k)
         cycle = hj.find_limit_cycle(runner, running, conserved={"energy": energy})
-        return cycle.start.q[0, 0]
+        return cycle.anchor.q[0, 0]
 
     at = jnp.array(20000.0), jnp.array(1784.8)
     by_k, by_energy = (jax.jvp(height, at, tangent)[1] for tangent in ((1.0, 0.0), (0.0, 1.0)))

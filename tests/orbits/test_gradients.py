@@ -44,7 +44,7 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
 
     def multiplier(hopper):
         cycle = hj.find_limit_cycle(hopper, hopper_cycle)
-        monodromy = hj.linearize(cycle, hj.ClockPhase(8, start=APEX), outputs="yM").monodromy(5)
+        monodromy = hj.linearize(cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM").monodromy(5)
         trace = jnp.trace(monodromy)
         determinant = (trace**2 - jnp.trace(monodromy @ monodromy)) / 2
         return jnp.stack([trace / 2, jnp.sqrt(determinant - trace**2 / 4)])

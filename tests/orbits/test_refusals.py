@@ -1,4 +1,4 @@
-"""Cycles and sections that are not what they seem to be are refused, never used."""
+"""Cycles that are not what they seem to be are refused, never used."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,6 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import OUTPUTS
 from ..toys import Field
 
 
@@ -39,16 +38,6 @@ class Forced(hj.HybridSystem):
         return 1.0
 
 
-def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
-    for use in (
-        lambda: hj.linearize(lossy_cycle, placed_isochrons),
-        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
-        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
-    ):
-        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
-            use()
-
-
 def test_a_search_that_begins_at_an_event():
     with pytest.raises(hj.ComputationError, match="begins exactly at the event 'kick'"):
         hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.6,), 0.25))
@@ -64,16 +53,9 @@ def test_a_period_that_the_field_does_not_have():
         hj.find_limit_cycle(Forced(), hj.Guess("a", (0.0,)))
 
 
-def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
-    period = float(vanderpol_cycle.period)
-    moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
-    with pytest.raises(hj.ComputationError, match="depends on time"):
-        hj.place_sections(vanderpol_cycle, [moving])
-
-
 def test_events_before_the_search_do_not_count(hopper_cycle):
     settled = hj.find_limit_cycle(
         hj.models.VerticalHopper(), hj.Guess("stance", (2.0, 1.9), 0.5), settle=20.0
     )
-    assert int(settled.start.events[0]) == 0
-    np.testing.assert_allclose(settled.start.q, hopper_cycle.start.q, atol=1e-11)
+    assert int(settled.anchor.events[0]) == 0
+    np.testing.assert_allclose(settled.anchor.q, hopper_cycle.anchor.q, atol=1e-11)

@@ -28,8 +28,8 @@ def test_each_is_the_cycle_that_is_found_alone(found):
     for i in range(4):
         cycle = found[i]
         alone = hj.find_limit_cycle(cycle.system, cycle)
-        assert cycle.order == alone.order
-        np.testing.assert_allclose(cycle.start.q, alone.start.q, atol=1e-9)
+        assert cycle.event_sequence == alone.event_sequence
+        np.testing.assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
         np.testing.assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
         np.testing.assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
@@ -37,7 +37,7 @@ def test_each_is_the_cycle_that_is_found_alone(found):
 
 
 def test_charts_may_differ(found):
-    assert len(np.unique(found.start.chart[:4])) == 2
+    assert len(np.unique(found.anchor.chart[:4])) == 2
 
 
 def test_failures_are_reported_by_index(found):
@@ -49,7 +49,7 @@ def test_failures_are_reported_by_index(found):
 def test_a_list_of_systems_is_the_same(found, hopper_cycle):
     systems = [found[i].system for i in range(5)]
     again = hj.find_limit_cycles(systems, hopper_cycle)
-    np.testing.assert_array_equal(again.start.q, found.start.q)
+    np.testing.assert_array_equal(again.anchor.q, found.anchor.q)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_without_a_clock_and_in_waves(wheel):
     assert found.ok.all() and np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
     np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
-    assert {found[i].order for i in range(11)} == {(0,)}
+    assert {found[i].event_sequence for i in range(11)} == {(0,)}
 
 
 def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
@@ -74,12 +74,12 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
     steps = []
     first_step = batches.Tiles._first_step
 
-    def watched(self, rows, start, period, jacobian):
-        end, after = first_step(self, rows, start, period, jacobian)
-        steps.append((rows, start.q[..., 0], end.q[..., 0]))
+    def watched(self, rows, anchor, period, jacobian):
+        end, after = first_step(self, rows, anchor, period, jacobian)
+        steps.append((rows, anchor.q[..., 0], end.q[..., 0]))
         for guess in (1e-6 * jacobian, np.full_like(jacobian, np.nan)):
             np.testing.assert_array_equal(
-                first_step(self, rows, start, period, guess)[0].q, start.q
+                first_step(self, rows, anchor, period, guess)[0].q, anchor.q
             )
         return end, after
 
@@ -87,7 +87,7 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
     slopes = np.linspace(0.08, 0.1, 11)
     found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
     rows, before, after = map(np.concatenate, zip(*steps, strict=True))
-    error = [np.abs(q - found.start.q[rows, :, 0]).max(axis=1) for q in (before, after)]
+    error = [np.abs(q - found.anchor.q[rows, :, 0]).max(axis=1) for q in (before, after)]
     assert len(rows) == 7 and np.all(error[1] < 0.3 * error[0])
     assert found.ok.all() and found.iterations[rows].max() <= 3
 
@@ -104,17 +104,17 @@ def test_systems_that_are_alike_or_undefined(wheel):
 def test_programs_in_threads_factorise_nothing(wheel):
     """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
-    start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.start, wheel.period))
+    start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.anchor, wheel.period))
     start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
     for programs in (batches.QUICK, batches.FULL):
-        arguments = systems, wheel, start, period, wheel.settings, jnp.array(True)
+        arguments = systems, wheel.return_map, start, period, jnp.array(True)
         lowered = programs.turn.lower(*arguments)
         assert "lapack" not in lowered.as_text()
 
 
 def test_a_guess_with_too_long_a_period(wheel):
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
-    assert cycle.order == (0,) and cycle.period < 0.7 * wheel.period
+    assert cycle.event_sequence == (0,) and cycle.period < 0.7 * wheel.period
     np.testing.assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)
 
 

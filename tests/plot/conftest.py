@@ -14,7 +14,7 @@ def figures_are_closed():
 
 @pytest.fixture(scope="session")
 def estimate(hopper):
-    design = hj.multisine(periods=16, f_max=4.0)
+    design = hj.multisine(periods=16, band=(0, 4.0))
     return hj.estimate_htf(
         hj.experiments.simulate_experiments(hopper, design, start="periodic"), (-1, 0, 1)
     )

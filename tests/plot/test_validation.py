@@ -38,7 +38,7 @@ def test_amplitude_marks_the_limit():
 
 
 def test_regions_are_drawn_around_estimates(hopper):
-    true = hopper.multipliers()
+    true = hopper.multipliers
     c = np.poly(true).real[1:]
     estimate = hj.identify.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
     ax = hj.plot.multipliers(hopper, {"fit": estimate}).ax

@@ -17,7 +17,7 @@ def hopper_recording(hopper_cycle):
 
 @pytest.fixture(scope="session")
 def angle():
-    return hj.recordings.AnglePhase("yM", "vM", center=(1.9, 0.0), scale=(0.3, 1.9))
+    return hj.KinematicPhase(16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9))
 
 
 @pytest.fixture

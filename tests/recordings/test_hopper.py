@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.testing.dirt import spoil
+
+
+def spoil(recording, signals=("yM", "vM"), **dirt):
+    return hj.testing.spoil(recording, signals, hj.testing.Dirt(**dirt))
 
 
 def test_five_lines(hopper_recording, hopper_cycle, angle):
@@ -21,9 +24,9 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
 
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
     """At the sections of an angle of the two outputs, these are one number."""
-    noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
+    noisy = spoil(hopper_recording, noise=1e-4)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
-    apex = hj.recordings.CrossingPhase("vM", "falling")
+    apex = hj.Crossing("vM", "falling")
     data = [hj.recordings.section_data(noisy, phase, **options) for phase in (angle, apex)]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
@@ -32,9 +35,7 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
 
 
 def test_dirt(hopper_recording, hopper_cycle, angle):
-    dirty = spoil(
-        hopper_recording, ("yM", "vM"), noise=1e-4, quantum=1e-5, missing=0.01, gap=(80.3, 90.7)
-    )
+    dirty = spoil(hopper_recording, noise=1e-4, quantum=1e-5, missing=0.01, gap=(80.3, 90.7))
     data = hj.recordings.section_data(dirty, angle, inputs="u", outputs=("yM", "vM"), n_sections=16)
     fit = hj.fit_series(data.records, order=2)
     assert len(data.records) == 2
@@ -45,7 +46,7 @@ def test_dirt(hopper_recording, hopper_cycle, angle):
 def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
     """Everything goes slower and slower: multipliers stay what they are, and phase says by how
     much."""
-    slower = spoil(hopper_recording, ("yM", "vM"), noise=1e-4, stretch=0.05)
+    slower = spoil(hopper_recording, noise=1e-4, stretch=0.05)
     phase = hj.recordings.estimate_phase(slower, angle)
     assert phase.drift * phase.cycles == pytest.approx(0.05, rel=0.1)
     data = hj.recordings.section_data(
@@ -68,11 +69,11 @@ def test_van_der_pol_without_a_clock():
     noisy = spoil(made, ("x", "v"), noise=1e-4)
     data = hj.recordings.section_data(
         noisy,
-        hj.recordings.AnglePhase("x", "v"),
+        hj.KinematicPhase(8, position="x", velocity="v"),
         inputs="u",
         outputs=("x", "v"),
         n_sections=8,
-        time="duration",
+        timing="duration",
     )
     fit = hj.fit_series(data.records, order=1)
     assert fit.compare(cycle.multipliers[:1]).max_error < 5e-3
@@ -90,14 +91,14 @@ def test_compass_gait_by_events():
     ]
     made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
     noisy = spoil(made, outputs, noise=1e-4)
-    marked = noisy.mark("middle", "s", direction="falling", bandwidth=20 / period)
+    marked = noisy.mark("middle", hj.Crossing("s", "falling"), bandwidth=20 / period)
     data = hj.recordings.section_data(
         marked,
-        hj.recordings.EventPhase("middle"),
+        hj.AtEvent("middle"),
         inputs="u",
         outputs=outputs,
         n_sections=16,
-        time="duration",
+        timing="duration",
     )
     fit = hj.fit_series(data.records, order=2, overhang=32)
     assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2
@@ -113,7 +114,7 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
     found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
     sections = hj.KinematicPhase(
         16, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9),
-        start=hj.Crossing("vM", "falling"),
+        anchor=hj.Crossing("vM", "falling"),
     )  # fmt: skip
     exact = hj.linearize(hopper_cycle, sections, ("yM", "vM")).impulse_response(64)
     reach, step = 4, found.period / 16
@@ -128,7 +129,7 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
 
 
 def test_order_and_advice(hopper_recording, angle):
-    noisy = spoil(hopper_recording, ("yM", "vM"), noise=1e-3)
+    noisy = spoil(hopper_recording, noise=1e-3)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
     data = hj.recordings.section_data(noisy, angle, **options)
     fit = hj.fit_series(data.records, order=2)

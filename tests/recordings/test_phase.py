@@ -1,5 +1,7 @@
 """Phase from angles and events, and splines, against closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -9,7 +11,7 @@ import hybridjax as hj
 from hybridjax.recordings.smoothing import means, spline
 
 
-CIRCLE = hj.recordings.AnglePhase("x", "v")
+CIRCLE = hj.KinematicPhase(8, position="x", velocity="v")
 
 
 def whole(phase, winding=0):
@@ -44,11 +46,43 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
         assert (np.diff(phase.stretches[0][k].phase) > 0).all()
 
 
-def test_a_function_and_a_start(wave):
+def test_a_function_and_an_anchor(wave):
     other = hj.recordings.estimate_phase(wave, lambda t, signals: 2 * np.pi * t + 1.0)
     np.testing.assert_allclose(np.diff(whole(other)), 1.0, atol=1e-9)
-    late = hj.recordings.estimate_phase(wave, hj.recordings.AnglePhase("x", "v", start=-np.pi / 2))
+    late = hj.recordings.estimate_phase(wave, dataclasses.replace(CIRCLE, anchor=-np.pi / 2))
     np.testing.assert_allclose(whole(late) % 1, 0.25, atol=2e-4)
+
+
+def test_a_crossing_as_the_anchor(wave):
+    """Section 0 lies at the angle at which the signal crosses the level."""
+    for crossing, clock in [
+        (hj.Crossing("v", "rising"), 0.5),
+        (hj.Crossing("x", "falling"), 0.25),
+        (hj.Crossing("x", "rising", value=0.5), 5 / 6),
+    ]:
+        definition = dataclasses.replace(CIRCLE, anchor=crossing)
+        phase = hj.recordings.estimate_phase(wave, definition)
+        np.testing.assert_allclose(whole(phase)[1:-1] % 1, clock, atol=1e-3)
+    thrice = hj.Crossing("w", "falling")
+    t, (_, x, v) = wave.trials[0].time, wave.trials[0].values.T
+    recording = hj.Recording(t, {"x": x, "v": v, "w": np.cos(6 * np.pi * t)})
+    with pytest.raises(hj.DefinitionError, match="w falling, .* all around the cycle"):
+        hj.recordings.estimate_phase(recording, dataclasses.replace(CIRCLE, anchor=thrice))
+
+
+def test_the_bandwidth_of_a_phase(wave):
+    estimate = hj.recordings.estimate_phase
+    np.testing.assert_allclose(
+        whole(estimate(wave, CIRCLE, bandwidth=32.0)), whole(estimate(wave, CIRCLE)), atol=1e-6
+    )
+    top = hj.Crossing("v", "falling")
+    np.testing.assert_allclose(
+        whole(estimate(wave, top, bandwidth=16.0)), whole(estimate(wave, top)), atol=1e-6
+    )
+    with pytest.raises(hj.DefinitionError, match="from the past only is not smoothed"):
+        estimate(wave, CIRCLE, bandwidth=8.0, causal=True)
+    with pytest.raises(hj.DefinitionError, match="not smoothed: no `bandwidth`"):
+        estimate(wave, hj.AtEvent("strike"), bandwidth=8.0)
 
 
 def test_in_real_time(wave):
@@ -73,9 +107,7 @@ def test_events_missed_and_doubled(wave, causal):
     recording = hj.Recording(
         wave.trials[0].time, {"x": wave.trials[0].values[:, 0]}, events={"strike": events}
     )
-    phase = hj.recordings.estimate_phase(
-        recording, hj.recordings.EventPhase("strike"), causal=causal
-    )
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"), causal=causal)
     assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
     assert phase.lead == (0 if causal else 1)
     w = phase.stretches[0][0]
@@ -93,7 +125,7 @@ def test_irregular_events(seed, jitter, causal):
     missed, doubled = 10 + rng.permutation(20)[0], 40 + rng.permutation(10)[0]
     events = np.sort(np.append(np.delete(t, missed), t[doubled] + 0.1))
     recording = hj.Recording(np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events})
-    phase = hj.recordings.estimate_phase(recording, hj.recordings.EventPhase("e"), causal=causal)
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("e"), causal=causal)
     assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
     assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
     for w in phase.stretches[0]:
@@ -107,10 +139,10 @@ def test_irregular_events(seed, jitter, causal):
 
 
 def test_marked_events(wave):
-    found = wave.mark("up", "v", direction="rising").trials[0].events["up"]
+    found = wave.mark("up", hj.Crossing("v", "rising")).trials[0].events["up"]
     np.testing.assert_allclose(found, np.arange(20) + 0.5, atol=1e-7)
     with pytest.raises(hj.DefinitionError, match="v never crosses 3, rising"):
-        wave.mark("up", "v", level=3.0)
+        wave.mark("up", hj.Crossing("v", "rising", value=3.0))
 
 
 def test_what_is_no_phase(wave):
@@ -118,18 +150,22 @@ def test_what_is_no_phase(wave):
     still = hj.Recording(t, {"x": np.cos(t) + 5, "v": np.sin(t) + 5, "c": 0 * t})
     for definition, message in [
         (
-            hj.recordings.AnglePhase("x", "v", center=(0, 0), scale=(1, 1)),
+            dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)),
             "the phase does not wind",
         ),
-        (hj.recordings.AnglePhase("x", "c"), "needs a c that varies"),
-        (hj.recordings.AnglePhase("x", "q"), "no signal 'q'"),
-        (hj.recordings.EventPhase("strike"), "no event 'strike'; its events are: none"),
-        (hj.recordings.CrossingPhase("x", "falling", 3.0), "x never crosses 3, falling"),
+        (dataclasses.replace(CIRCLE, velocity="c"), "needs a c that varies"),
+        (dataclasses.replace(CIRCLE, velocity="q"), "no signal 'q'"),
+        (hj.AtEvent("strike"), "no event 'strike'; its events are: none"),
+        (hj.Crossing("x", "falling", value=3.0), "x never crosses 3, falling"),
+        (hj.Crossing(lambda t, q: q[0], "falling"), "names a signal, and no charts"),
+        (hj.Crossing("x", "falling", charts=("a",)), "names a signal, and no charts"),
         (lambda t, s: t[1:], "returned the shape"),
         (lambda t, s: 0 * t, "the phase does not wind"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             hj.recordings.estimate_phase(still, definition)
+    with pytest.raises((hj.DefinitionError, TypeError), match="not by a ClockPhase|'definition'"):
+        hj.recordings.estimate_phase(still, hj.ClockPhase(8))
     one = hj.Recording(
         t[:180], {"x": np.cos(2 * np.pi * t[:180]), "v": np.sin(2 * np.pi * t[:180])}
     )

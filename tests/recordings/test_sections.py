@@ -8,16 +8,15 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
-from hybridjax.testing.dirt import spoil
 
 from .conftest import MULTIPLIER
 
 
-CIRCLE = hj.recordings.AnglePhase("x", "v", center=(0, 0), scale=(1, 1))
+CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(1, 1))
 
 
 def sample(recording, phase=CIRCLE, **options):
-    options = {"inputs": "f", "outputs": ("x", "v"), "n_sections": 8} | options
+    options = {"inputs": "f", "outputs": ("x", "v")} | options
     return hj.recordings.section_data(recording, phase, **options)
 
 
@@ -30,7 +29,7 @@ def test_a_circle(wave):
     np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
-        (record.u + data.cycle_inputs[(record.start + np.arange(len(times))) % 8])[:-1, 0],
+        (record.u + data.cycle_inputs[(record.first_section + np.arange(len(times))) % 8])[:-1, 0],
         np.diff(area) / 3 / np.diff(times), atol=2e-3,
     )  # fmt: skip
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
@@ -70,15 +69,25 @@ def test_slow_drift_is_taken_out(wave):
 
 
 def test_times_of_crossings(wave):
-    data = sample(wave, time="clock")
+    data = sample(wave, timing="clock")
     assert data.outputs == ("x", "v", "time") and data.rms()[1][2] < 1e-4
-    assert sample(wave, time="duration").outputs[2] == "duration"
+    assert sample(wave, timing="duration").outputs[2] == "duration"
+
+
+def test_the_number_of_sections(wave):
+    """Of the family, or of the call; it need not be said twice, but may."""
+    phase = hj.recordings.estimate_phase(wave, CIRCLE)
+    assert sample(wave, phase).n_sections == sample(wave, phase, n_sections=8).n_sections == 8
+    top = hj.Crossing("v", "falling")
+    assert sample(wave, top).n_sections == 32
+    assert sample(wave, top, n_sections=4).n_sections == 4
 
 
 def test_bad_arguments(wave):
     for options, message in [
         ({"inputs": "g"}, "no signal 'g'"),
-        ({"n_sections": 0}, "one section or more"),
+        ({"n_sections": 16}, "n_sections is 16, but the phase is that of a family of 8"),
+        ({"n_sections": 0, "phase": lambda t, s: 2 * np.pi * t}, "one section or more"),
         ({"drift": 1}, "more than four cycles"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
@@ -86,7 +95,7 @@ def test_bad_arguments(wave):
 
 
 def test_designs_as_tables(tmp_path, wave):
-    design = hj.multisine(n_sections=8, periods=16, f_max=2.0)
+    design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
     table = hj.recordings.read_design(tmp_path / "phase.csv")
     np.testing.assert_allclose(table["u"], design.inputs(19)[:, :, 0], atol=1e-9)
@@ -100,9 +109,9 @@ def test_designs_as_tables(tmp_path, wave):
     told = hj.recordings.add_command(wave, phase, {"u": table["u"][:1]}, 8)
     data = sample(told, phase, inputs="u", sampled="middle")
     u = data.records[0].u[:, 0] + data.cycle_inputs[:, 0][
-        (data.records[0].start + np.arange(len(data.records[0].u))) % 8
+        (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
     ]  # fmt: skip
-    first = -data.records[0].start % 8
+    first = -data.records[0].first_section % 8
     np.testing.assert_allclose(u[first : first + 150], table["u"][0, :150], atol=1e-9)
     with pytest.raises(hj.DefinitionError, match="1 trials, but the table has"):
         hj.recordings.add_command(wave, phase, table, 8)
@@ -113,7 +122,7 @@ def test_designs_as_tables(tmp_path, wave):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
-    dirty = spoil(rhythm, ("x", "v"), noise=1e-3)
+    dirty = hj.testing.spoil(rhythm, ("x", "v"), hj.testing.Dirt(noise=1e-3))
     (trial,) = dirty.trials
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
@@ -160,7 +169,7 @@ def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsy
     options = ["--input", "force", "--outputs", "x,v", "--crossing", text, "--out", str(tmp_path)]
     with pytest.raises(SystemExit):
         main(["identify", str(files / "trial0.csv"), *options])
-    assert "is not a signal, a direction and a level" in capsys.readouterr().err
+    assert "is not a signal, a direction and a value" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

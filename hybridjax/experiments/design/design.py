@@ -146,8 +146,8 @@ class Design(eqx.Module):
         self._refuse(
             (meets_itself(self.line, P, N, highest) & (alike > 1 - 1e-6)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
-            "experiments with phases 90 degrees apart (half_integers='two-phase' does so), or "
-            "leave it out (half_integers='skip')",
+            "experiments with phases 90 degrees apart (multisine(lines='two-phase') does so), or "
+            "leave it out",
         )
         self._refuse(
             is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < 1e-3),
@@ -166,7 +166,8 @@ class Design(eqx.Module):
         self._refuse(
             ~regular(gram)[place] & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
             "excites several inputs together, and its experiments cannot tell them apart: excite "
-            "it in as many experiments as inputs, with turned phases (excite='orthogonal')",
+            "it in as many experiments as inputs, with turned phases "
+            "(multisine(division='orthogonal'))",
         )
 
     def _refuse(self, wrong: np.ndarray, reason: str) -> None:

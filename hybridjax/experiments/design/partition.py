@@ -202,7 +202,7 @@ def avoid_second_order(
         raise DefinitionError(
             f"no division into {len(members)} experiments was found in which second-order products "
             f"miss the lines of their own experiment ({sum(hits)} still hit): take more "
-            "experiments, or second_order='ignore'."
+            "experiments, or division='random'."
         )
     out = np.empty_like(experiment)
     for e, m in enumerate(members):

@@ -1,7 +1,7 @@
 """How much of the output a linear periodic system explains."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
@@ -10,9 +10,10 @@ from jaxtyping import Float
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
-from .line_solve import solve
-from .line_sums import Query, sums_of
+from ...linear.frequency_response import Harmonics
+from .least_squares import solve_lines
 from .nonparametric import choose_harmonics
+from .spectral_sums import SumOptions, spectral_sums
 
 
 class Coherence(eqx.Module):
@@ -35,7 +36,7 @@ class Coherence(eqx.Module):
 
 def estimate_coherence(
     data: ExperimentData | Iterable[ExperimentData],
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     repeats: int = 1,
     highest: int | None = None,
@@ -54,17 +55,17 @@ def estimate_coherence(
     """
     require_x64()
     choose = functools.partial(choose_harmonics, harmonics, highest)
-    sums = sums_of(data, Query(choose, threshold, highest, repeats))
+    sums = spectral_sums(data, SumOptions(choose, threshold, highest, repeats))
     rows = np.flatnonzero(sums.solvable(sums.ran))
-    solution = solve(sums, rows)
-    seen = solution.realizations > 0
+    found = solve_lines(sums, rows)
+    seen = found.realizations > 0
     if not seen.any():
         raise DefinitionError(
             "no line was measured in several realizations, without which everything is explained: "
             "apply more of them (`Design.realizations`)."
         )
     power = sums.energy[rows][seen].transpose(1, 0, 2)
-    values = solution.coherence[:, seen]
+    values = found.coherence[:, seen]
     total = np.sum(values * power, axis=(0, 1)) / np.sum(power, axis=(0, 1))
-    f = sums.line[rows][seen] / sums.about.periods
-    return Coherence(f, values, total, sums.harmonics, sums.about.outputs)
+    f = sums.line[rows][seen] / sums.setup.periods
+    return Coherence(f, values, total, sums.harmonics, sums.setup.outputs)

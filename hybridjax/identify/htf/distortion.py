@@ -9,6 +9,11 @@ from ...experiments.data import ExperimentData
 from ...experiments.design.partition import line_class
 
 
+# Part of the largest line of an input below which a line is not excited. Doubled: none but
+# rounding.
+_SILENT_LINE = 1e-6
+
+
 class OutputLevels(eqx.Module):
     """Rms of one line of the output spectrum, by the kind of line; NaN where there is none.
 
@@ -54,7 +59,7 @@ def output_levels(data: ExperimentData, repeats: int = 1) -> OutputLevels:
     windows = data.windows(repeats)
     u, y = data.u[data.ok], data.y[data.ok]
     size = np.abs(np.fft.rfft(u[:, windows[-1]], axis=1)).max(axis=2)
-    experiment, line = np.nonzero(size > 1e-6 * size.max(axis=1, keepdims=True))
+    experiment, line = np.nonzero(size > _SILENT_LINE * size.max(axis=1, keepdims=True))
     if (line % 2 == 0).any():
         raise DefinitionError(
             f"f = {line[line % 2 == 0][0] / P:.10g} is an even line (j = f P), which hides even "

@@ -4,15 +4,17 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData, simulate_experiments
+from ...experiments.data import ExperimentData
 from ...experiments.design.design import Design
+from ...experiments.linear_model import simulate_experiments
+from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .nonparametric import estimate_htf
 
 
 def predict_leakage(
-    design: Design, model: LDTP | HTF, harmonics: tuple[int, ...] | None = None
+    design: Design, model: LDTP | HTF, harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M ny"]:
     """The error of every harmonic that comes from those which the design takes as zero.
 

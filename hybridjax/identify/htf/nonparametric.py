@@ -1,7 +1,7 @@
 """Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -10,15 +10,15 @@ from jaxtyping import Float
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
-from ...linear.frequency_response import check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
-from .line_solve import solve
-from .line_sums import Query, sums_of
+from .least_squares import solve_lines
+from .spectral_sums import SumOptions, spectral_sums
 
 
 def estimate_htf(
     data: ExperimentData | Iterable[ExperimentData],
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     repeats: int = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
@@ -79,39 +79,39 @@ def estimate_htf(
         raise DefinitionError(f"highest is a harmonic, 0 or more, not {highest}.")
     require_x64()
     choose = functools.partial(choose_harmonics, harmonics, highest)
-    sums = sums_of(data, Query(choose, threshold, highest, repeats))
+    sums = spectral_sums(data, SumOptions(choose, threshold, highest, repeats))
     unsolved = sums.one_phase(sums.tried)
     if unsolved.any() and half_integers == "error":
-        f = sums.line[unsolved][0] / sums.about.periods
+        f = sums.line[unsolved][0] / sums.setup.periods
         raise DefinitionError(
             f"f = {f:.10g} lies on a multiple of 1/2 and was measured with one phase only: "
             "measure it in a second experiment with a phase 90 degrees apart "
-            "(half_integers='two-phase' in the design does so), or leave it out here with "
+            "(multisine(lines='two-phase') does so), or leave it out here with "
             "half_integers='skip' and use HTF.interpolate."
         )
     rows = np.flatnonzero(sums.solvable(sums.ran))
     if len(rows) == 0:
         raise DefinitionError(
             f"no frequency is left to estimate: {sums.summary}; a frequency must have been "
-            f"measured from each of the {len(sums.about.inputs)} inputs."
+            f"measured from each of the {len(sums.setup.inputs)} inputs."
         )
-    solution = solve(sums, rows)
+    found = solve_lines(sums, rows)
     if variance == "noise":
-        solution = solution.of_noise()
+        found = found.of_noise()
     elif variance == "total":
-        solution.require_total(sums.line[rows] / sums.about.periods)
-    about = sums.about
+        found.require_total(sums.line[rows] / sums.setup.periods)
+    setup = sums.setup
     return HTF(
-        sums.line[rows] / about.periods,
-        solution.H,
+        sums.line[rows] / setup.periods,
+        found.H,
         sums.harmonics,
-        about.n_sections,
-        about.inputs,
-        about.outputs,
+        setup.n_sections,
+        setup.inputs,
+        setup.outputs,
         "estimate",
-        variance=solution.variance,
-        noise_variance=solution.noise_variance,
-        freedom=solution.freedom,
+        variance=found.variance,
+        noise_variance=found.noise_variance,
+        variance_freedom=found.variance_freedom,
     )
 
 
@@ -126,12 +126,12 @@ def missing_frequencies(
     Because their experiments failed, or not all inputs were applied at them, or because they lie
     on a multiple of 1/2 and one phase is all there is. `highest` as for `estimate_htf`.
     """
-    sums = sums_of(data, Query(lambda n_sections: (), threshold, highest))
-    return sums.line[~sums.solvable(sums.ran)] / sums.about.periods
+    sums = spectral_sums(data, SumOptions(lambda n_sections: (), threshold, highest))
+    return sums.line[~sums.solvable(sums.ran)] / sums.setup.periods
 
 
 def choose_harmonics(
-    harmonics: int | Sequence[int] | None, highest: int | None, n_sections: int
+    harmonics: Harmonics | None, highest: int | None, n_sections: int
 ) -> tuple[int, ...]:
     """The harmonics to estimate: those asked for, or all up to `highest`."""
     if highest is None:

@@ -8,17 +8,32 @@ multipliers is gone). So all amplitudes are linear unknowns that can be projecte
 multipliers alone are left to be found (variable projection: Golub and Pereyra 1973).
 """
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData
+from ...experiments.data import ExperimentData, Simulated
 from ...experiments.design.partition import line_class
 
 
-_MOST = 4  # the largest order that is tried
+# The largest number of multipliers that is tried. Doubled: longer, and records must have 8 more
+# cycles to be told from everything that repeats.
+_LARGEST_ORDER = 4
+# Change of the input after P periods, relative to its largest value, that is rounding. Doubled:
+# none but rounding.
+_REPEATS = 1e-6
+# Part of the largest line of an input below which a line is not excited. Doubled: none but
+# rounding.
+_SILENT_LINE = 1e-6
+# Imaginary part that rounding leaves of coefficients. Doubled: none but rounding.
+_REAL = 1e-9
+# Scale of steps for coefficients that start near zero. Doubled: their first steps are twice as
+# long.
+_SMALLEST_SCALE = 0.1
 
 
 class TransientFit(eqx.Module):
@@ -93,7 +108,7 @@ def remove_transient(
     scaled = data.y / np.where(size > 0, size, 1.0)
     y = scaled.reshape(S, -1, N * ny)[:, skip:]
     good = np.flatnonzero(data.ok).tolist()
-    everything = cycles - P >= 2 * (order or _MOST)
+    everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     free = [_free(data, s, cycles, everything) for s in ([good[0]] if everything else good)]
     free = free * len(good) if everything else free
     left = [Q @ y[s] for Q, s in zip(free, good, strict=True)]
@@ -105,7 +120,7 @@ def remove_transient(
             "(`multisine(lines='odd')`)."
         )
     if known is None:
-        tried = range(1, min(_MOST, least - 1) + 1) if order is None else [order]
+        tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
         blocks = _compressed(free, left, everything)
         count = sum(z.size for z in left)
         fits = [_fit(blocks, _start(y[good], free, d), count, N * ny * len(good)) for d in tried]
@@ -121,9 +136,9 @@ def remove_transient(
     roots = np.roots(np.r_[1.0, known])
     roots = roots[np.lexsort((-roots.imag, -np.abs(roots)))].astype(complex)
     failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
-    data = eqx.tree_at(
-        lambda d: (d.u, d.y, d.failed_at), data, (data.u[:, skip * N :], clean, failed_at)
-    )
+    # Events, some of which lie in the cycles that were cut off, are left out.
+    simulated = None if data.simulated is None else Simulated(failed_at, data.error)
+    data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
     return TransientFit(data, roots, removed)
 
 
@@ -132,7 +147,7 @@ def _require_periodic(data: ExperimentData) -> None:
     u = data.u[data.ok]
     change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
     worst = int(np.argmax(change))
-    if change[worst] > 1e-6 * np.abs(u[worst]).max():
+    if change[worst] > _REPEATS * np.abs(u[worst]).max():
         raise DefinitionError(
             f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
             f"{data.periods} periods over all of the record, so that response and transient cannot "
@@ -142,7 +157,7 @@ def _require_periodic(data: ExperimentData) -> None:
 
 def _polynomial(multipliers) -> Float[np.ndarray, " d"]:
     c = np.poly(np.asarray(multipliers))[1:]
-    if np.abs(np.imag(c)).max(initial=0) > 1e-9 or len(c) == 0:
+    if np.abs(np.imag(c)).max(initial=0) > _REAL or len(c) == 0:
         raise DefinitionError(f"multipliers must be real or in conjugate pairs: {multipliers}.")
     return np.real(c)
 
@@ -154,7 +169,7 @@ def _free(data: ExperimentData, s: int, cycles: int, everything: bool):
         classes = np.arange(P // 2 + 1)
     else:
         size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
-        classes = line_class(np.flatnonzero(size > 1e-6 * size.max()), P)
+        classes = line_class(np.flatnonzero(size > _SILENT_LINE * size.max()), P)
         classes = np.unique(np.r_[0, classes])
     angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
     inner = (classes > 0) & (2 * classes < P)
@@ -210,7 +225,7 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
             out.append((z - q @ (q.T @ z)).ravel())
         return np.concatenate(out)
 
-    found = least_squares(residual, start, x_scale=np.maximum(np.abs(start), 0.1))
+    found = least_squares(residual, start, x_scale=np.maximum(np.abs(start), _SMALLEST_SCALE))
     parameters = len(start) * (series + 1)
     mean = max(2 * found.cost, 1e-300) / count
     return count * np.log(mean) + parameters * np.log(count), found.x

@@ -6,9 +6,9 @@ from jaxtyping import Complex, Float
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from .estimate import MultiplierEstimate
-from .projection import evaluate, groups_of
-from .weights import check_freedom, check_values, weights_of
+from .error_weights import check_values, error_weights, require_frequencies
+from .multiplier_estimate import MultiplierEstimate
+from .variable_projection import group_htf, misfit_of
 
 
 class MultiplierBound(MultiplierEstimate):
@@ -59,13 +59,13 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: int | None = None) -> Mult
         htf.f, exact.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
         variance=htf.variance,
     )  # fmt: skip
-    multipliers = model.multipliers()
+    multipliers = model.multipliers
     d, N = len(multipliers), model.n_sections
-    unknowns = d * N + (N if overhang is None else overhang) + 1
-    check_freedom(exact, d, unknowns)
+    size = d * N + (N if overhang is None else overhang) + 1
+    require_frequencies(exact, d, size)
     c = np.poly(multipliers).real[1:]
     information = np.zeros((d, d))
-    for group in groups_of(exact, weights_of(exact, check_values(exact)), unknowns):
-        jacobian = evaluate(group, c).jacobian.reshape(d, -1)
+    for group in group_htf(exact, error_weights(exact, check_values(exact)), size):
+        jacobian = misfit_of(group, c).jacobian.reshape(d, -1)
         information += jacobian @ jacobian.T
     return MultiplierBound(multipliers, c, np.linalg.inv(information))

@@ -4,13 +4,11 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 from scipy.optimize import linear_sum_assignment
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
-
-
-Multipliers = np.ndarray | Array | Sequence[complex | float]
 
 
 class MultiplierComparison(eqx.Module):
@@ -19,15 +17,19 @@ class MultiplierComparison(eqx.Module):
     The pairing is the one with the smallest sum of distances; if the numbers of multipliers
     differ, those left over are not listed. Printing it shows a table.
 
-    **Fields**, sorted by decreasing modulus of the true multiplier: `true`, `estimated` and
-    `error`, the distance `|estimated - true|`. `max_error`: the largest.
+    **Fields**, sorted by decreasing modulus of the true multiplier, where a fit has multipliers of
+    its own for each output after these:
+
+    - `true` and `estimated` (k,); `error` (k,), their distance, and `max_error`, the largest.
+    - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
     """
 
-    true: Complex[np.ndarray, " d"]
-    estimated: Complex[np.ndarray, " d"]
+    true: Complex[np.ndarray, " k"]
+    estimated: Complex[np.ndarray, " k"]
+    outputs: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
-    def error(self) -> Float[np.ndarray, " d"]:
+    def error(self) -> Float[np.ndarray, " k"]:
         return np.abs(self.estimated - self.true)
 
     @property
@@ -35,9 +37,13 @@ class MultiplierComparison(eqx.Module):
         return float(np.max(self.error))
 
     def __repr__(self) -> str:
-        rows = [f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
-        for true, estimated, error in zip(self.true, self.estimated, self.error, strict=True):
-            rows.append(f"{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
+        width = max(map(len, self.outputs), default=-2)
+        rows = [" " * (width + 2) + f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
+        labels = [f"{name:>{width}}  " for name in self.outputs] or [""] * len(self.true)
+        for label, true, estimated, error in zip(
+            labels, self.true, self.estimated, self.error, strict=True
+        ):
+            rows.append(f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
         return "\n".join(rows)
 
 
@@ -45,16 +51,50 @@ def _show(value: complex) -> str:
     return f"{value.real:+.9f} {value.imag:+.9f}i"
 
 
-def compare_multipliers(estimated: Multipliers, true: Multipliers) -> MultiplierComparison:
+def compare_multipliers(estimated: Numbers, true: Numbers) -> MultiplierComparison:
     """Pair estimated with true multipliers so that the sum of distances is smallest.
 
     **Raises:** `DefinitionError` if either is empty.
     """
-    estimated, true = np.asarray(estimated).ravel(), np.asarray(true).ravel()
-    if estimated.size == 0 or true.size == 0:
+    found, known = np.asarray(estimated).ravel(), np.asarray(true).ravel()
+    if found.size == 0 or known.size == 0:
         raise DefinitionError("there is no multiplier to compare.")
-    here, there = linear_sum_assignment(np.abs(estimated[:, None] - true))
-    order = np.lexsort((-true[there].imag, -np.abs(true[there])))
+    here, there = linear_sum_assignment(np.abs(found[:, None] - known))
+    order = np.lexsort((-known[there].imag, -np.abs(known[there])))
     return MultiplierComparison(
-        true=true[there][order].astype(complex), estimated=estimated[here][order].astype(complex)
+        true=known[there][order].astype(complex), estimated=found[here][order].astype(complex)
     )
+
+
+def compare_by_output(
+    estimated: Sequence[Complex[np.ndarray, " _"]],
+    true: Numbers,
+    outputs: Sequence[str],
+    output: str | int | None = None,
+) -> MultiplierComparison:
+    """The same for fits with multipliers of their own for each output.
+
+    **Arguments:** `output`: name or index of the only one to compare; None means all.
+
+    **Raises:** `DefinitionError` for an output that is not there, or if there is no multiplier.
+    """
+    chosen = range(len(outputs)) if output is None else [channel_index("output", output, outputs)]
+    each = [compare_multipliers(estimated[k], true) for k in chosen]
+    names = [outputs[k] for k, one in zip(chosen, each, strict=True) for _ in one.true]
+    return MultiplierComparison(
+        np.concatenate([one.true for one in each]),
+        np.concatenate([one.estimated for one in each]),
+        tuple(names),
+    )
+
+
+def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
+    """The index of an input or output that is given by its name or index.
+
+    **Raises:** `DefinitionError` if it is not there.
+    """
+    if isinstance(wanted, str) and wanted in names:
+        return names.index(wanted)
+    if not isinstance(wanted, str) and 0 <= wanted < len(names):
+        return int(wanted)
+    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")

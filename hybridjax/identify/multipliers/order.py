@@ -1,7 +1,7 @@
 """How many multipliers do the data carry?"""
 
 import functools
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -9,10 +9,25 @@ import scipy.linalg
 from jaxtyping import Float, Int
 
 from ...errors import DefinitionError
+from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
-from .likelihood import maximum_likelihood, noise_levels, rank_matrix
-from .projection import Group, chi, evaluate, groups_of
-from .weights import check_freedom, check_values, weights_of
+from .denominator import chi
+from .error_weights import ROUNDING, check_values, error_weights, require_frequencies
+from .maximum_likelihood import maximum_likelihood, noise_levels
+from .variable_projection import HTFGroup, delayed_responses, group_htf, misfit_of
+
+
+# Largest misfit, relative to the rms, that rounding alone may leave. Doubled: noise up to 2e-12 of
+# the HTFs is taken for rounding errors.
+_NOTHING_BUT_ROUNDING = 1e-12
+# By how much squares of rounding errors may differ from each other. Doubled: multipliers of exact
+# HTFs must stand out by 1.4 times as much.
+_ROUNDING_VARIES = 1e6
+# Probability that noise alone is taken for a multiplier. Doubled: weaker multipliers are found, and
+# 2 % of orders are too high.
+_FALSE_ALARMS = 0.01
+# Random matrices from which its quantile is taken. Doubled: it is known to 0.7 times its error.
+_DRAWS = 20000
 
 
 class OrderSelection(eqx.Module):
@@ -80,7 +95,7 @@ class OrderSelection(eqx.Module):
 def select_order(
     htf: HTF,
     max_order: int = 5,
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     overhang: int | None = None,
     max_steps: int = 50,
@@ -109,35 +124,35 @@ def select_order(
     if harmonics is not None:
         htf = htf.select(harmonics)
     rms = check_values(htf)
-    check_freedom(htf, max_order, max_order * N + overhang + 1)
-    weights = weights_of(htf, rms)
-    largest = groups_of(htf, weights, max_order * N + overhang + 1)
+    require_frequencies(htf, max_order, max_order * N + overhang + 1)
+    weights = error_weights(htf, rms)
+    largest = group_htf(htf, weights, max_order * N + overhang + 1)
     start, _ = maximum_likelihood(largest, max_order, max_steps)
     noise = np.ones(len(rms))
     if htf.variance is None:
-        noise = np.maximum(noise_levels(largest, start, len(rms)), 1e-15)
+        noise = np.maximum(noise_levels(largest, start, len(rms)), ROUNDING)
         weights = weights / noise[:, None]
-        largest = groups_of(htf, weights, max_order * N + overhang + 1)
-    values, spread = noise_ratios(largest, np.zeros(max_order))
-    if noise.max() < 1e-12:  # nothing but rounding errors, which come in all sizes
-        values = values / 1e6
+        largest = group_htf(htf, weights, max_order * N + overhang + 1)
+    values, deviation = noise_ratios(largest, np.zeros(max_order))
+    if noise.max() < _NOTHING_BUT_ROUNDING:  # rounding errors come in all sizes
+        values = values / _ROUNDING_VARIES
 
     cost, freedom, parameters = np.zeros(max_order + 1), np.zeros(max_order + 1, int), []
     for d in range(max_order + 1):
-        groups = groups_of(htf, weights, d * N + overhang + 1)
-        c = maximum_likelihood(groups, d, max_steps)[0] if d else np.zeros(0)
-        cost[d] = sum(float((evaluate(group, c).residual ** 2).sum()) for group in groups)
-        freedom[d] = sum(group.freedom * group.data.shape[1] for group in groups) - d
-        parameters.append(sum((2 * len(g.lag) - g.freedom) * g.data.shape[1] for g in groups) + d)
+        groups = group_htf(htf, weights, d * N + overhang + 1)
+        c = maximum_likelihood(groups, d, max_steps).coefficients if d else np.zeros(0)
+        cost[d] = sum(float((misfit_of(g, c).residual ** 2).sum()) for g in groups)
+        freedom[d] = sum(g.freedom * g.size for g in groups) - d
+        parameters.append(sum((2 * len(g.period_delay) - g.freedom) * g.size for g in groups) + d)
     data = int(freedom[0] + parameters[0])
     level, tails = estimated_noise(htf, cost[-1] / freedom[-1])
     likelihood = data * np.log(np.maximum(cost, 1e-300)) if htf.variance is None else cost / level
     parameters = np.array(parameters)
-    left, spread = values[::-1] / level, tails * spread
+    left, deviation = values[::-1] / level, tails * deviation
     return OrderSelection(
         orders=np.arange(max_order + 1),
         strength=np.sqrt(left),
-        deviation=(left - 1) / spread,
+        deviation=(left - 1) / deviation,
         threshold=np.array([largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
         cost=cost,
         freedom=freedom,
@@ -147,12 +162,18 @@ def select_order(
     )
 
 
-def noise_ratios(groups: list[Group], c: Float[np.ndarray, " d"]):
-    """Squares of the singular values of z^-jN H, j = 0..d, in units of the noise, ascending.
+class NoiseRatios(NamedTuple):
+    """How much of $z^{-jN} H$, j = 0, ..., d, stands out of the noise."""
 
-    **Returns:** those, and the standard deviation of each where it is noise.
-    """
-    columns, noise = rank_matrix(groups, c)
+    values: Float[np.ndarray, " d1"]
+    """Squares of the singular values, ascending, in units of the noise: 1 if there is no more."""
+    deviation: float
+    """The standard deviation of each where it is noise."""
+
+
+def noise_ratios(groups: list[HTFGroup], c: Float[np.ndarray, " d"]) -> NoiseRatios:
+    """Generalized singular values of what numerators leave, weighted as for the denominator c."""
+    columns, noise = delayed_responses(groups, c)
     # Singular values of the columns, whitened: their Gram matrix would lose half of the digits.
     white = scipy.linalg.solve_triangular(
         np.linalg.cholesky(noise), np.linalg.qr(columns, mode="r").T, lower=True
@@ -161,28 +182,37 @@ def noise_ratios(groups: list[Group], c: Float[np.ndarray, " d"]):
     # Each is a weighted mean of squares of so many independent numbers.
     total, square = 0.0, 0.0
     for group in groups:
-        share = group.freedom * group.data.shape[1] / len(group.lag)
-        weight = 1 / np.abs(chi(group.lag, c)) ** 2
+        share = group.freedom * group.size / len(group.period_delay)
+        weight = 1 / np.abs(chi(group.period_delay, c)) ** 2
         total, square = total + share * weight.sum(), square + share * (weight**2).sum()
-    return values, float(np.sqrt(2 * square) / total)
+    return NoiseRatios(values, float(np.sqrt(2 * square) / total))
 
 
-def estimated_noise(htf: HTF, misfit: float) -> tuple[float, float]:
-    r"""What noise looks like in units of variances that were themselves estimated.
+class NoiseLevel(NamedTuple):
+    """What noise looks like in units of variances that were themselves estimated."""
+
+    mean: float
+    """L, the mean of its squares: 1 for variances that are known."""
+    tails: float
+    """How much wider than noise of known variance it scatters."""
+
+
+def estimated_noise(htf: HTF, misfit: float) -> NoiseLevel:
+    r"""The noise in units of `htf.variance`.
 
     With $\nu$ complex degrees of freedom $|\varepsilon|^2 / v$ has Fisher's distribution with 2 and
     $2 \nu$: its mean is $L = \nu / (\nu - 1)$, its standard deviation $L \sqrt{L / (2 - L)}$.
     Weights that are pooled have more degrees of freedom than each variance, so that L is taken
     from the misfit of a fit, as far as $\nu$ allows.
 
-    **Returns:** L, and how much wider than noise of known variance it scatters.
+    **Arguments:** `misfit`: cost of the fit relative to what is expected.
     """
-    if htf.freedom is None:
-        return 1.0, 1.0
-    freedom = float(np.median(htf.freedom))
+    if htf.variance_freedom is None:
+        return NoiseLevel(1.0, 1.0)
+    freedom = float(np.median(htf.variance_freedom))
     most = freedom / (freedom - 1) if freedom > 1 else np.inf
     level = float(np.clip(misfit, 1.0, most))
-    return level, np.sqrt(level / (2 - level)) if level < 2 else np.inf
+    return NoiseLevel(level, np.sqrt(level / (2 - level)) if level < 2 else np.inf)
 
 
 @functools.lru_cache
@@ -192,9 +222,9 @@ def largest_of_noise(size: int) -> float:
     The Gram matrix of independent noise differs from its mean by a matrix of the Gaussian
     orthogonal ensemble.
     """
-    draws = np.random.default_rng(0).normal(size=(20000, size, size))
+    draws = np.random.default_rng(0).normal(size=(_DRAWS, size, size))
     symmetric = (draws + draws.swapaxes(1, 2)) / 2
-    return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 0.99))
+    return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
 
 
 def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:

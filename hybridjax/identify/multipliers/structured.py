@@ -1,23 +1,23 @@
 """Floquet multipliers from the exact structure of the harmonic transfer functions."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Complex, Float
 
+from ..._core.arguments import Numbers
 from ..._core.results import Result
 from ...errors import DefinitionError
-from ...linear.frequency_response import check_harmonics
+from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from .estimate import MultiplierEstimate, roots_of
-from .likelihood import maximum_likelihood, noise_levels, summarize
+from .denominator import chi, multipliers_of
+from .error_weights import ROUNDING, check_values, error_weights, require_frequencies
+from .maximum_likelihood import maximum_likelihood, noise_levels, summarize
+from .multiplier_estimate import MultiplierEstimate
 from .order import estimated_noise, noise_ratios, refuse_invented
-from .projection import chi, groups_of, numerators
-from .weights import check_freedom, check_values, weights_of
+from .variable_projection import group_htf, numerators_of
 
 
 class StructuredFit(MultiplierEstimate):
@@ -59,8 +59,8 @@ class StructuredFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def evaluate(self, f: ArrayLike, harmonics: int | Sequence[int] | None = None) -> HTF:
-        """The fitted HTFs at frequencies f (cycles per period) inside the band of the data.
+    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
+        """The fitted HTFs at frequencies f (F,), cycles per period, inside the band of the data.
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
         """
@@ -92,16 +92,13 @@ class StructuredFit(MultiplierEstimate):
         )
 
 
-Errors = Literal["residuals", "variance"]
-
-
 def fit_multipliers(
     htf: HTF,
     order: int | LDTP,
-    harmonics: int | Sequence[int] | None = None,
+    harmonics: Harmonics | None = None,
     *,
     overhang: int | None = None,
-    errors: Errors = "residuals",
+    errors: Literal["residuals", "variance"] = "residuals",
     check: bool = True,
     max_steps: int = 50,
 ) -> StructuredFit:
@@ -150,34 +147,34 @@ def fit_multipliers(
         raise DefinitionError(
             "errors='variance' needs HTFs with variances; these have none: take 'residuals'."
         )
-    unknowns = order * N + overhang + 1
-    check_freedom(htf, order, unknowns)
+    size = order * N + overhang + 1
+    require_frequencies(htf, order, size)
 
-    groups = groups_of(htf, weights_of(htf, rms), unknowns)
+    groups = group_htf(htf, error_weights(htf, rms), size)
     c, converged = maximum_likelihood(groups, order, max_steps)
     if htf.variance is None:
         # Once more with the outputs weighted by what their misfit says.
-        noise = np.maximum(noise_levels(groups, c, len(rms)), 1e-15)
-        groups = groups_of(htf, weights_of(htf, rms * noise), unknowns)
+        noise = np.maximum(noise_levels(groups, c, len(rms)), ROUNDING)
+        groups = group_htf(htf, error_weights(htf, rms * noise), size)
         c, converged = maximum_likelihood(groups, order, max_steps, c)
     summary = summarize(groups, c, errors)
     if check:
         level, tails = estimated_noise(htf, summary.cost / summary.freedom)
-        values, spread = noise_ratios(groups, np.zeros(order))
-        refuse_invented(values / level, tails * spread)
+        ratios = noise_ratios(groups, np.zeros(order))
+        refuse_invented(ratios.values / level, tails * ratios.deviation)
 
-    B = np.zeros((len(htf.harmonics), unknowns, len(htf.outputs), len(htf.inputs)), complex)
+    B = np.zeros((len(htf.harmonics), size, len(htf.outputs), len(htf.inputs)), complex)
     for group in groups:
-        b = numerators(group, c).T
-        i, j = group.columns.T
-        B[group.rows, :, i, j] = b
+        b = numerators_of(group, c).T
+        i, j = group.channel.T
+        B[group.harmonic, :, i, j] = b
         if group.mirror is not None:
             B[group.mirror, :, i, j] = b.conj()
     fit = StructuredFit(
-        multipliers=roots_of(c),
+        multipliers=multipliers_of(c),
         coefficients=c,
-        covariance=summary.covariance,
-        covariance_freedom=summary.covariance_freedom,
+        covariance=summary.covariance.matrix,
+        covariance_freedom=summary.covariance.freedom,
         residual=np.zeros(len(rms)),
         numerators=B,
         cost=summary.cost,
@@ -188,6 +185,6 @@ def fit_multipliers(
         inputs=htf.inputs,
         outputs=htf.outputs,
     )
-    misfit = np.abs(np.asarray(fit.evaluate(htf.f).H) - np.asarray(htf.H)) ** 2
+    misfit = np.abs(np.asarray(fit.htf(htf.f).H) - np.asarray(htf.H)) ** 2
     residual = np.sqrt(np.mean(misfit, axis=(0, 1, 3))) / rms
     return eqx.tree_at(lambda fit: fit.residual, fit, residual)

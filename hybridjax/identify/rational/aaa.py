@@ -5,10 +5,16 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.interpolate import AAA
 
+from ..._core.arguments import Numbers
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.htf import HTF
-from ..multipliers.compare import MultiplierComparison, Multipliers, compare_multipliers
+from ..multipliers.compare import MultiplierComparison, channel_index, compare_by_output
+
+
+# Imaginary part of z up to which it is real, so that it is its own mirror image. Doubled: none but
+# rounding.
+_REAL = 1e-12
 
 
 class AAAFit(eqx.Module):
@@ -34,10 +40,13 @@ class AAAFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def compare(self, true: Multipliers) -> tuple[MultiplierComparison, ...]:
-        """For each output the multipliers that come closest to the true ones."""
+    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
+        """For each output (or one alone) the multipliers that come closest to the true ones.
+
+        **Raises:** `DefinitionError` for an output that is not there.
+        """
         rows = [row[np.isfinite(row)] for row in self.multipliers]
-        return tuple(compare_multipliers(row, true) for row in rows)
+        return compare_by_output(rows, true, self.outputs, output)
 
     def __repr__(self) -> str:
         counts = np.isfinite(self.poles).sum(axis=1)
@@ -69,25 +78,13 @@ def fit_aaa(
     **Raises:** `DefinitionError` for a harmonic or input that is not there, or NaN.
     """
     require_x64(htf.H)
-    if (
-        isinstance(input, str)
-        and input not in htf.inputs
-        or input
-        not in (
-            *htf.inputs,
-            *range(len(htf.inputs)),
-        )
-    ):
-        raise DefinitionError(
-            f"there is no input {input!r}; the inputs are {', '.join(htf.inputs)}."
-        )
-    column = htf.inputs.index(input) if isinstance(input, str) else input
+    column = channel_index("input", input, htf.inputs)
     H, N = np.asarray(htf.harmonic(harmonic))[:, :, column], htf.n_sections
     if not np.isfinite(H).all():
         raise DefinitionError(f"H_{harmonic} holds NaN or infinity.")
     z = np.exp(2j * np.pi * np.asarray(htf.f) / N)
     if 2 * harmonic % N == 0:
-        both = np.abs(z.imag) > 1e-12
+        both = np.abs(z.imag) > _REAL
         z, H = np.concatenate([z, z[both].conj()]), np.concatenate([H, H[both].conj()])
     found = []
     for values in H.T:

@@ -1,21 +1,36 @@
 """The paper's parametric fit: one rational function of z for one harmonic (Sec. VI-C3)."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ..._core.arguments import Numbers
 from ..._core.compile import quick_jit
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError
 from ...linear.htf import HTF
-from ..multipliers.compare import MultiplierComparison, Multipliers, compare_multipliers
+from ..multipliers.compare import MultiplierComparison, channel_index, compare_by_output
+
+
+# Steps of the iteration of Sanathanan and Koerner from which fits are started. Doubled: twice the
+# time, as a rule for the same result.
+_STARTS = (0, 1, 4, 29)
+# Relative and absolute accuracy of the denominator, in coordinates in which the residual changes by
+# about as much. Doubled: half a step fewer.
+_ACCURACY = 1e-8
+# Relative length, in the residual, of directions of the denominator that are taken to count for
+# something. Doubled: longer steps along such directions.
+_FLOOR = 1e-8
+# Relative difference of costs that are equal. Doubled: none but rounding.
+_EQUAL_COST = 1e-9
+# |H| relative to its rms that counts as zero. Doubled: none but rounding.
+_ZERO = 1e-12
 
 
 class RationalFit(eqx.Module):
@@ -55,19 +70,26 @@ class RationalFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def evaluate(self, f: ArrayLike) -> Complex[np.ndarray, "F ny"]:
-        """The fitted functions at frequencies `f`, cycles per period."""
-        w = np.exp(-2j * np.pi * np.atleast_1d(np.asarray(f, float)) / self.n_sections)[:, None]
+    def htf(self, f: Numbers) -> HTF:
+        """The fitted functions at frequencies f (F,), cycles per period: one harmonic and input."""
+        f = np.atleast_1d(np.asarray(f, float))
+        w = np.exp(-2j * np.pi * f / self.n_sections)[:, None]
         delay = w if self.form == "delayed" else 1.0
         polynomial = np.polynomial.polynomial.polyval
         columns = range(len(self.outputs))
         top = [polynomial(w[:, 0], self.numerator[i]) for i in columns]
         bottom = [polynomial(w[:, 0], self.denominator[i]) for i in columns]
-        return delay * np.stack(top, axis=1) / np.stack(bottom, axis=1)
+        H = (delay * np.stack(top, axis=1) / np.stack(bottom, axis=1))[None, :, :, None]
+        N = self.n_sections
+        harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
+        return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
 
-    def compare(self, true: Multipliers) -> tuple[MultiplierComparison, ...]:
-        """The multipliers of each output's fit beside the true ones."""
-        return tuple(compare_multipliers(own, true) for own in self.multipliers)
+    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
+        """The multipliers of each output's fit (or of one alone) beside the true ones.
+
+        **Raises:** `DefinitionError` for an output that is not there.
+        """
+        return compare_by_output(list(self.multipliers), true, self.outputs, output)
 
     def __repr__(self) -> str:
         rows = [
@@ -125,8 +147,9 @@ def fit_rational(
         raise DefinitionError(f"weighting must be 'uniform' or 'relative', not {weighting!r}.")
     if poles < 1 or zeros < 0:
         raise DefinitionError(f"a fit needs poles >= 1 and zeros >= 0, not {poles} and {zeros}.")
-    column = _index("input", input, htf.inputs)
-    rows = range(len(htf.outputs)) if output is None else [_index("output", output, htf.outputs)]
+    column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
+    if output is not None:
+        rows = [channel_index("output", output, htf.outputs)]
     H = np.asarray(htf.harmonic(harmonic))[:, :, column]
     if 2 * len(H) < poles + zeros + 1:
         raise DefinitionError(
@@ -142,22 +165,22 @@ def fit_rational(
         if not np.isfinite(h).all():
             raise DefinitionError(f"{name} holds NaN or infinity.")
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
-        if rms == 0 or (weighting == "relative" and np.abs(h).min() < 1e-12 * rms):
+        if rms == 0 or (weighting == "relative" and np.abs(h).min() < _ZERO * rms):
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
         h = jnp.asarray(h / rms)
-        a, b, cost, converged = _fit(w, delay, h, jnp.asarray(weight), poles, zeros, max_steps)
-        cost = np.where(np.isfinite(cost), cost, np.inf)
+        tried = _fit(w, delay, h, jnp.asarray(weight), poles, zeros, max_steps)
+        cost = np.where(np.isfinite(tried.cost), tried.cost, np.inf)
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
-        lowest = cost <= cost.min() * (1 + 1e-9)
-        best = int(np.argmax(lowest * (1 + np.asarray(converged))))
+        lowest = cost <= cost.min() * (1 + _EQUAL_COST)
+        best = int(np.argmax(lowest * (1 + np.asarray(tried.converged))))
         fits.append(
             (
-                np.asarray(b[best]) * rms,
-                np.concatenate([[1.0], a[best]]),
+                np.asarray(tried.numerator[best]) * rms,
+                np.concatenate([[1.0], tried.denominator[best]]),
                 float(cost[best]),
-                Result.OK if converged[best] else Result.NOT_CONVERGED,
+                Result.OK if tried.converged[best] else Result.NOT_CONVERGED,
             )
         )
     numerator, denominator, residual, result = (
@@ -183,19 +206,22 @@ def fit_rational(
     )
 
 
-def _index(kind: str, wanted: str | int, names: tuple[str, ...]) -> int:
-    if isinstance(wanted, str) and wanted in names:
-        return names.index(wanted)
-    if not isinstance(wanted, str) and 0 <= wanted < len(names):
-        return int(wanted)
-    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
-
-
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
     finite = finite[np.lexsort((-finite.imag, -np.abs(finite)))]
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
+
+
+class _Trials(NamedTuple):
+    """The fits from S starts."""
+
+    denominator: Float[Array, "S p"]
+    """Without its leading 1."""
+    numerator: Float[Array, "S q1"]
+    cost: Float[Array, " S"]
+    """Root mean square of the weighted residual."""
+    converged: Bool[Array, " S"]
 
 
 @quick_jit
@@ -207,8 +233,7 @@ def _fit(
     poles: int,
     zeros: int,
     max_steps: int,
-):
-    """The fits from each start: denominators, numerators, rms residuals, convergence."""
+) -> _Trials:
     powers_b = delay[:, None] * w[:, None] ** jnp.arange(zeros + 1)
     powers_a = w[:, None] ** (1 + jnp.arange(poles))
     weight = weight[:, None] / jnp.sqrt(h.size)
@@ -229,15 +254,15 @@ def _fit(
         solution = jnp.linalg.lstsq(columns / size, -_real(scale * h[:, None])[:, 0])[0] / size
         return solution[:poles], solution[:poles]
 
-    _, path = jax.lax.scan(linearized, jnp.zeros(poles), length=30)
-    starts = path[jnp.array([0, 1, 4, 29])]
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    _, path = jax.lax.scan(linearized, jnp.zeros(poles), length=1 + max(_STARTS))
+    starts = path[jnp.array(_STARTS)]
+    solver = optx.LevenbergMarquardt(rtol=_ACCURACY, atol=_ACCURACY)
 
     def refine(start):
         # Coordinates in which the Jacobian at the start is orthonormal: those of `a` are so
         # nearly dependent for poles close to z = 1 that damping would stall.
         jacobian = jax.jacfwd(lambda a: numerator(a)[1])(start)
-        floor = 1e-8 * (jnp.linalg.norm(jacobian) + 1e-8) * jnp.eye(poles)
+        floor = _FLOOR * (jnp.linalg.norm(jacobian) + _FLOOR) * jnp.eye(poles)
         scale = jnp.linalg.qr(jnp.concatenate([jacobian, floor]), mode="r")
 
         def place(s):
@@ -253,7 +278,7 @@ def _fit(
         a = place(found.value)
         b, residual = numerator(a)
         good = found.result == optx.RESULTS.successful
-        return a, b, jnp.linalg.norm(residual), good
+        return _Trials(a, b, jnp.linalg.norm(residual), good)
 
     return jax.lax.map(refine, starts)
 

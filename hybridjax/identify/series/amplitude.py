@@ -1,17 +1,19 @@
 """Up to which amplitude a linear model holds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from ..._core.arguments import Numbers
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
-from .layout import Piece
-from .validation import check_model, simulate_piece
+from .fit import check_start
+from .simulation import simulate_record
+from .validation import require_same_kind
 
 
 class AmplitudeSweep(eqx.Module):
@@ -63,10 +65,10 @@ class AmplitudeSweep(eqx.Module):
 def amplitude_sweep(
     run: Callable[[Float[np.ndarray, "S n nu"]], ExperimentData],
     model: LDTP,
-    u: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
-    amplitudes: Sequence[float] | np.ndarray,
+    u: Numbers,
+    amplitudes: Numbers,
     *,
-    start: Literal["free", "rest"] = "rest",
+    start: Literal["free", "cycle"] = "cycle",
 ) -> AmplitudeSweep:
     """Apply an input at several amplitudes and compare with the linear model's response.
 
@@ -74,27 +76,28 @@ def amplitude_sweep(
 
     - `run`: makes experiments from inputs (S, n, nu): a simulation, e.g.
       `lambda u: hj.run_experiments(cycle, sections, u, outputs)`, or a laboratory.
-    - `model`: the linear one. `u`: inputs at amplitude 1. `amplitudes`: positive factors.
+    - `model`: the linear one. `u` (S, n, nu): inputs at amplitude 1. `amplitudes` (A,): positive
+      factors.
     - `start`: as in `validate`; by default experiments start on the limit cycle.
 
     **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
     """
-    amplitudes = np.sort(np.asarray(amplitudes, float))
-    if amplitudes.ndim != 1 or not (np.isfinite(amplitudes) & (amplitudes > 0)).all():
-        raise DefinitionError(f"amplitudes must be positive numbers, not {amplitudes}.")
+    free_start = check_start(start) == "free"
+    factors = np.sort(np.asarray(amplitudes, float))
+    if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
+        raise DefinitionError(f"amplitudes must be positive numbers, not {factors}.")
     misfit, rms, failed = [], [], []
-    for a in amplitudes:
+    for a in factors:
         data = run(a * np.asarray(u))
-        check_model(model, data.n_sections, data.inputs, data.outputs)
+        require_same_kind(model, data)
         failed.append(float((~data.ok).sum()))
         rms.append(np.sqrt(np.mean(data.u**2, axis=(0, 1))))
         square = np.zeros((2, len(data.outputs)))
-        for s in np.flatnonzero(data.ok):
-            piece = Piece(0, data.u[s], data.y[s])
-            error = piece.y - simulate_piece(model, piece, start == "free")
-            square += [(error**2).sum(axis=0), (piece.y**2).sum(axis=0)]
+        for record in data.records:
+            error = record.y - simulate_record(model, record, free_start)
+            square += [(error**2).sum(axis=0), (record.y**2).sum(axis=0)]
         with np.errstate(invalid="ignore"):
             misfit.append(np.sqrt(square[0] / square[1]))
     return AmplitudeSweep(
-        amplitudes, np.array(rms), np.array(misfit), np.array(failed), model.inputs, model.outputs
+        factors, np.array(rms), np.array(misfit), np.array(failed), model.inputs, model.outputs
     )

@@ -3,24 +3,33 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float, Int
 
-from ..._core.arguments import names
+from ..._core.arguments import Numbers, names
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from .fit import SeriesFit
+from .series_fit import SeriesFit
 
 
-_ROUNDING = 1e-12  # singular values below this part of the largest are rounding errors
-_MARGIN = 1.1  # by so much a singular value must exceed the largest that noise alone makes
+# Singular values below this part of the largest one are rounding errors. Doubled: states that are
+# seen twice as little are left out of exact models.
+_ROUNDING = 1e-12
+# Factor by which a singular value must exceed the largest that noise alone makes, on average.
+# Doubled: states must be twice as strong to be found.
+_NOISE_MARGIN = 1.1
+# Sections that a state is seen through at least, by default. Doubled: more averaging, more lags.
+_SHORTEST_HORIZON = 8
+# Smallest standard deviation of an HTF, relative to the largest HTF: rounding. Doubled: outputs
+# without noise count half as much beside noisy ones.
+_SMALLEST_ERROR = 1e-15
 
 
 def realize(
-    source: HTF | SeriesFit | Float[np.ndarray, "N lags ny nu"] | Float[Array, "N lags ny nu"],
-    dims: int | Sequence[int] | np.ndarray | None = None,
+    source: HTF | SeriesFit | Numbers,
+    dims: int | Sequence[int] | Int[np.ndarray, " N"] | None = None,
     *,
     order: int = 1,
     horizon: int | None = None,
@@ -32,7 +41,8 @@ def realize(
     The state at a section is what the outputs from there on remember of the inputs before it, so
     that its dimension is a rank at each section on its own.
 
-    - *From Markov parameters* (an array as `LDTP.impulse_response` gives it, or a `SeriesFit`):
+    - *From Markov parameters* (an array (N, lags, ny, nu) as `LDTP.impulse_response` gives it, or a
+      `SeriesFit`):
       the rank of the Hankel matrix at section n of the responses, `[i, j]`, at section n + i to
       an input at n - 1 - j (Ho and Kalman 1966, for each section of the period).
     - *From HTFs* on any frequencies: the outputs at sections n, ..., n + p in response to
@@ -82,7 +92,7 @@ def realize(
     ny, nu = markov.shape[2:]
     scale = _scale(np.sqrt(np.mean(markov**2, axis=(0, 1, 3))) if spread is None else spread)
     markov = markov / scale[:, None]
-    edge = 0.0 if spread is None else _MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
+    edge = 0.0 if spread is None else _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(p * nu))
 
     hankels = [
         np.block([[markov[(n + i) % N, i + j + 1] for j in range(p)] for i in range(p + 1)])
@@ -99,7 +109,7 @@ def realize(
 def _horizon(horizon: int | None, N: int) -> int:
     if horizon is not None and horizon < 1:
         raise DefinitionError(f"a horizon is at least 1 section, not {horizon}.")
-    return max(8, 2 * N) if horizon is None else horizon
+    return max(_SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
 
 
 def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
@@ -161,8 +171,8 @@ def _from_htf(htf: HTF, dims, order: int, horizon: int | None) -> LDTP:
         # Real and imaginary part have half of the variance each.
         spread = np.sqrt(np.asarray(htf.variance).sum(axis=0) / 2)
         scale = _scale(np.sqrt((spread**2).mean(axis=(0, 2))))
-        weight = 1 / np.maximum(spread, 1e-15 * np.abs(G).max())
-        edge = _MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * len(f) * nu))
+        weight = 1 / np.maximum(spread, _SMALLEST_ERROR * np.abs(G).max())
+        edge = _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * len(f) * nu))
     z = np.exp(2j * np.pi / N * f)
 
     # One weight for each column, that of its noise: the rows of an input stay what they were.

@@ -4,20 +4,26 @@ from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import stats
 
 from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...experiments.record import Record, RecordedData, uninterrupted_records
 from ...linear.ldtp import LDTP
-from .fit import SeriesFit
-from .layout import Piece, Recorded, pieces_of, slow_waves
-from .prediction import predict
+from .fit import check_start
+from .series_fit import SeriesFit
+from .simulation import simulate_record
 
 
-_FEWEST = 8  # samples of a section, below which a correlation says nothing
+# Samples of a section, below which a correlation says nothing. Doubled: more records are refused.
+_FEWEST_SAMPLES = 8
+# Samples for each lag that is looked at by default. Doubled: half as many lags.
+_SAMPLES_PER_LAG = 4
+# Singular values of lagged inputs below this part of the largest one are rounding errors. Doubled:
+# none but rounding.
+_RANK = 1e-9
 
 
 class Validation(eqx.Module):
@@ -38,7 +44,8 @@ class Validation(eqx.Module):
     - `autocorrelation` (N, lags, ny): of the residual at each section with those 1, 2, ... samples
       earlier. `cross_correlation` (N, lags, ny, nu): of the residual with the inputs 0, 1, ...
       samples earlier. Both in units of their standard deviation where there is no correlation.
-    - `measured`, `simulated` (n, ny): the first record; `start`, its first section.
+    - `measured`, `simulated` (n, ny): the first record, whose first sample lies on
+      `first_section`.
     - `n_sections`, `inputs`, `outputs`.
     """
 
@@ -51,7 +58,7 @@ class Validation(eqx.Module):
     measured: Float[np.ndarray, "n ny"]
     simulated: Float[np.ndarray, "n ny"]
     level: float = eqx.field(static=True)
-    start: int = eqx.field(static=True)
+    first_section: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
@@ -83,9 +90,9 @@ class Validation(eqx.Module):
 
 def validate(
     model: LDTP | SeriesFit,
-    data: Recorded,
+    data: RecordedData,
     *,
-    start: Literal["free", "rest"] = "free",
+    start: Literal["free", "cycle"] = "free",
     lags: int | None = None,
     level: float = 0.01,
 ) -> Validation:
@@ -102,9 +109,9 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is.
-    - `data`: `ExperimentData`, a `Record` or several, best those that the model was not made from;
-      those that it was made from always fit too well.
-    - `start`: "free" estimates the state at the start of each record from it; "rest" takes it as
+    - `data`: as for `fit_series`, best those that the model was not made from; those that it was
+      made from always fit too well.
+    - `start`: "free" estimates the state at the start of each record from it; "cycle" takes it as
       zero. A drift that the records announce is estimated from them in either case.
     - `lags`: how many are looked at; default one period, less for few cycles.
     - `level`: of the tests.
@@ -114,29 +121,32 @@ def validate(
     """
     if not 0 < level < 1:
         raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
-    pieces, N, inputs, outputs, *_ = pieces_of(data)
-    check_model(model, N, inputs, outputs)
-    simulated = [simulate_piece(model, piece, start == "free") for piece in pieces]
-    seen = np.concatenate([np.isfinite(p.y) for p in pieces])
-    y = np.concatenate([p.y for p in pieces])
-    e = [p.y - y for p, y in zip(pieces, simulated, strict=True)]
+    free_start = check_start(start) == "free"
+    records = uninterrupted_records(data)
+    N, outputs = records[0].n_sections, records[0].outputs
+    require_same_kind(model, records[0])
+    simulated = [simulate_record(model, record, free_start) for record in records]
+    seen = np.concatenate([np.isfinite(r.y) for r in records])
+    y = np.concatenate([r.y for r in records])
+    e = [r.y - y for r, y in zip(records, simulated, strict=True)]
     error = np.concatenate(e)
     for i, name in enumerate(outputs):
         if seen[:, i].sum() < 2 or np.nanstd(y[:, i]) == 0:
             raise DefinitionError(f"the output {name} is constant or missing at every sample.")
     noise = np.sqrt(np.nanmean(error**2, axis=0))
     spread = np.sqrt(np.nanmean((y - np.nanmean(y, axis=0)) ** 2, axis=0))
-    fewest = min(np.bincount(_sections(pieces, N)[seen[:, i]], minlength=N).min()
+    fewest = min(np.bincount(_sections(records)[seen[:, i]], minlength=N).min()
                  for i in range(len(outputs)))  # fmt: skip
-    if fewest < _FEWEST:
+    if fewest < _FEWEST_SAMPLES:
         raise DefinitionError(
-            f"a section was sampled {fewest} times only; the tests need {_FEWEST} or more cycles."
+            f"a section was sampled {fewest} times only; the tests need {_FEWEST_SAMPLES} or more "
+            "cycles."
         )
-    lags = min(N, int(fewest) // 4) if lags is None else lags
+    lags = min(N, int(fewest) // _SAMPLES_PER_LAG) if lags is None else lags
     if lags < 1:
         raise DefinitionError(f"lags must be at least 1, not {lags}.")
-    auto, white = _whiteness(pieces, e, N, lags)
-    cross, independent = _independence(pieces, e, N, lags)
+    auto, white = _whiteness(records, e, N, lags)
+    cross, independent = _independence(records, e, N, lags)
     return Validation(
         fit=100 * (1 - noise / spread),
         noise=noise,
@@ -144,67 +154,27 @@ def validate(
         independence=independent,
         autocorrelation=auto,
         cross_correlation=cross,
-        measured=pieces[0].y,
+        measured=records[0].y,
         simulated=simulated[0],
         level=level,
-        start=pieces[0].start,
+        first_section=records[0].first_section,
         n_sections=N,
-        inputs=inputs,
+        inputs=records[0].inputs,
         outputs=outputs,
     )
 
 
-def check_model(model: LDTP | SeriesFit, N: int, inputs, outputs) -> None:
-    of_data = {"n_sections": N, "inputs": inputs, "outputs": outputs}
-    for name, value in of_data.items():
-        if getattr(model, name) != value:
-            raise DefinitionError(
-                f"model and data have different {name}: {getattr(model, name)} and {value}."
-            )
+def require_same_kind(model: LDTP | SeriesFit, data: Record | ExperimentData) -> None:
+    """**Raises:** `DefinitionError` if model and data have different N, inputs or outputs."""
+    for name in ("n_sections", "inputs", "outputs"):
+        its, of_data = getattr(model, name), getattr(data, name)
+        if its != of_data:
+            raise DefinitionError(f"model and data have different {name}: {its} and {of_data}.")
 
 
-def simulate_piece(model: LDTP | SeriesFit, piece: Piece, free: bool) -> Float[np.ndarray, "n ny"]:
-    """The outputs of the model from the state that fits the record best, or from rest, with the
-    drift that does."""
-    if isinstance(model, SeriesFit):
-        return predict(model, piece, free)
-    forced = np.asarray(model.simulate(piece.u, start=piece.start))
-    left = (piece.y - forced)[..., None]
-    if not free:
-        return forced + _slow(left, piece, model.n_sections)[..., 0]
-    d = int(model.dims[piece.start])
-    still = jnp.zeros_like(jnp.asarray(piece.u))
-    states = jnp.eye(model.A.shape[-1])[:d]
-    alone = jax.vmap(lambda x0: model.simulate(still, x0, piece.start))(states)
-    alone = np.moveaxis(np.asarray(alone), 0, -1)
-    both = np.concatenate([left, alone], axis=2)
-    both = both - _slow(both, piece, model.n_sections)
-    seen = np.isfinite(piece.y)
-    # Outputs in units of their size, so that none is neglected.
-    size = np.sqrt(np.nanmean(piece.y**2, axis=0, where=seen)) if seen.any() else 1.0
-    weight = np.broadcast_to(1 / np.where(size > 0, size, 1.0), piece.y.shape)[seen]
-    x0 = np.linalg.lstsq(both[seen][:, 1:] * weight[:, None], both[seen][:, 0] * weight)[0]
-    out = forced + alone @ x0
-    return out + _slow((piece.y - out)[..., None], piece, model.n_sections)[..., 0]
-
-
-def _slow(
-    x: Float[np.ndarray, "n ny m"], piece: Piece, n_sections: int
-) -> Float[np.ndarray, "n ny m"]:
-    """The drift that explains most of x at the samples of a piece, section by section."""
-    out = np.zeros_like(x)
-    waves = slow_waves(piece, n_sections, piece.drift)
-    cycle, section = np.divmod(piece.start + np.arange(len(x)), n_sections)
-    for n, i in np.ndindex(n_sections, x.shape[1]):
-        rows = section == n
-        seen = rows & np.isfinite(piece.y[:, i])
-        if waves.shape[1] and seen.any():
-            out[rows, i] = waves[cycle[rows]] @ np.linalg.lstsq(waves[cycle[seen]], x[seen, i])[0]
-    return out
-
-
-def _sections(pieces: Sequence[Piece], N: int) -> np.ndarray:
-    return np.concatenate([(p.start + np.arange(len(p.u))) % N for p in pieces])
+def _sections(records: Sequence[Record]) -> Int[np.ndarray, " n"]:
+    """Of all samples."""
+    return np.concatenate([(r.first_section + np.arange(len(r.u))) % r.n_sections for r in records])
 
 
 def _earlier(x: np.ndarray, lag: int) -> np.ndarray:
@@ -214,13 +184,16 @@ def _earlier(x: np.ndarray, lag: int) -> np.ndarray:
     return out
 
 
-def _whiteness(pieces, e, N: int, lags: int):
-    section = _sections(pieces, N)
+def _whiteness(
+    records: Sequence[Record], e: Sequence[np.ndarray], N: int, lags: int
+) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+    """Correlations with earlier residuals, and the p-values."""
+    section = _sections(records)
     ny = e[0].shape[1]
     now = np.concatenate(e)
     size = np.stack([np.sqrt(np.nanmean(now[section == n] ** 2, axis=0)) for n in range(N)])
     scale = np.where(size > 0, size, 1.0)
-    scaled = [x / scale[(p.start + np.arange(len(x))) % N] for p, x in zip(pieces, e, strict=True)]
+    scaled = [x / scale[_sections([r])] for r, x in zip(records, e, strict=True)]
     z = np.zeros((N, lags, ny))
     total = np.zeros((N, lags, ny), bool)
     now = np.concatenate(scaled)
@@ -230,7 +203,7 @@ def _whiteness(pieces, e, N: int, lags: int):
             values = product[section == n]
             count = np.isfinite(values).sum(axis=0)
             z[n, lag - 1] = np.nansum(values, axis=0) / np.sqrt(np.maximum(count, 1))
-            total[n, lag - 1] = count >= _FEWEST
+            total[n, lag - 1] = count >= _FEWEST_SAMPLES
     # The mean over the sections of each lag, and what the sections differ from it: independent.
     z = z * total
     count = total.sum(axis=0)
@@ -244,11 +217,14 @@ def _whiteness(pieces, e, N: int, lags: int):
     return z, p
 
 
-def _independence(pieces, e, N: int, lags: int):
-    section = _sections(pieces, N)
-    ny, nu = e[0].shape[1], pieces[0].u.shape[1]
+def _independence(
+    records: Sequence[Record], e: Sequence[np.ndarray], N: int, lags: int
+) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"]]:
+    """Correlations with earlier inputs, and the p-values."""
+    section = _sections(records)
+    ny, nu = e[0].shape[1], records[0].u.shape[1]
     now = np.concatenate(e)
-    past = [np.concatenate([_earlier(p.u, lag) for p in pieces]) for lag in range(lags)]
+    past = [np.concatenate([_earlier(r.u, lag) for r in records]) for lag in range(lags)]
     past = np.stack(past, axis=1)
     z = np.zeros((N, lags, ny, nu))
     square, freedom = np.zeros(ny), np.zeros(ny)
@@ -257,12 +233,12 @@ def _independence(pieces, e, N: int, lags: int):
         for i in range(ny):
             rows = np.isfinite(residual[:, i]) & np.isfinite(inputs).all(axis=(1, 2))
             U, r = inputs[rows].reshape(rows.sum(), -1), residual[rows, i]
-            if rows.sum() < _FEWEST or not r.any():
+            if rows.sum() < _FEWEST_SAMPLES or not r.any():
                 continue
             size = np.sqrt((U**2).sum(axis=0) * np.mean(r**2))
             z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
             left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > 1e-9 * s[0]]
+            left = left[:, s > _RANK * s[0]]
             if left.shape[1] > len(r) // 2:
                 left = left[:, : len(r) // 2]
             # Explained against unexplained part: an F ratio, as its normal deviate squared.

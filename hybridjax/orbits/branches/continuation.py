@@ -24,14 +24,20 @@ from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .curve import Curve, Failure, Point
 
 
-# Where the step is made shorter and longer: cosine of the turn of the tangent, Newton steps.
-_STRAIGHT, _FEW = 0.97, 3
-# Where to look for a point instead, as parts of a step.
+# A step is halved if the tangent turns by more than the angle of this cosine. (Twice the angle:
+# about half as many points.)
+_STRAIGHT = 0.97
+# The next step is longer if Newton needs at most this many. Doubled, it almost always is.
+_QUICK = 3
+# Where to look for a point instead, as parts of a step: beside a crossing of two branches.
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
-# Test functions below this are rounding errors.
+# Test functions below this are rounding errors. Doubled, points twice as close to a degenerate one
+# are not marked.
 _ROUNDING = 1e-7
-# The first step, and the shortest, relative to the longest.
-_FIRST, _SHORTEST = 0.2, 1e-5
+# The first step, relative to the longest. Doubled, a branch is sometimes lost in its first step.
+_FIRST = 0.2
+# The shortest step, relative to the longest. Doubled, branches end twice as far from a grazing.
+_SHORTEST = 1e-5
 
 
 def continuation(
@@ -177,7 +183,7 @@ class _Trace:
             points.append(there)
             if over:
                 return points, marks, BranchEnd(there.value, Result.OK, "the values end")
-            length = min(self.step, length * (1.5 if there.steps <= _FEW else 1.0))
+            length = min(self.step, length * (1.5 if there.steps <= _QUICK else 1.0))
         end = BranchEnd(
             points[-1].value, Result.STEP_LIMIT, f"{self.max_points} cycles; `max_points` raises it"
         )
@@ -190,7 +196,7 @@ class _Trace:
             before, after = here.tests[kind], there.tests[kind]
             if max(abs(before), abs(after)) < _ROUNDING:
                 continue
-            if before * after >= 0 or (kind == "branch point" and here.turns_before(there)):
+            if before * after >= 0 or (kind == "branch point" and here.folds_before(there)):
                 continue
             event = self.locate(here, there, kind)
             if event is not None:
@@ -244,10 +250,10 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     cycle, stack = curve.cycle, lambda *x: np.stack([np.asarray(y) for y in x])
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
-    r = jax.tree_util.tree_map(stack, *(p.round for p in points))
+    anchor, turn = jax.tree_util.tree_map(stack, *((p.departure, p.turn) for p in points))
     return LimitCycles(
-        systems, cycle.base, r.period, r.start, r.legs, r.factors,
-        np.max(np.abs(r.residual), axis=1), np.array([p.steps for p in points]),
-        np.zeros(len(points), np.int32), front(r.codes.reshape(len(points), -1)),
-        cycle.settings, cycle.conserved, cycle.turns,
+        systems, cycle.base, turn.period, anchor, turn.legs, turn.factors, turn.distance,
+        np.array([p.steps for p in points]), np.zeros(len(points), np.int32),
+        front(turn.codes.reshape(len(points), -1)), cycle.settings, cycle.conserved,
+        cycle.multiplicity,
     )  # fmt: skip

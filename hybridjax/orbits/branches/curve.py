@@ -3,29 +3,42 @@
 import dataclasses
 import functools as ft
 import operator
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Inexact
 
+from ..._core.compile import quick_jit
 from ..._core.results import Result
 from ...engine.lanes import Lanes
 from ...errors import DefinitionError
 from ...systems.structure import Structure
 from ...systems.system import HybridSystem
 from ..cycle import LimitCycle
-from ..return_map import ReturnMap
-from .parameter_map import Round, go_round
+from ..newton import newton_steps
+from ..return_map import ReturnMap, Turn, turn_product
 
 
-# Newton's method: most steps; a step (in sizes of the states) that is small enough, and one from
-# which on rounding errors may be all that is left.
-_MOST, _SMALL, _ROUNDING = 8, 1e-11, 1e-8
+# Newton's steps before a point is given up. Doubled, hopeless ones take longer.
+_MOST = 8
+# Newton's method ends with a step this small, in sizes of the states; from the second number on,
+# rounding errors may be all that is left. Doubled, it sometimes ends one step earlier.
+_SMALL, _ROUNDING = 1e-11, 1e-8
+# Singular values of Newton's equations below this part of the largest are zero. Doubled, points
+# twice as far from a crossing of branches are refused.
+_SINGULAR = 1e-14
 # States that hardly move on the cycle count as if they moved by these parts of the largest move and
-# of their own size; nothing moves if the largest move is this part of the largest state.
-_FLOOR, _SHARE, _REST = 1e-3, 0.02, 1e-6
+# of their own size. Doubled, steps are up to twice as long.
+_FLOOR, _SHARE = 1e-3, 0.02
+# Nothing moves if the largest move is at most this part of the largest state, all in sizes.
+# Doubled, cycles twice as large are taken for an equilibrium.
+_REST = 1e-6
+# A multiplier is complex, and two are conjugate, up to these differences. Doubled, real pairs with
+# the product 1 that are so close are taken for a Neimark-Sacker point.
+_COMPLEX, _CONJUGATE = 1e-9, 1e-6
 
 
 @dataclasses.dataclass
@@ -39,16 +52,19 @@ class Failure:
 class Point:
     """A cycle on the curve.
 
-    **Fields:** `start`, chart and phase at which it is anchored; `z` (d+1,), state and parameter;
-    `size` (d+1,), what counts as 1 in each; `tangent` (d+1,) of the curve, a unit vector in these
-    sizes; `round`, see `extended`; `steps` of Newton.
+    **Fields:** `anchor`, chart and phase (as the time of the first cycle's clock) at which it
+    begins; `departure`, the lane there; `dim`, its number of states; `z` (n,), state (padded) and
+    parameter; `size` (n,), what counts as 1 in each; `tangent` (n,) of the curve, a unit vector in
+    these sizes; `turn` from there; `steps` of Newton.
     """
 
-    start: Lanes
+    anchor: Lanes
+    departure: Lanes
+    dim: int
     z: Float[np.ndarray, " n"]
     size: Float[np.ndarray, " n"]
     tangent: Float[np.ndarray, " n"]
-    round: Round
+    turn: Turn
     steps: int
 
     @property
@@ -66,24 +82,28 @@ class Point:
         theirs = other.tangent * other.size / self.size
         return float(self.tangent @ theirs / np.linalg.norm(theirs))
 
-    def turns_before(self, other: "Point") -> bool:
+    def folds_before(self, other: "Point") -> bool:
         """Whether the parameter turns back between the two."""
         return self.tests["fold"] * other.tests["fold"] < 0
 
     @ft.cached_property
     def scaled(self) -> Float[np.ndarray, "d n"]:
         """Derivatives of the residual, all in sizes."""
-        by_z = np.column_stack([self.round.by_state, self.round.by_parameter])
-        return by_z * self.size / self.size[:-1, None]
+        return _scaled(self.turn, self.size)
 
     @ft.cached_property
-    def eigenvalues(self) -> np.ndarray:
-        return np.linalg.eigvals(self.round.monodromy)
+    def monodromy(self) -> Float[np.ndarray, "m m"]:
+        """Derivative of the return map; for an autonomous system across the flow."""
+        return turn_product(self.turn.factors[None])[0, : self.dim, : self.dim]
+
+    @ft.cached_property
+    def eigenvalues(self) -> Inexact[np.ndarray, " m"]:
+        return np.linalg.eigvals(self.monodromy)
 
     @ft.cached_property
     def tests(self) -> dict[str, float]:
         """Functions that change their signs where a multiplier crosses the unit circle."""
-        M = self.round.monodromy
+        M = self.monodromy
         mu, n = self.eigenvalues, len(M)
         pairs = [mu[i] * mu[j] - 1 for i in range(n) for j in range(i)]
         return {
@@ -98,7 +118,7 @@ class Point:
         mu = self.eigenvalues
         pairs = [(i, j) for i in range(len(mu)) for j in range(i)]
         i, j = min(pairs, key=lambda p: abs(mu[p[0]] * mu[p[1]] - 1))
-        return bool(abs(mu[i].imag) > 1e-9 and abs(mu[i] - np.conj(mu[j])) < 1e-6)
+        return bool(abs(mu[i].imag) > _COMPLEX and abs(mu[i] - np.conj(mu[j])) < _CONJUGATE)
 
 
 class Curve:
@@ -106,10 +126,8 @@ class Curve:
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
-        self.structure = Structure(cycle.system)
-        self.kind = ReturnMap(cycle.base, cycle.conserved, cycle.turns)
-        self.expected = cycle.period
-        self.order = _turned(cycle.order)
+        self.map, self.structure = cycle.return_map, Structure(cycle.system)
+        self.sequence = _rotated(cycle.event_sequence)
         _leaf(cycle.system, parameter)
         flat = jax.tree_util.tree_map(
             lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
@@ -124,17 +142,16 @@ class Curve:
 
     def first(self, value: float) -> Point | Failure:
         """The cycle itself."""
-        n = self.structure.d
-        z = np.append(np.asarray(self.cycle.start.q[:, 0]), value)
-        row = np.append(np.zeros(n), 1.0)
-        size = np.append(np.ones(n), self.span)
-        return self._correct(z, row, size, row, self.cycle.start)
+        z = np.append(np.asarray(self.cycle.anchor.q[:, 0]), value)
+        row = np.append(np.zeros(self.structure.d), 1.0)
+        size = np.append(np.asarray(self.map.sizes), self.span)
+        return self._correct(z, row / size, size, row, self.cycle.anchor)
 
     def step(self, here: Point, length: float) -> Point | Failure:
         """The next point, about `length` further along the tangent."""
         ahead = length * here.tangent * here.size
         point = self._correct(
-            here.z + ahead, here.tangent / here.size, here.size, here.tangent, here.start
+            here.z + ahead, here.tangent / here.size, here.size, here.tangent, here.anchor
         )
         if isinstance(point, Failure):
             return point
@@ -145,7 +162,7 @@ class Curve:
         """The point over a place on the chord from a to b."""
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
-        return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.start)
+        return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.anchor)
 
     def land(self, a: Point, b: Point, value: float) -> Point | Failure:
         """The point between a and b where the parameter has a value."""
@@ -153,7 +170,7 @@ class Curve:
         z = a.z + where * (b.z - a.z)
         z[-1] = value
         row = np.append(np.zeros(len(z) - 1), 1 / a.size[-1])
-        point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.start)
+        point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.anchor)
         if not isinstance(point, Failure):
             point.z[-1] = value
         return point
@@ -164,93 +181,113 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        codes = here.round.codes
+        codes = here.turn.codes
         events = np.flatnonzero((codes >= 0).any(axis=1)) + 0.5
-        if self.kind.base is not None or not len(events):
+        if self.map.base is not None or not len(events):
             return None
         K = len(codes)
         apart = np.abs(np.arange(K)[:, None] - events)
         k = int(np.argmax(np.min(np.minimum(apart, K - apart), axis=1)))
-        legs = here.round.legs
-        phase = legs.t[k : k + 1] / here.round.period * self.expected
-        start = eqx.tree_at(
-            lambda x: (x.t, x.chart), here.start, (jnp.asarray(phase), jnp.asarray(legs.chart[[k]]))
+        legs = here.turn.legs
+        phase = legs.t[k : k + 1] / here.turn.period * float(self.map.expected)
+        anchor = eqx.tree_at(
+            lambda x: (x.t, x.chart),
+            here.anchor,
+            (jnp.asarray(phase), jnp.asarray(legs.chart[[k]])),
         )
         row = np.append(np.zeros(len(here.z) - 1), 1.0)
         forward = row * np.sign(here.tangent[-1])
         z = np.append(legs.q[:, k], here.value)
-        point = self._correct(z, row / here.size, here.size, forward, start)
+        point = self._correct(z, row / here.size, here.size, forward, anchor)
         return None if k == 0 or isinstance(point, Failure) else point
 
-    def _correct(self, z0, row, size, forward, start: Lanes) -> Point | Failure:
+    def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Failure:
         """Newton's method for a point with row @ (z - z0) = 0."""
         z, last = z0.copy(), np.inf
         for k in range(_MOST):
-            round = self._round(z, start)
-            if (failure := self._failure(round)) is not None:
+            departure, turn = self._turn(z, anchor)
+            if (failure := self._failure(turn)) is not None:
                 return failure
-            by_z = np.column_stack([round.by_state, round.by_parameter])
-            A = np.vstack([by_z, row]) * size
-            right = np.append(round.residual, row @ (z - z0))
-            if not np.all(np.isfinite(A)):
+            equations = np.vstack([_scaled(turn, size), row * size])
+            residual = np.append(turn.residual / size[:-1], row @ (z - z0))
+            (change,) = newton_steps(equations[None], residual[None], _SINGULAR)
+            if not np.all(np.isfinite(change)):
                 return Failure(Result.NOT_CONVERGED)
-            change = np.linalg.lstsq(A, -right, rcond=1e-14)[0]
             length = np.linalg.norm(change)
             if length <= _SMALL or (length <= _ROUNDING and length >= 0.5 * last):
-                return self._point(z, forward, start, round, k)
+                dim = self.structure.dims[int(anchor.chart[0])]
+                return self._settled(Point(anchor, departure, dim, z, size, forward, turn, k))
             if length > 2 * last:
                 break
             z, last = z + change * size, length
         return Failure(Result.NOT_CONVERGED)
 
-    def _round(self, z, start: Lanes) -> Round:
-        system = self.system_at(z[-1])
-        out = go_round(
-            system, self.direction, jnp.asarray(z[:-1]), start, self.kind, self.expected,
-            self.cycle.settings,
-        )  # fmt: skip
+    def _turn(self, z, anchor: Lanes) -> tuple[Lanes, Turn]:
+        map = dataclasses.replace(self.map, anchor=anchor)
+        out = _turn_along(map, self.system_at(z[-1]), self.direction, jnp.asarray(z[:-1]))
         return jax.tree_util.tree_map(np.asarray, out)
 
-    def _failure(self, round: Round) -> Failure | None:
-        if int(round.result) != Result.OK:
-            return Failure(Result(int(round.result)))
-        order = _turned(int(g) for g in np.ravel(round.codes) if g >= 0)
-        if sorted(order) != sorted(self.order):
+    def _failure(self, turn: Turn) -> Failure | None:
+        if int(turn.result) != Result.OK:
+            return Failure(Result(int(turn.result)))
+        sequence = _rotated(int(g) for g in np.ravel(turn.codes) if g >= 0)
+        if sorted(sequence) != sorted(self.sequence):
             return Failure(Result.GRAZING)  # events come and go where a guard is touched
-        if order != self.order or not np.all(np.isfinite(round.residual)):
+        if sequence != self.sequence or not np.all(np.isfinite(turn.residual)):
             return Failure(Result.EVENT_ORDER)
         return None
 
-    def _point(self, z, forward, start: Lanes, round: Round, steps: int) -> Point | Failure:
-        moves, largest = self._extent(int(start.chart[0]), z[:-1], round.legs)
+    def _settled(self, point: Point) -> Point | Failure:
+        """The point with sizes and a tangent of its own."""
+        moves, largest = self._extent(point)
         rest = np.max(moves) <= _REST * np.max(largest)
-        if rest and self.kind.base is not None:
+        if rest and self.map.base is not None:
             return Failure(Result.EQUILIBRIUM)
         floor = np.maximum(_FLOOR * np.max(moves), _SHARE * largest)
-        size = np.append(np.ones_like(moves) if rest else np.maximum(moves, floor), self.span)
-        point = Point(start, z, size, forward, round, steps)
+        moves = np.ones_like(moves) if rest else np.maximum(moves, floor)
+        sizes = self._sizes(point)
+        point = dataclasses.replace(point, size=np.append(moves * sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
-        tangent = right[-1] * (1.0 if right[-1] @ forward >= 0 else -1.0)
+        tangent = right[-1] * (1.0 if right[-1] @ point.tangent >= 0 else -1.0)
         return dataclasses.replace(point, tangent=tangent)
 
-    def _extent(self, first: int, q, legs) -> tuple[np.ndarray, np.ndarray]:
-        """By how much each state of the first chart moves on the cycle, in all charts that have a
-        state of its name, and its largest modulus."""
-        s = self.structure
+    def _sizes(self, point: Point) -> Float[np.ndarray, " d"]:
+        return np.asarray(dataclasses.replace(self.map, anchor=point.anchor).sizes)
+
+    def _extent(self, point: Point) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """By how much each state of the anchor's chart moves on the cycle, in all charts that have
+        a state of its name, and its largest modulus, both in sizes of the states."""
+        s, legs, sizes = self.structure, point.turn.legs, self._sizes(point)
         moves, largest = np.zeros(s.d), np.zeros(s.d)
-        for k, name in enumerate(s.charts[first].states):
-            seen = [q[k]]
+        for k, name in enumerate(s.charts[int(point.anchor.chart[0])].states):
+            seen = [point.z[k]]
             for a, chart in enumerate(s.charts):
                 if name in chart.states:
                     seen.extend(legs.q[chart.states.index(name), legs.chart == a])
-            moves[k], largest[k] = np.ptp(seen), np.max(np.abs(seen))
+            moves[k], largest[k] = np.ptp(seen) / sizes[k], np.max(np.abs(seen)) / sizes[k]
         return moves, largest
 
 
-def _turned(order) -> tuple[int, ...]:
+@quick_jit
+def _turn_along(
+    map: ReturnMap, system: HybridSystem, direction: HybridSystem, q: Float[Array, " d"]
+) -> tuple[Lanes, Turn]:
+    """The lane at the beginning, and one turn with derivatives by the state and along `direction`
+    in the parameters: so one program serves all parameters."""
+    own = map.at_phase_of(system)
+    return own.departure(q), own.turn_with_jacobian(q, direction=direction)
+
+
+def _scaled(turn: Turn, size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "d n"]:
+    """Derivatives of the residual by state and parameter, all in sizes."""
+    by_z = np.column_stack([turn.jacobian, turn.by_parameter])
+    return by_z * size / size[:-1, None]
+
+
+def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:
     """Events of a turn, from the same one on wherever the turn begins."""
-    order = tuple(order)
-    return min((order[k:] + order[:k] for k in range(len(order))), default=())
+    events = tuple(sequence)
+    return min((events[k:] + events[:k] for k in range(len(events))), default=())
 
 
 def _leaf(system: HybridSystem, parameter: str):

@@ -1,13 +1,14 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
@@ -19,37 +20,42 @@ from ...engine.lanes import Lanes
 from ...engine.move import move
 from ...engine.settings import TRANSIENT, Settings
 from ...engine.target import toward, until
-from ...sections.families import AtEvent, ListLevels
-from ...systems.structure import Structure
-from ..cycle import LimitCycle
-from ..return_map import ReturnMap, Turn, closes, judge, newton_step, turn_with_jacobian
+from ...sections.crossing import AtEvent
+from ...sections.section_list import ListLevels
+from ...systems.system import HybridSystem
+from ..newton import excess, newton_steps
+from ..return_map import ReturnMap, Turn
 
 
-# Newton steps before a system is given up, or tried again; and before it is left until those that
-# need more steps than most go on together.
-_NEWTON, _USUAL = 6, 3
-# Periods for which a system flows freely before Newton tries again.
+# Newton steps before a system is given up, or tried again. Doubled, hopeless systems cost twice as
+# much.
+_NEWTON = 6
+# Newton steps before a system is left until those that need more steps than most go on together.
+# Doubled, few of a call's systems are still going in its last steps.
+_USUAL = 3
+# Periods for which a system flows freely before Newton tries again. Doubled, slower transients die
+# out, and each failure takes twice as long.
 _SETTLE = 40
 # Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
-# get no slope.
+# get no slope. Doubled, a few more do not.
 _RIDGE = 1e-12
-# A step with a guessed Jacobian is taken if it is at most this part of the state.
-_NEAR = 0.03
-# Up to this many parameters, guesses from neighbors are quadratic.
-_FEW = 4
+# A step with a guessed Jacobian is taken if it is at most this part of the states' sizes. Doubled,
+# more are taken, and more of them lead astray.
+_NEAR = 0.06
+# Up to this many parameters, guesses from neighbors are quadratic: their number of terms grows with
+# the square. Doubled, four times as many neighbors are needed.
+_QUADRATIC = 4
 
 
 class Rounds(NamedTuple):
     """What the last Newton step of S systems saw; S is the leading axis of every array."""
 
-    start: Lanes
-    jacobian: Float[np.ndarray, "S d d"]
-    size: Float[np.ndarray, " S"]
-    """Of that step, relative to the tolerance; infinite where the turn was too long, NaN where it
-    failed."""
+    anchor: Lanes
+    excess: Float[np.ndarray, " S"]
+    """Size of that step relative to the tolerance; infinite where the turn was too long, NaN where
+    it failed."""
     period: Float[np.ndarray, " S"]
-    factors: Float[np.ndarray, "S K d d"]
-    seen: Turn
+    turn: Turn
     """Without the codes of events,"""
     codes: Int[np.ndarray, "S E"]
     """which stand here, filled up with -1."""
@@ -60,10 +66,10 @@ class Rounds(NamedTuple):
 class Tiles(NamedTuple):
     """How the systems are solved."""
 
-    systems: Any
+    systems: HybridSystem
     """Their arrays have a leading axis of S systems."""
-    guess: LimitCycle
-    settings: Settings
+    map: ReturnMap
+    """That of the guess, with the settings asked for."""
     size: int
     """Systems in one compiled call."""
     workers: int
@@ -103,15 +109,15 @@ class Tiles(NamedTuple):
             out = _join(out, part._replace(steps=part.steps + 1))
             bar.update(len(rows))
         bar.close()
-        late = np.flatnonzero(out.size > 1)
+        late = np.flatnonzero(out.excess > 1)
         if len(late):
-            start, period = _pick((out.start, out.period), late)
-            part = self._newton(order[late], start, period, _NEWTON - _USUAL)
+            anchor, period = _pick((out.anchor, out.period), late)
+            part = self._newton(order[late], anchor, period, _NEWTON - _USUAL)
             out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
         return _pick(self._again(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
-        given = self.guess.start, self.guess.period
+        given = self.map.anchor, self.map.expected
         return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
 
     def _again(self, rows, out: Rounds) -> Rounds:
@@ -130,20 +136,20 @@ class Tiles(NamedTuple):
 
     def _by_neighbors(self, known, out: Rounds, wanted):
         """The cycle of the nearest system, moved as those around it in the same chart suggest:
-        its start, its period, and the Jacobian there (NaN where nothing is known)."""
+        its anchor, its period, and the Jacobian there (NaN where nothing is known)."""
         ok = np.flatnonzero(out.result == Result.OK)
         if not len(ok):
-            blank = np.full((len(wanted), *out.jacobian.shape[1:]), np.nan)
+            blank = np.full((len(wanted), *out.turn.jacobian.shape[1:]), np.nan)
             return *self._given(len(wanted)), blank
         known = known[ok]
         terms = _powers(known[:1]).shape[1]
         _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
-        start, period, jacobian = _pick((out.start, out.period, out.jacobian), ok)
+        anchor, period, jacobian = _pick((out.anchor, out.period, out.turn.jacobian), ok)
         flat = jacobian.reshape(len(ok), -1)
-        values = np.concatenate([start.q[..., 0], period[:, None], flat], axis=1)
-        same = start.chart[near] == start.chart[first][:, None]
+        values = np.concatenate([anchor.q[..., 0], period[:, None], flat], axis=1)
+        same = anchor.chart[near] == anchor.chart[first][:, None]
         apart = _powers(known[near] - known[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
         across = apart.transpose(0, 2, 1)
@@ -152,47 +158,54 @@ class Tiles(NamedTuple):
         ridge = np.where(size > 0, _RIDGE * size, 1.0) * np.eye(gram.shape[-1])
         slope = np.linalg.solve(gram + ridge, across @ change)
         guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
-        d = start.q.shape[1]
-        start = eqx.tree_at(lambda x: x.q, _pick(start, first), guess[:, :d, None])
-        return start, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
+        d = anchor.q.shape[1]
+        anchor = eqx.tree_at(lambda x: x.q, _pick(anchor, first), guess[:, :d, None])
+        return anchor, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
 
-    def _first_step(self, rows, start: Lanes, period, jacobian):
+    def _first_step(self, rows, anchor: Lanes, period, jacobian):
         """Newton's first step, with Jacobians that are guessed, where it is a small one."""
         if not np.isfinite(jacobian).any():
-            return start, period
-        turned = self._in_tiles(self._turn, self._threads, rows, start, period, wanted=False)
-        start, period, residual, *_ = turned
-        before = start.q[..., 0]
-        q, _ = newton_step(before, residual, jacobian)
-        small = (np.abs(q - before) <= _NEAR * (1 + np.abs(before))).all(axis=1, keepdims=True)
-        q = np.where(small, q, before)
-        return eqx.tree_at(lambda x: x.q, start, q[..., None]), period
+            return anchor, period
+        turned = self._in_tiles(self._turn, self._threads, rows, anchor, period, wanted=False)
+        anchor, period, turn, _ = turned
+        sizes, step = self._step_from(anchor, turn.residual, jacobian)
+        small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
+        q = anchor.q[..., 0] + np.where(small, step * sizes, 0.0)
+        return eqx.tree_at(lambda x: x.q, anchor, q[..., None]), period
 
-    def _newton(self, rows, start: Lanes, period, steps: int) -> Rounds:
+    def _newton(self, rows, anchor: Lanes, period, steps: int) -> Rounds:
         """Newton's method; systems that are done make room for others."""
-        out = self._step(rows, start, period)
+        out = self._step(rows, anchor, period)
         for _ in range(steps - 1):
-            going = np.flatnonzero(out.size > 1)
+            going = np.flatnonzero(out.excess > 1)
             if not len(going):
                 break
-            part = self._step(rows[going], *_pick((out.start, out.period), going))
+            part = self._step(rows[going], *_pick((out.anchor, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        judged = self._in_tiles(self.programs.verdict, 1, rows, out.start, out.period, out.seen)
-        start, period, factors, result = judged
-        return out._replace(start=start, period=period, factors=factors, result=result)
+        judged = self._in_tiles(self.programs.verdict, 1, rows, out.anchor, out.period, out.turn)
+        anchor, period, result = judged
+        return out._replace(anchor=anchor, period=period, result=result)
 
-    def _step(self, rows, start: Lanes, period) -> Rounds:
+    def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
-        start, period, residual, jacobian, seen, codes = self._in_tiles(
-            self._turn, self._threads, rows, start, period
+        anchor, period, turn, codes = self._in_tiles(
+            self._turn, self._threads, rows, anchor, period
         )
-        q, size = newton_step(start.q[..., 0], residual, jacobian)
+        sizes, step = self._step_from(anchor, turn.residual, turn.jacobian)
+        q = anchor.q[..., 0] + step * sizes
+        size = excess(q / sizes, step)
         # A turn that closes but met its section too often was given too long a period.
-        extra = closes(start.q[..., 0], seen) & (seen.meetings > self.guess.turns)
-        period[extra] = self.guess.turns * seen.period[extra] / seen.meetings[extra]
+        extra = turn.closed & (turn.meetings > self.map.multiplicity)
+        period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
         size[extra] = np.inf
-        start, once = eqx.tree_at(lambda x: x.q, start, q[..., None]), np.ones(len(rows), int)
-        return Rounds(start, jacobian, size, period, seen.factors, seen, codes, -once, once)
+        anchor, once = eqx.tree_at(lambda x: x.q, anchor, q[..., None]), np.ones(len(rows), int)
+        return Rounds(anchor, size, period, turn, codes, -once, once)
+
+    def _step_from(self, anchor: Lanes, residual, jacobian):
+        """Sizes of the states (S, d) of some systems, and their Newton steps in these sizes."""
+        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
+        scaled = jacobian * sizes[:, None, :] / sizes[:, :, None]
+        return sizes, newton_steps(scaled, residual / sizes)
 
     def _turn(self, *arguments, wanted: bool = True):
         *found, codes = self.programs.turn(*arguments, np.asarray(wanted))
@@ -202,7 +215,7 @@ class Tiles(NamedTuple):
     def _threads(self) -> int:
         """One where programs factorize matrices (`held`): in several threads of XLA's pool, these
         would wait for each other forever."""
-        return 1 if self.guess.conserved else self.workers
+        return 1 if self.map.conserved else self.workers
 
     def _in_tiles(self, work, workers: int, rows, *arguments, **options):
         """`work` for some systems, in calls of one size, so that there is one program for all."""
@@ -211,7 +224,7 @@ class Tiles(NamedTuple):
         def tile(k):
             some = np.arange(k, k + self.size) % len(rows)
             systems = eqx.combine(_pick(arrays, rows[some]), rest)
-            part = work(systems, self.guess, *_pick(arguments, some), self.settings, **options)
+            part = work(systems, self.map, *_pick(arguments, some), **options)
             return _pick(part, slice(len(rows) - k))
 
         return _join(*in_threads(tile, range(0, len(rows), self.size), workers))
@@ -220,7 +233,7 @@ class Tiles(NamedTuple):
 def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:
     """x, and for few parameters the products of two of its columns."""
     p = x.shape[-1]
-    i, j = np.triu_indices(p if p <= _FEW else 0)
+    i, j = np.triu_indices(p if p <= _QUADRATIC else 0)
     return np.concatenate([x, x[..., i] * x[..., j]], axis=-1)
 
 
@@ -261,67 +274,60 @@ def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     return out
 
 
-def _kind(guess: LimitCycle) -> ReturnMap:
-    return ReturnMap(guess.base, guess.conserved, guess.turns)
+def _own(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
+    """The return map of a system, begun at the same phase of its own clock."""
+    own = map.at_phase_of(system)
+    if map.base is not None:
+        own = dataclasses.replace(own, expected=expected)
+    anchor = eqx.tree_at(lambda x: x.t, anchor, own.anchor.t)
+    return dataclasses.replace(own, anchor=anchor)
 
 
-def _turn(systems, guess: LimitCycle, start: Lanes, period, settings, wanted):
-    """One turn of every system from its start, at the same phase of its own clock, with the
-    Jacobian if it is `wanted`."""
+def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
+    """One turn of every system from its anchor, with the Jacobian if it is `wanted`."""
 
-    def one(system, start, expected):
-        start, expected = _on_clock(system, guess, start, expected)
-        kind = _kind(guess)
-        residual, seen, jacobian = turn_with_jacobian(
-            start.q[:, 0], system, start, kind, expected, settings, wanted
-        )
-        bare = eqx.tree_at(lambda x: x.codes, seen, None)
-        return start, expected, residual, jacobian, bare, seen.codes.ravel()
+    def one(system, anchor, expected):
+        own = _own(map, system, anchor, expected)
+        turn = own.turn_with_jacobian(own.anchor.q[:, 0], wanted)
+        return own.anchor, own.expected, turn._replace(codes=None), turn.codes.ravel()
 
-    return eqx.filter_vmap(one)(systems, start, period)
+    return eqx.filter_vmap(one)(systems, anchor, period)
 
 
-def _verdict(systems, guess: LimitCycle, start: Lanes, period, seen: Turn, settings):
-    """The starts ready to be left, periods, factors, and result codes."""
+def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
+    """The anchors ready to be left, periods, and result codes."""
 
-    def one(system, start, expected, seen):
-        return judge(start.q[:, 0], seen, system, start, _kind(guess), expected, settings)
+    def one(system, anchor, expected, turn):
+        own, q = _own(map, system, anchor, expected), anchor.q[:, 0]
+        period = own.expected if own.base is None else turn.period
+        return own.departure(q), period, own.judge(q, turn)
 
-    return eqx.filter_vmap(one)(systems, start, period, seen)
+    return eqx.filter_vmap(one)(systems, anchor, period, turn)
 
 
-def _settled(systems, guess: LimitCycle, start: Lanes, period, settings):
+def _settled(systems, map: ReturnMap, anchor: Lanes, period):
     """Where systems are after they have flowed freely for a while, at the guess's phase or
     section (NaN for those that do not get there), and their expected periods."""
-    base = guess.base
-    patient = Settings(rtol=TRANSIENT, atol=TRANSIENT, max_steps=512 * _SETTLE)
+    base = map.base
+    patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
 
-    def one(system, start, expected):
-        start, expected = _on_clock(system, guess, start, expected)
-        s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
-        moved = move(s, start, u, until(start.t + _SETTLE * expected), patient)
+    def one(system, anchor, expected):
+        own = _own(map, system, anchor, expected)
+        s, anchor, expected = own.structure, own.anchor, own.expected
+        u = jnp.zeros((s.nu, 1))
+        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
         if base is not None:
             at_event = isinstance(base, AtEvent)
             event = s.transition_index(base.name) if at_event else -1
             target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
             if not at_event:
-                target = eqx.tree_at(
-                    lambda x: x.levels, target, ListLevels((base,)), is_leaf=lambda x: x is None
-                )
+                target = dataclasses.replace(target, levels=ListLevels((base,)))
             moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
-        start = eqx.tree_at(lambda x: (x.chart, x.q), start, (moved.lanes.chart, q))
-        return start, expected
+        anchor = eqx.tree_at(lambda x: (x.chart, x.q), anchor, (moved.lanes.chart, q))
+        return anchor, expected
 
-    return eqx.filter_vmap(one)(systems, start, period)
-
-
-def _on_clock(system, guess: LimitCycle, start: Lanes, expected: Array):
-    """The start at the same phase of this system's clock, and its period."""
-    if guess.clocked:
-        expected = guess.turns * jnp.asarray(system.period(), float)
-        start = eqx.tree_at(lambda x: x.t, start, guess.start.t / guess.period * expected)
-    return start, expected
+    return eqx.filter_vmap(one)(systems, anchor, period)
 
 
 class Programs(NamedTuple):

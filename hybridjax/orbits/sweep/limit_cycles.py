@@ -1,6 +1,7 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -15,13 +16,17 @@ from ..._core.threads import thread_count
 from ...engine.lanes import Lanes
 from ...engine.settings import SWEEP, Settings
 from ...errors import DefinitionError
-from ...systems.structure import check_system
+from ...sections.crossing import AtEvent, Crossing
+from ...systems.structure import Structure, check_system
 from ...systems.system import HybridSystem
 from ..cycle import LimitCycle
+from ..return_map import turn_product
+from ..scale import given_sizes, scale_of
 from .batches import FULL, QUICK, Tiles
 
 
 # Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
+# Doubled, it is 6 s.
 _SMALL = 2000
 
 
@@ -30,17 +35,17 @@ class LimitCycles(eqx.Module):
 
     **Fields**, with the systems on the first axis:
 
-    - `systems`; `period` (S,); `start`, the states at which they are anchored; `legs`, `factors`:
-        see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `systems`; `period` (S,); `anchor`, the lanes at which they begin; `legs`, `factors`: see
+        `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
-    `base`, `settings`, `conserved` and `turns` are those of every cycle.
+    `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
     """
 
     systems: HybridSystem
-    base: object
+    base: Crossing | AtEvent | None
     period: Float[np.ndarray, " S"]
-    start: Lanes
+    anchor: Lanes
     legs: Lanes
     factors: Float[np.ndarray, "S K d d"]
     residual: Float[np.ndarray, " S"]
@@ -49,7 +54,7 @@ class LimitCycles(eqx.Module):
     codes: Int[np.ndarray, "S R"]
     settings: Settings
     conserved: dict[str, Float[Array, ""]]
-    turns: int = eqx.field(static=True)
+    multiplicity: int = eqx.field(static=True)
 
     def __len__(self) -> int:
         return len(self.result)
@@ -59,11 +64,11 @@ class LimitCycles(eqx.Module):
         pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
-            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.start),
+            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.anchor),
             pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
             pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
-            self.conserved, self.turns,
+            self.conserved, self.multiplicity,
         )  # fmt: skip
 
     @property
@@ -83,11 +88,7 @@ class LimitCycles(eqx.Module):
         Eigenvalues of the product of the factors, filled up with zeros: those far below the
         largest are lost in rounding. `cycles[i].multipliers` sees them, too.
         """
-        factors = np.asarray(self.factors)
-        product = factors[:, 0]
-        for k in range(1, factors.shape[1]):
-            product = factors[:, k] @ product
-        product = np.where(self.ok[:, None, None], product, 0.0)
+        product = np.where(self.ok[:, None, None], turn_product(np.asarray(self.factors)), 0.0)
         values = np.linalg.eigvals(product).astype(complex)
         order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
         values = np.take_along_axis(values, order, axis=-1)
@@ -110,6 +111,7 @@ def find_limit_cycles(
     systems: HybridSystem | Sequence[HybridSystem],
     guess: LimitCycle,
     *,
+    scale: Mapping[str, float] | None = None,
     settings: Settings | None = None,
     batch: int = 250,
     workers: int | None = None,
@@ -127,6 +129,7 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
+    - `scale`: sizes of states by name, by default those of the guess.
     - `settings`: accuracy of the flow; by default 1e-9 per step.
     - `batch`: systems per compiled call.
     - `workers`: threads that run calls at the same time; by default all cores on CPU.
@@ -137,25 +140,29 @@ def find_limit_cycles(
 
     **Raises:** `DefinitionError` for systems that do not belong together.
     """
-    settings = Settings(rtol=SWEEP, atol=SWEEP) if settings is None else settings
     systems = _stacked(systems)
     require_x64(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
+    settings = Settings(rtol=SWEEP, atol=SWEEP) if settings is None else settings
     if not isinstance(guess, LimitCycle):
         raise DefinitionError(
             f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
             "find_limit_cycle first."
         )
+    s = Structure(guess.system)
+    known = guess.settings.scale if settings.scale is None else settings.scale
+    settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
+    map = dataclasses.replace(guess.return_map, settings=settings)
     programs = QUICK if S <= _SMALL else FULL
-    tiles = Tiles(systems, guess, settings, min(batch, S), thread_count(workers), programs)
+    tiles = Tiles(systems, map, min(batch, S), thread_count(workers), programs)
     found = tiles.solve(S, progress)
-    seen = found.seen
+    turn = found.turn
     return LimitCycles(
-        systems, guess.base, found.period, found.start, seen.legs, found.factors,
-        seen.distance, found.steps, found.result, found.codes, settings, guess.conserved,
-        guess.turns,
+        systems, guess.base, found.period, found.anchor, turn.legs, turn.factors,
+        turn.distance, found.steps, found.result, found.codes, settings, guess.conserved,
+        guess.multiplicity,
     )  # fmt: skip
 
 

@@ -1,0 +1,215 @@
+"""Equinox modules in npz files with a JSON header, written whole or not at all.
+
+One array per array field, named like the field (`outer.inner` where a field is a module itself),
+and the array `header`. Nothing in a file is ever executed: there is no pickle, and a reader builds
+only the kinds that it asks for, by their own checked constructors.
+"""
+
+import contextlib
+import dataclasses
+import inspect
+import io
+import json
+import os
+import types
+import typing
+import uuid
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import jaxtyped
+
+from .. import __version__
+from ..errors import DefinitionError, FileFormatError, HybridJaxError
+
+
+_FORMAT, _VERSION = "hybridjax", 2
+_HEADER = "header"
+
+
+def write_module(path: Path, thing: eqx.Module) -> None:
+    """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
+
+    **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
+    written.
+    """
+    kind = type(thing).__name__
+    if (wrong := _wrong_field(thing)) is not None:
+        raise DefinitionError(f"this {kind} cannot be saved: {wrong}.")
+    static, arrays = _taken_apart(thing)
+    header = {
+        "format": _FORMAT,
+        "format_version": _VERSION,
+        "package_version": __version__,
+        "kind": kind,
+        "static": static,
+        "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
+        "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
+    }
+    text = json.dumps(header, indent=1, default=lambda x: x.item())
+    _write(path, {_HEADER: np.array(text), **arrays})
+
+
+def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
+    """Read a module of one of these kinds.
+
+    **Raises:** `DefinitionError` if the file cannot be read; `FileFormatError` if it is damaged, of
+    another format or version, or holds something else.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
+    members = _unpack(path, content)
+    header = _read_header(path, members.pop(_HEADER, None), kinds)
+    kind = kinds[header["kind"]]
+    if set(header["arrays"]) != set(members):
+        raise damaged(path, "its arrays are not those that its header lists")
+    try:
+        thing = _put_together(kind, header["static"], members)
+    except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise damaged(path, f"its content is no {kind.__name__} ({error})") from error
+    if (wrong := _wrong_field(thing)) is not None:
+        raise damaged(path, wrong)
+    return thing
+
+
+def damaged(path: Path, reason: str) -> FileFormatError:
+    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}.")
+
+
+def _taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Static fields and arrays; a module among the fields becomes a dictionary of its own static
+    fields, and arrays with its name before theirs."""
+    static, arrays = {}, {}
+    for field in dataclasses.fields(thing):
+        value = getattr(thing, field.name)
+        if field.metadata.get("static", False):
+            static[field.name] = value
+        elif isinstance(value, eqx.Module):
+            static[field.name], inner = _taken_apart(value)
+            arrays |= {f"{field.name}.{name}": array for name, array in inner.items()}
+        elif value is not None:
+            arrays[field.name] = np.asarray(value)
+    return static, arrays
+
+
+def _put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+    """The module that `_taken_apart` took apart. Fields that are not there are `None`, or have
+    their defaults where they are static."""
+    other = ValueError(f"its fields are not those of {kind.__name__}")
+    if not isinstance(static, dict):
+        raise other
+    static, arrays, values = dict(static), dict(arrays), {}
+    for field in dataclasses.fields(kind):
+        name, inner = field.name, _module_in(field.type)
+        if field.metadata.get("static", False):
+            if name in static:
+                values[name] = _tuples(static.pop(name))
+            elif field.default is dataclasses.MISSING:
+                raise other
+        elif inner is not None and name in static:
+            own = {k: arrays.pop(k) for k in list(arrays) if k.startswith(f"{name}.")}
+            own = {k.removeprefix(f"{name}."): array for k, array in own.items()}
+            values[name] = _put_together(inner, static.pop(name), own)
+        else:
+            values[name] = arrays.pop(name, None)
+    if static or arrays:
+        raise other
+    return kind(**values)
+
+
+def _module_in(hint: Any) -> type | None:
+    """The kind of module that a field of this type may hold."""
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return next((x for x in options if isinstance(x, type) and issubclass(x, eqx.Module)), None)
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """All or nothing: a temporary file in the same folder takes the place of `path`."""
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        with open(temporary, "xb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _unpack(path: Path, content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an npz file. Whole members are read, so that their checksums are checked."""
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")
+    try:
+        arrays = {}
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for info in archive.infolist():
+                if info.file_size > len(content):  # files are not compressed
+                    raise ValueError("a member is larger than the file")
+                stream = io.BytesIO(archive.read(info))
+                array = np.lib.format.read_array(stream, allow_pickle=False)
+                if stream.read(1):
+                    raise ValueError("an array ends before its data")
+                arrays[info.filename.removesuffix(".npy")] = array
+        return arrays
+    except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
+        raise damaged(path, str(error) or type(error).__name__) from error
+
+
+def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:
+    try:
+        header = json.loads(array.item() if array is not None else "")
+        name, version = header["format"], header["format_version"]
+    except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
+        name = None
+    if name != _FORMAT:
+        raise FileFormatError(f"'{path}' was not written by hybridjax.save.")
+    if version != _VERSION:
+        raise FileFormatError(
+            f"'{path}' has format version {version} (hybridjax {header.get('package_version')}), "
+            f"but hybridjax {__version__} reads version {_VERSION}: use a matching hybridjax."
+        )
+    kind = header.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise FileFormatError(f"'{path}' holds a {kind!r}; load knows {', '.join(kinds)}.")
+    if not all(isinstance(header.get(part), dict) for part in ("static", "arrays")):
+        raise damaged(path, "its header is incomplete")
+    return header
+
+
+def _tuples(value: Any) -> Any:
+    """JSON's lists as the tuples that they were."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _wrong_field(thing: eqx.Module) -> str | None:
+    """The first field that is not what its annotation says; array axes of one name must agree."""
+    with jaxtyped("context"):
+        for field in dataclasses.fields(thing):
+            value = getattr(thing, field.name)
+            if not _matches(value, field.type):
+                what = f"{value.dtype}{value.shape}" if hasattr(value, "dtype") else repr(value)
+                return f"{field.name} is {what}"
+            if isinstance(value, eqx.Module) and (wrong := _wrong_field(value)) is not None:
+                return f"{field.name}.{wrong}"
+    return None
+
+
+def _matches(value: Any, hint: Any) -> bool:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType or origin is typing.Union:
+        return any(_matches(value, option) for option in arguments)
+    if origin is tuple:  # tuple[X, ...], the only form in use
+        return isinstance(value, tuple) and all(_matches(x, arguments[0]) for x in value)
+    if hint is int:
+        return isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return isinstance(value, hint)

@@ -1,0 +1,126 @@
+"""The response of a hybrid system around its limit cycle to inputs: many experiments, compiled."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._core.results import Result, update_result
+from ..engine.move import Moved, move
+from ..engine.settings import Settings
+from ..maps.outputs import observe
+from ..maps.placed import PlacedSections
+from ..systems.output import Output
+from ..systems.structure import Structure
+from .stepping.plan import Plan
+
+
+# The error that rounding alone may leave at a section, relative to the states' scales. Twice as
+# much is seen in `error` only where accuracies near 1e-13 are asked for.
+ROUNDING = 1e-13
+
+
+class EventLog(NamedTuple):
+    """Events of S experiments between consecutive sections, the first K of each interval."""
+
+    time: Float[Array, "S n K"]
+    """Since the limit cycle passed section 0 at the start of this turn."""
+    event: Int[Array, "S n K"]
+    """Transitions by index; beyond `count` without meaning, as their times."""
+    count: Int[Array, "S n"]
+    """How many events there were, which may be more than K."""
+
+
+class Response(NamedTuple):
+    """What becomes of S experiments of n samples."""
+
+    y: Float[Array, "S n ny"]
+    """Outputs at the sections, before the new input acts; NaN after a failure."""
+    result: Int[Array, " S"]
+    """Codes of `Result`."""
+    failed_at: Int[Array, " S"]
+    """The sample at which an experiment failed, or -1."""
+    error: Float[Array, " S"]
+    """Estimate of the largest error of (t, q) at any section, relative to the states' scales."""
+    end: Float[Array, "S m"]
+    """Times and states on section 0 after the last sample, the time counted within one period as
+    that of the start is; NaN after a failure."""
+    log: EventLog | None
+    """Events, if they were asked for."""
+
+
+def flow_batch(
+    placed: PlacedSections,
+    plan: Plan,
+    start: Float[Array, "m S"],
+    u: Float[Array, "S n nu"],
+    outputs: Sequence[str | Output],
+    settings: Settings,
+    event_log: int = 0,
+) -> Response:
+    """Flow S experiments from section 0 through n sections under inputs held between them, n a
+    multiple of N.
+
+    `start` holds times and (padded) states at section 0; `event_log`, how many events between two
+    sections are kept. Differentiable in both modes; reverse mode stores the states at the sections,
+    and computes what lies between them again.
+    """
+    system, cycle = placed.cycle.system, placed.cycle
+    s = Structure(system)
+    z = s.resolve_outputs(outputs)
+    N, (S, n, _) = placed.n_sections, u.shape
+    one_turn = len(cycle.event_sequence)
+    first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
+    lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
+    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
+
+    @jax.checkpoint
+    def section(carry, xs):
+        lanes, result = carry
+        k, u = xs
+        i, j = k % N, (k + 1) % N
+        y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
+        turns = (j == 0).astype(jnp.int32)
+        target = placed.target(j[None], lanes.t, turns[None])
+        target = dataclasses.replace(target, order=cycle.event_sequence)
+        stride = plan.stride(i, S)
+        moved = move(
+            s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log
+        )
+        # An event may change places with a section, but none may be left out or come in addition.
+        due = placed.lanes.events[j] + turns * one_turn
+        wrong = jnp.abs(moved.lanes.events - due) > 1
+        result = update_result(moved.result, wrong, Result.EVENT_ORDER)
+        # Times and events are counted within one turn, so that every turn is computed alike.
+        lanes = eqx.tree_at(
+            lambda x: (x.t, x.events),
+            moved.lanes,
+            (moved.lanes.t - turns * cycle.period, moved.lanes.events - turns * one_turn),
+        )
+        ok = result == Result.OK
+        share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
+        return (lanes, result), (
+            y,
+            ok,
+            jax.lax.stop_gradient(share),
+            _log(moved, first.t) if event_log else None,
+        )
+
+    xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
+    begin = (lanes, jnp.zeros(S, jnp.int32))
+    (lanes, result), (y, ok, shares, log) = jax.lax.scan(section, begin, xs)
+    failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
+    each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
+    error = ROUNDING + jnp.max(each_turn, axis=0)
+    end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
+    y, log = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x, -1, 0), (y, log))
+    return Response(y, result, failed_at, error, end.T, log)
+
+
+def _log(moved: Moved, beginning: Float[Array, " 1"]) -> EventLog:
+    """The events on the way to one section, time counted from `beginning`."""
+    return EventLog(moved.log.time - beginning, moved.log.event, moved.log.count)

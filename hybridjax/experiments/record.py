@@ -1,0 +1,157 @@
+"""Recorded inputs and outputs at the sections of a cycle, of any length and with gaps."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import Numbers, names
+from ..errors import DefinitionError
+
+
+class Record(eqx.Module):
+    """One stretch of recorded inputs and outputs, of any length, with any input.
+
+    **Fields**, on the host:
+
+    - `u` (n, nu): inputs, held from sample i to i + 1. NaN where not known: the record is then
+      cut there, and the state after it is unknown.
+    - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
+      sample is missing or bad.
+    - `n_sections`: N. `first_section`: the section of sample 0. `inputs`, `outputs`: names.
+    - `lead`: y[i] may depend on inputs up to `u[i + lead]`: smoothing, or sections that were placed
+      by what came later.
+    - `drift`: the outputs at each section also hold an unknown part that changes more slowly than
+      in so many cycles; infinite: a constant, as where an average cycle was subtracted. None: they
+      hold nothing but the response.
+    """
+
+    u: Float[np.ndarray, "n nu"]
+    y: Float[np.ndarray, "n ny"]
+    n_sections: int = eqx.field(static=True)
+    first_section: int = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    lead: int = eqx.field(static=True, default=0)
+    drift: float | None = eqx.field(static=True, default=None)
+
+    def __init__(
+        self,
+        u: Numbers,
+        y: Numbers,
+        *,
+        n_sections: int,
+        first_section: int = 0,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        lead: int = 0,
+        drift: int | float | None = None,
+    ):
+        """**Raises:** `DefinitionError` for shapes that do not fit together, or infinite values."""
+        self.u, self.y = _columns("u", u), _columns("y", y)
+        if len(self.u) != len(self.y) or 0 in self.u.shape + self.y.shape:
+            raise DefinitionError(
+                "u must have the shape (samples, inputs) and y (samples, outputs), not "
+                f"{self.u.shape} and {self.y.shape}."
+            )
+        if n_sections < 1 or not 0 <= first_section < n_sections:
+            raise DefinitionError(
+                "a record needs n_sections >= 1 and a first_section from 0 to n_sections - 1, not "
+                f"{n_sections} and {first_section}."
+            )
+        if lead < 0:
+            raise DefinitionError(f"lead must not be negative, but is {lead}.")
+        if drift is not None and not drift > 0:
+            raise DefinitionError(f"drift must be a positive number of cycles, not {drift}.")
+        self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
+        self.drift = None if drift is None else float(drift)
+        self.inputs = names("inputs", inputs, self.u.shape[1])
+        self.outputs = names("outputs", outputs, self.y.shape[1])
+
+    @property
+    def records(self) -> tuple["Record"]:
+        """Itself alone, so that a record may stand wherever data of several may."""
+        return (self,)
+
+    def part(self, first: int, stop: int) -> "Record":
+        """The samples `first`, ..., `stop - 1` as a record of their own.
+
+        **Raises:** `DefinitionError` if there are none.
+        """
+        return Record(
+            self.u[first:stop],
+            self.y[first:stop],
+            n_sections=self.n_sections,
+            first_section=(self.first_section + first) % self.n_sections,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            lead=self.lead,
+            drift=self.drift,
+        )
+
+    def __repr__(self) -> str:
+        missing = int(np.isnan(self.y).any(axis=1).sum())
+        gaps = f", {missing} with gaps" if missing else ""
+        return (
+            f"Record({len(self.u)} samples from section {self.first_section}{gaps}; "
+            f"N = {self.n_sections}; {', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+        )
+
+
+@runtime_checkable
+class HasRecords(Protocol):
+    """Whatever is made of records: `Record`, `ExperimentData`, `SectionData`."""
+
+    @property
+    def records(self) -> Sequence[Record]: ...
+
+
+RecordedData = HasRecords | Iterable[HasRecords]
+"""What fits to series take: data made of records, or several such data."""
+
+
+def uninterrupted_records(data: RecordedData) -> list[Record]:
+    """All records, cut where an input is unknown, so that no input is NaN in what is returned.
+
+    The output just at an unknown input is not used, since it may feel it directly, nor are those
+    `lead` samples earlier.
+
+    **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
+    """
+    parts = [data] if isinstance(data, HasRecords) else data
+    records = [record for part in parts for record in part.records]
+    if not records:
+        raise DefinitionError("there is no experiment that ran to its end.")
+    kinds = {(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records}
+    if len(kinds) > 1:
+        a, b = sorted(kinds, key=str)[:2]
+        raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
+    found = [part for record in records for part in _with_known_inputs(record)]
+    if not found:
+        raise DefinitionError("the input is NaN at every sample.")
+    return found
+
+
+def _with_known_inputs(record: Record) -> Iterator[Record]:
+    known = np.isfinite(record.u).all(axis=1)
+    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
+    for first, stop in edges.reshape(-1, 2).tolist():
+        part = record.part(first, stop)
+        part.y[max(len(part.y) - record.lead, 0) :] = np.nan  # (`part` copies)
+        yield part
+
+
+def _columns(name: str, values: Numbers) -> Float[np.ndarray, "n columns"]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.ndim != 2:
+        raise DefinitionError(
+            f"{name} must hold real numbers on two axes, not {array.dtype} of shape {array.shape}."
+        )
+    bad = np.argwhere(np.isinf(array))
+    if len(bad):
+        raise DefinitionError(
+            f"{name} is infinite at sample {bad[0][0]}; put NaN where a sample is bad."
+        )
+    return array.astype(float)

@@ -1,0 +1,276 @@
+"""What the limit cycle teaches about the way from each section to the next.
+
+A plan serves prediction, step lengths and error estimates, not control flow: lanes that go another
+way than the cycle are integrated just as well, only perhaps in more steps.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..._core.compile import quick_jit
+from ..._core.memo import Memory
+from ..._core.results import Result
+from ...engine.move import move
+from ...engine.settings import Settings
+from ...engine.stride import Stride
+from ...engine.watch import watch
+from ...errors import DefinitionError
+from ...maps.place import PATIENCE
+from ...maps.placed import PlacedSections
+from ...systems.structure import Structure
+
+
+# Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
+# steps whose error estimate is at most this part of the tolerance. Twice as many of either take
+# longer to try, and find ways that are a little cheaper.
+_EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
+_TOLERANCES = (1.0, 1e-2, 1e-4)
+# The relative tolerance of the reference to which the ways are compared. Twice as much shows where
+# accuracies near 1e-13 are asked for.
+_REFERENCE_RTOL = 1e-13
+# The step of the differences that give section maps, relative to the states' scales. With twice the
+# step, twice as much of the maps' curvature is taken for their slope.
+_DIFFERENCE = 1e-6
+# Room for the way to a level, which takes longer in some lanes than on the cycle, as a ratio of
+# times. Twice as much makes equal steps longer than they need to be.
+_ROOM = 1.25
+# A step may have up to this many times its error estimate on the cycle, where the accuracy allows
+# it. Twice as much lets lanes far from the cycle go twice as wrong before their steps get shorter.
+_MOST_SLACK = 10.0
+# Periods over which errors are followed; the rest is a geometric series. Twice as many plan for
+# longer, and matter where multipliers are near the unit circle.
+_PERIODS = 8
+# Estimates are this many times the error that accumulates on the cycle. Twice as much doubles
+# `ExperimentData.error`.
+_CAUTION = 3.0
+# Errors of different sections cancel in part; credit for it is given up to this ratio. Twice as
+# much lets estimates be half as large where nearly everything cancels.
+_MOST_CANCELLATION = 30.0
+# Errors per section that are taken for granted, relative to the states' scales: a few units in the
+# last place. Twice as much changes nothing above accuracies of 1e-13.
+_ROUNDING = 1e-15
+# Accuracies, relative to the states' scales, that a plan can be made for. Below the least, rounding
+# is larger; beyond the largest, the cycle tells little about lanes beside it.
+_LEAST_ACCURACY, _LARGEST_ACCURACY = 1e-13, 1e-2
+
+
+class Plan(eqx.Module):
+    """How to go from section k to the next, for k = 0..N-1.
+
+    **Fields:**
+
+    - `h`: first step; `lead`, `slack`: see `engine.stride.Stride`.
+    - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
+        cycle and relative to the states' scales: the largest that it ever leads to at a later
+        section, summed over all periods as if each made the same error.
+    """
+
+    h: Float[Array, " N"]
+    lead: Float[Array, " N"]
+    slack: Float[Array, " N"]
+    weight: Float[Array, " N"]
+
+    def stride(self, k, lanes: int) -> Stride:
+        """How `lanes` lanes set out from section k."""
+        fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
+        return Stride(fill(self.h), fill(self.lead), fill(self.slack))
+
+
+def make_plan(
+    placed: PlacedSections, settings: Settings, accuracy: float, scale: Float[np.ndarray, "N n"]
+) -> Plan:
+    """Find the cheapest way between sections that keeps the accuracy asked for.
+
+    **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
+    """
+    N = placed.n_sections
+    ways = jax.device_get(_try_ways(placed, settings, jnp.asarray(scale)))
+    K = len(ways.estimate)
+    exact = ways.ends[:, K]
+    J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _DIFFERENCE, (2, 0, 1))
+    J = J / scale[:, None, :]
+    J[~np.asarray(placed.time_is_state), :, 0] = 0.0
+    error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
+    if not placed.cycle.clocked:
+        error[..., 0] = 0.0
+    impact = np.maximum(_impact(J, error, scale), _ROUNDING)
+    impact = np.where(np.isnan(impact), np.inf, impact)
+    estimate = np.maximum(ways.estimate, 1e-6)
+
+    # The largest share of the accuracy for each section that keeps their sum.
+    section = np.arange(N)
+    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
+        best = _cheapest(impact, share)
+        total = impact[best, section].sum()
+        if total <= accuracy:
+            break
+    spare = np.clip(accuracy / total, 1e-6, _MOST_SLACK)
+    impact, estimate = impact[best, section], estimate[best, section]
+    # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
+    together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
+    weight = impact / estimate * np.maximum(together, 1 / _MOST_CANCELLATION)
+    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
+    share = np.minimum(accuracy * estimate / impact, 1.0) / N
+    slack = np.where(
+        best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
+    )
+    return Plan(*map(jnp.asarray, (ways.first[best, section], ways.lead, slack, weight)))
+
+
+class _Ways(NamedTuple):
+    """What was tried from every section to the next."""
+
+    ends: Float[Array, "n B N"]
+    """(t, q) after each of K ways to go, after the reference, and after it from starts that are
+    nudged in each coordinate; NaN for those that do not arrive."""
+    estimate: Float[Array, "K N"]
+    """Error estimates of the ways to go, relative to the tolerance."""
+    first: Float[Array, "K N"]
+    """Their first steps."""
+    slack: Float[Array, " K"]
+    lead: Float[Array, " N"]
+
+
+@quick_jit
+def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N n"]) -> _Ways:
+    N, n = scale.shape
+    K = len(_EQUAL_STEPS) + len(_TOLERANCES)
+    patience = max(settings.max_steps, PATIENCE)
+    following, _, target = placed.onwards()
+    lead = _lead(placed, target)
+    by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
+    longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
+
+    # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
+    nudge = _DIFFERENCE * scale.T[None] * np.eye(n)[:, :, None]
+    nudge = jnp.concatenate([np.zeros((K + 1, n, N)), nudge])
+    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), *[2] * (1 + n)])
+    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
+    by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
+    rtol = jnp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
+    s = Structure(placed.cycle.system)
+    u = jnp.zeros((s.nu, N))
+
+    def block(xs):
+        nudge, divide, slack, rtol = xs
+        moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
+        lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
+        start = Stride(longest / divide, lead, jnp.full(N, slack))
+        atol = settings.atol * rtol / settings.rtol
+        tolerance = Settings(rtol, atol, patience, settings.scale)
+        moved = move(s, lanes, u, target, tolerance, start)
+        ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
+        return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
+
+    ends, error = jax.lax.map(block, (nudge, jnp.asarray(divide), jnp.asarray(slack), rtol))
+    estimate = error[:K] * (rtol[:K, None] / settings.rtol)
+    first = longest / divide[:K, None]
+    return _Ways(jnp.moveaxis(ends, 0, 1), estimate, first, jnp.asarray(slack[:K]), lead)
+
+
+def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
+    """The first candidate of each section whose impact is at most `share`, or the best one."""
+    enough = impact <= share
+    return np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
+
+
+def _lead(placed: PlacedSections, target):
+    """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
+    s, lanes = Structure(placed.cycle.system), placed.lanes
+    N = placed.n_sections
+    everywhere = jnp.ones(N, bool)
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)), target, everywhere)
+    value, rate = seen.value[-1], seen.rate[-1]
+    falls = (value > 0) & (rate < 0)
+    lead = placed.duration * jnp.where(falls, -rate / jnp.where(falls, value, 1.0), 0.0)
+    return jnp.where((lead > 0.3) & (lead < 3.0), lead, 1.0)
+
+
+def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
+    """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
+    N = len(scale)
+    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:2]))
+    for m in range(_PERIODS * N):
+        at = (section + 1 + m) % N
+        now = worst[m // N]
+        np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
+        error = np.einsum("kij,ckj->cki", J[at], error)
+    last, before = worst[-1], worst[-2]
+    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    return worst.sum(axis=0) + last * ratio / (1 - ratio)
+
+
+def _accumulated(J, error, scale) -> float:
+    """The largest error, relative to the scales, when every section makes its `error` (N, n)."""
+    N = len(scale)
+    total, largest = np.zeros(scale.shape[1]), 0.0
+    for m in range(_PERIODS * N):
+        total = J[m % N] @ total + error[m % N]
+        largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
+    return largest
+
+
+def state_sizes(placed: PlacedSections) -> Float[np.ndarray, "A d"]:
+    """Sizes of states, by chart: the largest that a state of this name has at any section, in any
+    chart; 1 for one that is always zero, and beyond a chart's dimension."""
+    s = Structure(placed.cycle.system)
+    chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
+    sizes = np.ones((len(s.charts), s.d))
+    for name in s.state_names():
+        places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
+        size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
+        for place in places:
+            sizes[place] = size if size > 0 else 1.0
+    return sizes
+
+
+class Stepping(eqx.Module):
+    """How lanes step from section to section, and how precise that is.
+
+    **Fields:**
+
+    - `plan`, `settings`: first steps, and tolerances.
+    - `scales`: of time and states at each section.
+    - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
+    - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
+    """
+
+    plan: Plan
+    settings: Settings
+    scales: Float[np.ndarray, "N n"]
+    accuracy: float = eqx.field(static=True)
+    rounding: float = eqx.field(static=True, default=0.0)
+
+
+_made = Memory()
+
+
+def check_accuracy(accuracy: float) -> None:
+    """**Raises:** `DefinitionError` for an accuracy that no plan has."""
+    if not _LEAST_ACCURACY <= accuracy <= _LARGEST_ACCURACY:
+        raise DefinitionError(
+            f"accuracy lies between {_LEAST_ACCURACY} and {_LARGEST_ACCURACY}, not at {accuracy}."
+        )
+
+
+def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
+    """The plan for placed sections; made once for each accuracy.
+
+    **Raises:** `DefinitionError` for an accuracy out of range.
+    """
+    check_accuracy(accuracy)
+    accuracy = float(accuracy)
+
+    def make() -> Stepping:
+        sizes = state_sizes(placed)
+        settings = Settings(accuracy, accuracy, PATIENCE, sizes)
+        time = np.full((placed.n_sections, 1), float(placed.cycle.period))
+        scales = np.concatenate([time, sizes[np.asarray(placed.lanes.chart)]], axis=1)
+        return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
+
+    return _made.recall(placed, accuracy, make)

@@ -1,0 +1,259 @@
+"""What estimates of HTFs need of experiments: sums over them, for each line of the spectrum.
+
+Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the
+same memory for any number of experiments, and those of two sets of experiments add.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...experiments.design.partition import check_sharing, meets_itself, regular
+from .crest_test import CrestTest, compare_crest_factors
+
+
+# Largest change of a line of the input from one window to the next, relative to the largest line.
+# Doubled: inputs that repeat half as well pass, and the noise of their estimates is overrated.
+_REPEATS = 1e-2
+# Part of the largest line of all inputs below which a line is rounding. Doubled: none but rounding.
+_ROUNDING = 1e-12
+
+
+class Setup(NamedTuple):
+    """What all experiments of one estimate have in common."""
+
+    n_sections: int
+    periods: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+class SumOptions(NamedTuple):
+    """Which sums are wanted."""
+
+    harmonics: Callable[[int], tuple[int, ...]]
+    """The harmonics, for the number of sections."""
+    threshold: float = 1e-6
+    """A line is excited above this part of the largest |U| of its experiment."""
+    highest: int | None = None
+    """Harmonics beyond this one count as zero."""
+    repeats: int = 1
+    """How many windows are averaged."""
+
+
+class InputSums(NamedTuple):
+    """Sums of products of inputs over some experiments, for K lines."""
+
+    power: Complex[np.ndarray, "K nu nu"]
+    """Of conj(U) U^T."""
+    square: Complex[np.ndarray, "K nu nu"]
+    """Of U U^T: as large as the power where all phases are the same (mod 180 degrees)."""
+
+
+class SpectralSums(NamedTuple):
+    """Sums over experiments, for K lines, ascending."""
+
+    setup: Setup
+    harmonics: tuple[int, ...]
+    line: Int[np.ndarray, " K"]
+    mirrored: Bool[np.ndarray, " K"]
+    """Lines that meet their own mirror images."""
+    tried: InputSums
+    """Over all experiments."""
+    ran: InputSums
+    """Over those that did not fail, as all that follow."""
+    count: Int[np.ndarray, " K"]
+    """Of experiments."""
+    direct: Complex[np.ndarray, "K nu M ny"]
+    """Of conj(U[k]) Y[k + l P], Y the mean over the repeated windows."""
+    mirror: Complex[np.ndarray, "K nu M ny"]
+    """Of U[k] Y[k + l P]."""
+    energy: Float[np.ndarray, "K M ny"]
+    """Of |Y[k + l P]|^2."""
+    noise: Float[np.ndarray, "K M ny"]
+    """Of the variance of Y[k + l P], as seen from one window to the next; zero for one window."""
+    crest_test: CrestTest
+    repeats: int
+    """How many windows were averaged."""
+    summary: str = ""
+    """How many experiments ran to their end."""
+
+    def gram(self, inputs: InputSums, rows: np.ndarray, both: bool) -> Complex[np.ndarray, "k n n"]:
+        """Normal matrices of Y on U, or for `both` on U and conj(U)."""
+        power, square = inputs.power[rows], inputs.square[rows]
+        if not both:
+            return power
+        upper = np.concatenate([power, square.conj()], axis=2)
+        return np.concatenate([upper, np.concatenate([square, power.conj()], axis=2)], axis=1)
+
+    def solvable(self, inputs: InputSums) -> Bool[np.ndarray, " K"]:
+        """Lines with responses to all inputs (and mirror images) that can be told apart."""
+        out = np.zeros(len(self.line), bool)
+        for rows in (np.flatnonzero(~self.mirrored), np.flatnonzero(self.mirrored)):
+            out[rows] = regular(self.gram(inputs, rows, bool(self.mirrored[rows].any())))
+        return out
+
+    def one_phase(self, inputs: InputSums) -> Bool[np.ndarray, " K"]:
+        """Lines that meet their mirror images and were excited with one phase only."""
+        rows = np.flatnonzero(self.mirrored)
+        out = np.zeros(len(self.line), bool)
+        out[rows] = regular(self.gram(inputs, rows, False))
+        out[rows] &= ~regular(self.gram(inputs, rows, True))
+        return out
+
+
+def spectral_sums(
+    data: ExperimentData | Iterable[ExperimentData], options: SumOptions
+) -> SpectralSums:
+    """The sums over all experiments, which may come in parts.
+
+    **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
+    other, if records are too short, or if parts do not belong together.
+    """
+    if not 0 < options.threshold < 1:
+        raise DefinitionError(f"threshold must lie between 0 and 1, not {options.threshold}.")
+    if isinstance(data, ExperimentData):
+        total, summary = _sums_of_part(data, options, 0), data.summary()
+    else:
+        total, count, good = None, 0, 0
+        for part in data:
+            if total is not None and (other := _setup(part)) != total.setup:
+                raise DefinitionError(
+                    f"these experiments do not belong together: some have {total.setup}, others "
+                    f"{other}."
+                )
+            new = _sums_of_part(part, options, count)
+            total = new if total is None else _add(total, new)
+            count, good = count + len(part.ok), good + int(part.ok.sum())
+        if total is None:
+            raise DefinitionError("there are no experiments: what was given has no parts.")
+        summary = f"{good}/{count} ok"
+    if len(total.line) == 0:
+        raise DefinitionError("the inputs are zero in the window: there is nothing to estimate.")
+    return total._replace(summary=summary)
+
+
+def _setup(data: ExperimentData) -> Setup:
+    return Setup(data.n_sections, data.periods, data.inputs, data.outputs)
+
+
+def _sums_of_part(data: ExperimentData, options: SumOptions, first: int) -> SpectralSums:
+    """The sums over one part, whose first experiment has the number `first`."""
+    N, P, harmonics = data.n_sections, data.periods, options.harmonics(data.n_sections)
+    highest = (
+        None if options.highest is None else options.highest + max(map(abs, harmonics), default=0)
+    )
+    windows = data.windows(options.repeats)
+    experiment, line, U = _excited(data, windows, options.threshold, highest, first)
+    lines, place = np.unique(line, return_inverse=True)
+    good = data.ok[experiment]
+
+    def total(values, keep):
+        """Sums over the entries of each line."""
+        values, where = values[keep], place[keep]
+        order = np.argsort(where, kind="stable")
+        begin = np.flatnonzero(np.diff(where[order], prepend=-1))
+        out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
+        if len(begin):
+            out[where[order][begin]] = np.add.reduceat(values[order], begin, axis=0)
+        return out
+
+    def input_sums(keep):
+        columns, rows = U[:, :, None], U[:, None, :]
+        return InputSums(total(columns.conj() * rows, keep), total(columns * rows, keep))
+
+    Y, noise = _outputs(data, windows, experiment, line, harmonics)
+    by = U[:, :, None, None]
+    return SpectralSums(
+        _setup(data),
+        harmonics,
+        lines,
+        meets_itself(lines, P, N, highest),
+        tried=input_sums(np.ones(len(U), bool)),
+        ran=input_sums(good),
+        count=total(np.ones(len(U), int), good),
+        direct=total(by.conj() * Y[:, None], good),
+        mirror=total(by * Y[:, None], good),
+        energy=total(np.abs(Y) ** 2, good),
+        noise=total(noise, good),
+        crest_test=_test_phases(data, lines, line, first),
+        repeats=options.repeats,
+    )
+
+
+def _test_phases(data: ExperimentData, lines, line, first: int) -> CrestTest:
+    """Where lines are measured several times: whether their phases are random."""
+    if first == 0 and len(lines) == len(line):
+        return CrestTest(0, 0)
+    return compare_crest_factors(data.u[:, data.window])
+
+
+def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
+    """Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
+    N, P, ny = data.n_sections, data.periods, len(data.outputs)
+    if not harmonics:
+        return np.zeros((len(line), 0, ny), complex), np.zeros((len(line), 0, ny))
+    output = (line[:, None] + P * np.asarray(harmonics)) % (N * P)
+    each = [np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows]
+    mean = sum(each) / len(each)
+    if len(each) == 1:
+        return mean, np.zeros(mean.shape)
+    spread = sum(np.abs(Y - mean) ** 2 for Y in each)
+    return mean, spread / (len(each) - 1) / len(each)
+
+
+def _excited(
+    data: ExperimentData, windows: list[slice], threshold: float, highest: int | None, first: int
+):
+    """Experiment, line and U of every excited line, checked that they do not meet."""
+    u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
+    each = [np.fft.rfft(u[:, window], axis=1) for window in windows]
+    U = sum(each) / len(each)
+    size = np.abs(U)
+    peak = size.max(axis=(1, 2), keepdims=True)
+    if max(np.abs(x - U).max(axis=(1, 2), keepdims=True).sum() for x in each) > 0:
+        worst = max(float(np.max(np.abs(x - U) / np.where(peak > 0, peak, 1))) for x in each)
+        if worst > max(threshold, _REPEATS):
+            raise DefinitionError(
+                f"the input does not repeat: its last {len(windows)} windows of P = "
+                f"{data.periods} periods differ by {worst:.2g} of the largest line. Take fewer "
+                "`repeats`, or the right number of periods."
+            )
+    found = ((size > threshold * peak) & (size > _ROUNDING * peak.max())).any(axis=2)
+    experiment, line = np.nonzero(found)
+    number = found.sum(axis=1)
+    most = data.periods // 2 + 1
+
+    def hint(experiment: int) -> str:
+        lines = number[experiment - first]
+        if lines <= most:
+            return ""
+        return (
+            f" ({lines} lines are excited, more than any experiment can hold: is the "
+            f"input periodic over the last P = {data.periods} periods, and without noise above "
+            "`threshold`?)"
+        )
+
+    check_sharing(experiment + first, line, data.periods, hint, data.n_sections, highest)
+    return experiment, line, U[experiment, line]
+
+
+def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
+    line = np.union1d(a.line, b.line)
+    places = [np.searchsorted(line, x.line) for x in (a, b)]
+
+    def add(x, y):
+        if isinstance(x, InputSums):
+            return InputSums(*map(add, x, y))
+        out = np.zeros((len(line), *x.shape[1:]), x.dtype)
+        out[places[0]] += x
+        out[places[1]] += y
+        return out
+
+    sums = ("mirrored", "tried", "ran", "count", "direct", "mirror", "energy", "noise")
+    both = {name: add(getattr(a, name), getattr(b, name)) for name in sums}
+    return a._replace(line=line, crest_test=a.crest_test.merge(b.crest_test), **both)

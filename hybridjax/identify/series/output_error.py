@@ -1,0 +1,157 @@
+r"""The output-error problem in time: numerators and unknown starts projected out.
+
+With $\chi(q^{-N}) y = B_{n \bmod N}(q^{-1}) u$ and $v = \chi^{-1} u$, filtered from cycle to cycle,
+
+$$y[n] = \sum_r b_{n \bmod N}[r]\, v[n-r] + (\chi^{-1} g)[n] + \varepsilon[n],$$
+
+where g is free in the first cycles of each record: it stands for inputs and outputs before the
+record. For given c every section is a linear regression of its own, in b and g.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..._core.threads import on_all_cores
+from ..multipliers.gauss_newton import Coefficients
+from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
+from .cycle_grid import CycleGrid
+from .section_regression import RANK, SectionRegression, sampled_alike
+
+
+class OutputErrorProblem(NamedTuple):
+    """What does not depend on c."""
+
+    u: Float[np.ndarray, "S T N nu"]
+    y: Float[np.ndarray, "S T N ny"]
+    """In units of `scale`; zero where there is no sample."""
+    sampled: Bool[np.ndarray, "S T N ny"]
+    """Where there is one."""
+    first: Int[np.ndarray, "S N"]
+    """The cycle in which a record first meets a section."""
+    lags: int
+    """R: numerators have the lags -lead..R-1-lead."""
+    lead: int
+    free: int
+    """K: the cycles at the start of each record in which g is free."""
+    to_lags: list[Float[np.ndarray, "columns r"]]
+    """For each section: the combinations of lagged inputs that are linearly independent."""
+    drift: Float[np.ndarray, "S T K"]
+    """What an unknown drift of the outputs is composed of."""
+    scale: Float[np.ndarray, " ny"]
+
+    @classmethod
+    def from_grid(
+        cls, grid: CycleGrid, order: int, overhang: int, free_start: bool
+    ) -> "OutputErrorProblem":
+        """**Arguments:** `order`: d. `overhang`: lags of the numerators beyond d N. `free_start`:
+        whether the state at the start of records is unknown, or zero."""
+        N = grid.n_sections
+        lags = grid.lead + order * N + overhang + 1
+        free = order + -(-overhang // N) if free_start else 0
+        sampled, first = np.isfinite(grid.y), np.argmax(grid.inside, axis=1)
+        cycle = np.arange(grid.y.shape[1])
+
+        def independent(n: int):
+            tells = sampled[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
+            rows = lagged_inputs(grid.u, n, lags, grid.lead)[tells]
+            _, s, vh = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=False)
+            kept = s > RANK * s.max(initial=0)
+            return vh[kept].T / s[kept]
+
+        scale = np.sqrt(np.nanmean(grid.y**2, axis=(0, 1, 2)))
+        return cls(
+            u=grid.u,
+            y=np.where(sampled, grid.y, 0.0) / scale,
+            sampled=sampled,
+            first=first,
+            lags=lags,
+            lead=grid.lead,
+            free=free,
+            to_lags=on_all_cores(independent, range(N)),
+            drift=grid.drift,
+            scale=scale,
+        )
+
+    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "OutputErrorProblem":
+        """The same with each output in units of its noise, which was `noise` units before."""
+        return self._replace(y=self.y / noise, scale=self.scale * noise)
+
+
+class Linearization(NamedTuple):
+    """What the numerators and free starts leave of the outputs at some c, and its derivative."""
+
+    residual: Float[np.ndarray, "S T N ny C"]
+    jacobian: Float[np.ndarray, "d S T N ny C"]
+    freedom: Int[np.ndarray, "N ny"]
+    """Samples less unknowns."""
+    leverage: Float[np.ndarray, "S T N ny"]
+    """The share of its own error that the fit takes from each sample."""
+    numerators: Float[np.ndarray, "N columns ny"]
+    """Of the first column of outputs; rows are lags, then inputs."""
+    slope: Float[np.ndarray, "d N columns ny"]
+    """Their derivative with respect to c."""
+    roots: list[list[Float[np.ndarray, "columns r"]]]
+    """root @ root.T is the covariance of the numerators of a section and output, given c."""
+
+    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "Linearization":
+        """That of the problem with each output in units of its noise."""
+        return self._replace(
+            residual=self.residual / noise[:, None],
+            jacobian=self.jacobian / noise[:, None],
+            numerators=self.numerators / noise,
+            slope=self.slope / noise,
+        )
+
+
+def linearize(
+    problem: OutputErrorProblem,
+    c: Coefficients,
+    y: Float[np.ndarray, "S T N ny C"] | None = None,
+) -> Linearization:
+    """The residuals and their derivative in c, section by section.
+
+    The derivative omits what vanishes with the residual (Kaufman 1975). `y`: other outputs than
+    those measured, C of each.
+    """
+    S, T, N, ny = problem.y.shape
+    y = problem.y[..., None] if y is None else y
+    d, columns = len(c), problem.lags * problem.u.shape[3]
+    found = Linearization(
+        residual=np.zeros(y.shape),
+        jacobian=np.zeros((d, *y.shape)),
+        freedom=np.zeros((N, ny), int),
+        leverage=np.zeros((S, T, N, ny)),
+        numerators=np.zeros((N, columns, ny)),
+        slope=np.zeros((d, N, columns, ny)),
+        roots=[[np.zeros((0, 0))] * ny for _ in range(N)],
+    )
+    v = divide_by_chi(c, problem.u)
+
+    def section(n: int) -> None:
+        to_lags = problem.to_lags[n]
+        inputs = lagged_inputs(v, n, problem.lags, problem.lead) @ to_lags
+        starts = start_responses(c, problem.first[:, n], T, min(problem.free, T))
+        for sampled, outputs in sampled_alike(problem.sampled[:, :, n]):
+            regression = SectionRegression.make(inputs, starts, problem.drift, sampled)
+            shape = (len(outputs), y.shape[4])
+            x = y[:, :, n, outputs].reshape(S, T, -1)
+            a, left = regression.solve(x)
+            found.residual[:, :, n, outputs] = left.reshape(S, T, *shape)
+            # The residual's derivative in c_j: q^-jN / chi of what was fitted, less what fits that.
+            fitted = regression.response(a, x)
+            fitted = np.concatenate([divide_by_chi(c, fitted, j + 1) for j in range(d)], axis=2)
+            more, slopes = regression.solve(fitted)
+            slopes = np.moveaxis(slopes.reshape(S, T, d, *shape), 2, 0)
+            found.jacobian[:, :, :, n, outputs] = slopes
+            found.freedom[n, outputs] = regression.freedom
+            found.leverage[:, :, n, outputs] = regression.leverage[..., None]
+            found.numerators[n][:, outputs] = to_lags @ a.reshape(-1, *shape)[..., 0]
+            more = np.moveaxis(more.reshape(-1, d, *shape)[..., 0], 1, 0)
+            found.slope[:, n][..., outputs] = to_lags @ more
+            for i in outputs:
+                found.roots[n][i] = to_lags @ regression.root
+
+    on_all_cores(section, range(N))
+    return found

@@ -1,0 +1,297 @@
+"""Finding a limit cycle, by Newton's method on the return map with its exact Jacobian."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.compile import quick_jit
+from .._core.precision import require_x64
+from .._core.results import Result
+from .._core.tracing import is_traced
+from ..engine.lanes import Lanes
+from ..engine.settings import LIMIT_CYCLE, Settings
+from ..engine.target import until
+from ..engine.watch import slopes, watch
+from ..errors import ComputationError, DefinitionError
+from ..linear.time_response import monodromy
+from ..sections.crossing import AtEvent, Crossing
+from ..systems.structure import Structure, check_system
+from ..systems.system import Guess, HybridSystem
+from .cycle import LimitCycle
+from .guess import begin, check_beginning, guessed_lane
+from .newton import Solution, solve
+from .return_map import ReturnMap
+from .scale import Sizes, alike, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
+
+
+# An autonomous system is given up if it does not return within so many of the times in which the
+# states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
+_PATIENCE = 1000.0
+# A cycle is computed anew with the sizes that states have on it if one of them is off by more than
+# this factor. Doubled, accuracies are kept to within twice the factor.
+_OFF = 4.0
+# A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
+# Doubled, so do states that move twice as far.
+_VANISHING = 1e-6
+# Steps of Levenberg and Marquardt before a cycle is given up.
+_DAMPED_STEPS = 64
+# The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
+# monodromy up to this part of it. Doubled, half as much loss is noticed.
+_CONSERVED = 1e-6
+# The field one period later is the same up to this part of it, and up to this part of the states'
+# sizes in one period. Doubled, half as large an error of a stated period is noticed.
+_SAME_FIELD, _SAME_REST = 1e-6, 1e-9
+# An event is due at the anchor if it would come within this part of the period. Doubled, guesses
+# twice as far from an event are refused.
+_DUE = 1e-9
+
+
+def find_limit_cycle(
+    system: HybridSystem,
+    guess: Guess | LimitCycle | None = None,
+    *,
+    section: Crossing | AtEvent | None = None,
+    multiplicity: int | None = None,
+    conserved: Mapping[str, ArrayLike] | None = None,
+    settle: ArrayLike = 0.0,
+    max_period: ArrayLike | None = None,
+    scale: Mapping[str, float] | None = None,
+    settings: Settings | None = None,
+    throw: bool = True,
+) -> LimitCycle:
+    """Find a limit cycle by Newton on the return map; stable or not makes no difference.
+
+    Where Newton fails, as it does if it steps out of the domain of the return map, the search is
+    repeated with the smaller steps of Levenberg and Marquardt.
+
+    A clocked system has its clock's period, and the return map is taken at the guess's phase of
+    the clock. The period of an autonomous one is found; its return map lives on `section`.
+
+    **Arguments:**
+
+    - `guess`: a rough `Guess`, by default the model's own. A `LimitCycle` of a similar system is
+        the best guess.
+    - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
+        "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
+        flow. Newton starts at the guess if it lies on the section, else where the flow from the
+        guess first meets it.
+    - `multiplicity`: periods of the clock, or returns to the section, until the cycle closes: 2
+        for the cycle that a period doubling leaves behind. By default 1, or the guess's.
+    - `conserved`: the values at which conserved quantities are wanted, by the names of outputs,
+        e.g. `{"energy": 1784.8}`. Cycles then come in families, with a multiplier of exactly 1 for
+        each quantity, and this picks one of them. By default none, or the guess's.
+    - `settle`: time to simulate before Newton begins, so that transients die out (the paper
+        takes 60 s). No help where the cycle is unstable.
+    - `max_period`: for autonomous systems: give up if no return is seen in this time, by default a
+        thousand times that in which the states change at the guess.
+    - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
+        them do not matter. By default each state's largest modulus on the cycle, so that results
+        do not depend on units.
+    - `settings`: accuracy of the flow; 1e-12 by default.
+    - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
+
+    **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
+    found: no convergence, an event or section that does not come, grazing, an equilibrium in
+    place of a cycle, or a singular J - I (there is a whole family of cycles, from a conserved
+    quantity or a symmetry; see `conserved`).
+
+    Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
+    followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
+    cycle that was not found mean nothing, and are NaN as a rule.
+    """
+    traced = is_traced((system, conserved))
+    if not traced:
+        require_x64(system)
+        check_system(system)
+    s = Structure(system)
+    settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings
+    given = {} if settings.scale is None else sizes_of(s, settings.scale)
+    given |= given_sizes(s, scale)
+    if isinstance(guess, LimitCycle):
+        _check_multiplicity(guess, multiplicity)
+        conserved = guess.conserved if conserved is None else conserved
+        multiplicity, base = guess.multiplicity, guess.base if section is None else section
+        settings = _in_sizes(settings, s, given, guess.settings.scale)
+        anchor, expected = guess.anchor, guess.period
+        if guess.clocked:
+            expected = multiplicity * jnp.asarray(system.period(), float)
+    elif traced:
+        raise DefinitionError(
+            "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
+            "one outside, and pass it as `guess`."
+        )
+    else:
+        multiplicity = 1 if multiplicity is None else multiplicity
+        lane, period = guessed_lane(system, guess), system.period()
+        check_beginning(system, section, multiplicity, settle, max_period)
+        near = sizes_near(
+            system, int(lane.chart[0]), lane.t[0], lane.q[:, 0],
+            None if period is None else float(period),
+        )  # fmt: skip
+        settings = _in_sizes(settings, s, near.sizes | given)
+        max_period = _PATIENCE * near.time if max_period is None else float(max_period)
+        anchor, base, expected = begin(
+            system, lane, section, multiplicity, settle, max_period, settings
+        )
+    conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
+    map = ReturnMap(system, settings, anchor, base, expected, conserved, multiplicity)
+    if traced:
+        return _cycle(map, solve(map, False, True), guess.event_sequence)
+    _check_values(system, anchor, conserved)
+    map, solution = _in_own_sizes(map, _solve(map), given)
+    codes = np.ravel(solution.turn.codes)
+    cycle = _cycle(map, solution, tuple(int(g) for g in codes if g >= 0))
+    code = Result(int(cycle.result))
+    if code in (Result.OK, Result.SINGULAR):
+        if cycle.clocked:
+            _check_clock(cycle)
+        if conserved:
+            _check_conserved(cycle)
+    if throw and code != Result.OK:
+        raise ComputationError(_explain(cycle, code))
+    return cycle
+
+
+def _in_sizes(
+    settings: Settings,
+    s: Structure,
+    sizes: Sizes,
+    otherwise: Float[Array, "A d"] | None = None,
+) -> Settings:
+    return dataclasses.replace(settings, scale=scale_of(s, sizes, otherwise))
+
+
+def _solve(map: ReturnMap) -> Solution:
+    """Newton's method, with smaller steps or another period where it fails."""
+    solution = solve(map)
+    if int(solution.result) == Result.EXTRA_TURNS:
+        turn = solution.turn
+        expected = turn.period * map.multiplicity / turn.meetings
+        solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
+    if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
+        # Newton may have stepped out of the domain of the return map: smaller steps.
+        second = solve(map, True, False, _DAMPED_STEPS)
+        solution = second if int(second.result) == Result.OK else solution
+    return solution
+
+
+def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:
+    """A cycle in the sizes that states have on it, for one that was found in rough ones."""
+    if int(solution.result) not in (Result.OK, Result.SINGULAR):
+        return map, solution
+    s, legs, period = map.structure, solution.turn.legs, float(solution.turn.period)
+    rough = sizes_of(s, map.settings.scale)
+    sizes = sizes_on(map.system, legs.t, legs.chart, legs.q, period)
+    sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
+    if alike(sizes, rough, _OFF):
+        return map, solution
+    expected = map.expected if map.base is None else solution.turn.period
+    finer = dataclasses.replace(
+        map, settings=_in_sizes(map.settings, s, sizes), anchor=solution.anchor, expected=expected
+    )
+    again = solve(finer)
+    if int(again.result) not in (Result.OK, Result.SINGULAR):
+        return map, solution
+    return finer, again._replace(steps=solution.steps)
+
+
+def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:
+    turn = solution.turn
+    period = map.expected if map.base is None else turn.period
+    return LimitCycle(
+        map.system, map.base, period, solution.anchor, turn.legs, turn.factors, turn.distance,
+        solution.steps, solution.result, event_sequence, map.settings, map.conserved,
+        map.multiplicity,
+    )  # fmt: skip
+
+
+def _check_multiplicity(guess: LimitCycle, multiplicity: int | None) -> None:
+    if multiplicity not in (None, guess.multiplicity):
+        raise DefinitionError(
+            f"the guess closes after {guess.multiplicity} turns, not {multiplicity}: give a Guess."
+        )
+
+
+def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, Array]) -> None:
+    s = Structure(system)
+    s.resolve_outputs(tuple(conserved)).require(int(anchor.chart[0]))
+    for name, value in conserved.items():
+        if value.shape != () or not np.isfinite(value):
+            raise DefinitionError(f"the conserved '{name}' must be one finite number; got {value}.")
+
+
+def _check_conserved(cycle: LimitCycle) -> None:
+    """Raise where a quantity that should be conserved is not: its gradient is then no left
+    eigenvector of the monodromy."""
+    s = Structure(cycle.system)
+    a, t = int(cycle.anchor.chart[0]), cycle.anchor.t[0]
+    q, u = cycle.anchor.q[: s.dims[a], 0], jnp.zeros(s.nu)
+    returned = np.asarray(monodromy(cycle.factors))[: s.dims[a], : s.dims[a]]
+    sizes = np.asarray(cycle.return_map.sizes)[: s.dims[a]]
+    outputs = s.resolve_outputs(tuple(cycle.conserved))
+    gradients = np.asarray(jax.jacfwd(lambda q: outputs(a, t, q, u))(q))
+    for name, gradient in zip(outputs.names, gradients, strict=True):
+        change = (gradient @ returned - gradient) * sizes
+        if np.max(np.abs(change)) > _CONSERVED * np.max(np.abs(gradient * sizes)):
+            raise DefinitionError(
+                f"'{name}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
+                "cycle change it in one turn. Leave it out of `conserved`."
+            )
+
+
+def _check_clock(cycle: LimitCycle) -> None:
+    """Raise where the cycle of a clocked system is not what it seems to be."""
+    s, system = Structure(cycle.system), cycle.system
+    a, t = int(cycle.anchor.chart[0]), float(cycle.anchor.t[0])
+    f, later, guards, rates = jax.device_get(_at_anchor(cycle))
+    f, later = f[: s.dims[a]], later[: s.dims[a]]
+    slow = np.asarray(cycle.return_map.sizes)[: s.dims[a]] / float(cycle.period)
+    if np.any(np.abs(later - f) > _SAME_FIELD * np.abs(f) + _SAME_REST * slow):
+        raise ComputationError(
+            f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "
+            f"that {type(system).__name__}.period() states: at t = {t:.6g} it is {f}, one period "
+            f"later {later}."
+        )
+    due = (rates < 0) & (np.abs(guards) <= -_DUE * float(cycle.period) * rates)
+    if due.any():
+        raise ComputationError(
+            f"the search begins exactly at the event '{s.transitions[int(np.argmax(due))].name}', "
+            "which may or may not belong to the turn: give a guess at another time."
+        )
+
+
+@quick_jit
+def _at_anchor(cycle: LimitCycle):
+    """The field at the anchor (d,) and one period later, the guards there (G,) and their rates."""
+    s, anchor = Structure(cycle.system), cycle.anchor
+    u, later = jnp.zeros((s.nu, 1)), anchor.t + cycle.period
+    f = [slopes(s, t, anchor.chart, anchor.q, u)[:, 0] for t in (anchor.t, later)]
+    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), jnp.ones(1, bool))
+    return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
+
+
+def _explain(cycle: LimitCycle, code: Result) -> str:
+    name = type(cycle.system).__name__
+    if code == Result.SINGULAR:
+        return (
+            f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
+            "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
+            "is wanted by the value of the quantity (an output of the system), e.g. "
+            "`conserved={'energy': 1.0}`, or take the one nearest to the guess with `throw=False`."
+        )
+    reason = code.message
+    if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
+        reason = "Newton came to a state from where one period ends in another chart"
+    elif code == Result.NOT_CONVERGED:
+        reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
+        if cycle.conserved:
+            reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
+    return (
+        f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "
+        "if the cycle is stable, e.g. `settle=60 * period`."
+    )

@@ -1,0 +1,117 @@
+"""Newton's method on the return map, under transformations and on the host.
+
+Steps are taken, and convergence is judged, in sizes of the states.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from .._core.compile import quick_jit
+from ..engine.lanes import Lanes
+from .return_map import SINGULAR, ReturnMap, Turn
+
+
+# Newton's method ends with a step below this, in sizes of the states and relative to the state.
+# Doubled, it sometimes ends one step earlier; halved, rounding may keep it from ending.
+_ATOL, _RTOL = 1e-12, 1e-11
+# Along a direction in which J - I is singular, neither Newton nor a derivative moves.
+_SOLVER = lx.SVD(rcond=SINGULAR)
+
+
+class Solution(NamedTuple):
+    """Where Newton's method ended."""
+
+    anchor: Lanes
+    """The lane there, ready to be left."""
+    turn: Turn
+    """The last turn that it saw."""
+    steps: Int[Array, ""]
+    result: Int[Array, ""]
+    """`Result` code: whether this is a cycle."""
+
+
+@quick_jit
+def solve(
+    map: ReturnMap, damped: bool = False, once_more: bool = False, max_steps: int = 32
+) -> Solution:
+    """Newton's method from the anchor's state.
+
+    **Arguments:** `damped` takes the smaller steps of Levenberg and Marquardt; `once_more` goes
+    round once more on the cycle found, so that what is seen has the derivatives of the cycle.
+    """
+    q, turn, steps = root(map, damped, max_steps)
+    if once_more:
+        turn = map.turn_with_jacobian(q)
+    return Solution(map.departure(q), turn, steps, map.judge(q, turn))
+
+
+def newton_steps(
+    jacobian: Float[np.ndarray, "S n n"],
+    residual: Float[np.ndarray, "S n"],
+    rcond: float = SINGULAR,
+) -> Float[np.ndarray, "S n"]:
+    """Newton's steps of S systems of equations, on the host: the shortest that are left where a
+    system is singular, NaN where it is not finite."""
+    step = np.full(residual.shape, np.nan)
+    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
+    step[good] = -(inverse @ residual[good, :, None])[..., 0]
+    return step
+
+
+def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float[np.ndarray, " S"]:
+    """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
+    return np.max(np.abs(step) / (_ATOL + _RTOL * np.abs(q)), axis=1)
+
+
+@eqx.filter_custom_jvp
+def root(
+    map: ReturnMap, damped: bool, max_steps: int
+) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
+    """The state that the return map leaves where it is, the turn from there, and steps taken.
+
+    Differentiable once and twice; only the state has derivatives.
+    """
+    if damped:
+        solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
+    else:
+        solver = optx.Newton(rtol=_RTOL, atol=_ATOL, linear_solver=_SOLVER)
+    solution = optx.root_find(
+        _residual, solver, map.anchor.q[:, 0] / map.sizes, map,
+        has_aux=True, max_steps=max_steps, throw=False,
+    )  # fmt: skip
+    return solution.value * map.sizes, solution.aux, solution.stats["num_steps"]
+
+
+@root.def_jvp
+def _root_jvp(primals, tangents):
+    """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
+    where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""
+    map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
+    q, turn, steps = root(*primals)
+    fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
+    t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
+    _, by_parameters = eqx.filter_jvp(lambda map: map.turn(q).residual, (map,), (t_map,))
+    jacobian = map.turn_with_jacobian(q).jacobian * sizes / sizes[:, None]
+    jacobian = lx.MatrixLinearOperator(jacobian)
+    t_q = -lx.linear_solve(jacobian, by_parameters / sizes, _SOLVER, throw=False).value * sizes
+    nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
+    return (q, turn, steps), (t_q, *nothing)
+
+
+def _residual(x, map: ReturnMap):
+    """(P(q) - q) in sizes for q = x sizes, whose derivative is the Jacobian of the turn's pieces,
+    and the `Turn`.
+
+    The Jacobian comes with the value, so that the turn need not be traced again for it.
+    """
+    fixed = jax.lax.stop_gradient(x * map.sizes)
+    turn = map.turn_with_jacobian(fixed)
+    residual = turn.residual + turn.jacobian @ (x * map.sizes - fixed)
+    return residual / map.sizes, turn

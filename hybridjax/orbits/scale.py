@@ -1,0 +1,198 @@
+"""Sizes of states: what counts as 1 in each, so that no result depends on the user's units.
+
+Every size is one number for each name of a state, whatever chart it is in. On a cycle it is the
+state's largest modulus there. Before the cycle is known it is what the field at the guess makes of
+the state in one period. Wherever rounding errors of the field move a state by more than that, as
+they do a state that a symmetry keeps at zero, the size is so large that they are tolerated.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from .._core.compile import quick_jit
+from ..engine.watch import slopes
+from ..errors import DefinitionError
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+
+
+Sizes = dict[str, float]
+
+# A size is at least this many times the error by which rounding moves the state in one period.
+# Steps are judged by errors of 1e-12 sizes, and by the change of these errors where states are
+# moved by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to
+# what moves them are computed half as accurately.
+_TIMES_ROUNDING = 5e13
+# A period may be so many times that of the fastest mode at the guess. Doubled, sizes of states that
+# rest are guessed twice as large.
+_MODES = 20.0
+# Shifts of states by which rounding errors of the field are seen, in rounding errors of the states:
+# odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
+_SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
+# Points at which fields are seen in one call, so that one program serves guesses and cycles.
+_POINTS = 16
+
+
+class GuessSizes(NamedTuple):
+    """What a guess says of the cycle near it."""
+
+    sizes: Sizes
+    time: float
+    """In which the states change by their sizes: the clock's period, if there is one."""
+
+
+def sizes_near(
+    system: HybridSystem,
+    chart: int,
+    t: Float[Array, ""],
+    q: Float[Array, " d"],
+    period: float | None,
+) -> GuessSizes:
+    """Sizes of all states, from the field at a guess and at the states that resets make of it.
+
+    **Arguments:** `chart`, index of the guess's chart; `q`, padded; `period` of the clock.
+    """
+    s = Structure(system)
+    points = np.asarray(_reached(system, chart, t, q))
+    reached = np.flatnonzero(np.isfinite(points).all(axis=1))
+    reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
+    near = _look(system, reached, np.full(len(reached), float(t)), points[reached].T)
+    time = _time_scale(near) if period is None else period
+    size = np.abs(near.q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, _MODES * time))), time)
+
+
+def sizes_on(
+    system: HybridSystem,
+    t: Float[Array, " K"],
+    chart: Int[Array, " K"],
+    q: Float[Array, "d K"],
+    period: float,
+) -> Sizes:
+    """Sizes of all states, from points of a cycle."""
+    seen = _look(system, np.asarray(chart), np.asarray(t), np.asarray(q))
+    size = np.maximum(np.abs(seen.q), _floor(seen, period))
+    return _by_name(Structure(system), np.asarray(chart), size)
+
+
+def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
+    """Sizes by name, as users give them.
+
+    **Raises:** `DefinitionError` for a state that does not exist, or a size that is not positive.
+    """
+    given = {name: float(size) for name, size in (scale or {}).items()}
+    unknown = [name for name in given if name not in s.state_names()]
+    if unknown or not all(np.isfinite(size) and size > 0 for size in given.values()):
+        raise DefinitionError(
+            "`scale` gives positive sizes of states by name; states are "
+            f"{', '.join(s.state_names())}. Got {scale}."
+        )
+    return given
+
+
+def scale_of(
+    s: Structure, sizes: Mapping[str, float], otherwise: Float[ArrayLike, "A d"] | None = None
+) -> Float[Array, "A d"]:
+    """Sizes by chart, padded, as `Settings.scale` takes them; for states whose names are not among
+    the `sizes`, those of another such array, or 1."""
+    scale = np.full((len(s.charts), s.d), np.nan)
+    for a, chart in enumerate(s.charts):
+        scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
+    return jnp.where(np.isnan(scale), 1.0 if otherwise is None else otherwise, scale)
+
+
+def sizes_of(s: Structure, scale: Float[Array, "A d"] | None) -> Sizes:
+    """Sizes by name, from `Settings.scale`."""
+    scale = np.ones((len(s.charts), s.d)) if scale is None else np.asarray(scale)
+    charts = list(enumerate(s.charts))
+    return {n: float(scale[a, k]) for a, c in reversed(charts) for k, n in enumerate(c.states)}
+
+
+def alike(a: Mapping[str, float], b: Mapping[str, float], factor: float) -> bool:
+    """Whether no size differs by more than a factor."""
+    return all(1 / factor <= a[name] / b[name] <= factor for name in a)
+
+
+class _Seen(NamedTuple):
+    """The field at some points."""
+
+    q: Float[np.ndarray, "d K"]
+    f: Float[np.ndarray, "d K"]
+    change: Float[np.ndarray, "d K"]
+    """Derivative of the field along the flow."""
+    derivative: Float[np.ndarray, "d d K"]
+    """Of the field by the state."""
+    rounding: Float[np.ndarray, "d K"]
+    """By how much rounding errors change the field, seen at states that all but agree."""
+
+
+def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
+    K = len(chart)
+    fill = np.arange(-(-K // _POINTS) * _POINTS) % K
+    field = jax.device_get(_field(system, chart[fill].astype(np.int32), t[fill], q[:, fill]))
+    return _Seen(q, *(x[..., :K] for x in field))
+
+
+@quick_jit
+def _field(system, chart, t, q):
+    s = Structure(system)
+    K, S = len(chart), len(_SHIFTS)
+    at = lambda t, q: slopes(s, t, chart, q, jnp.zeros((s.nu, K)))  # noqa: E731
+    f, change = jax.jvp(at, (t, q), (jnp.ones(K), at(t, q)))
+    column = lambda e: jax.jvp(lambda q: at(t, q), (q,), (e[:, None] * jnp.ones(K),))[1]  # noqa: E731
+    derivative = jax.vmap(column, out_axes=1)(jnp.eye(s.d))
+    # Not all states by the same part, since a common factor may cancel.
+    shifts = np.stack([np.roll(_SHIFTS, k) for k in range(s.d)]) * np.finfo(float).eps
+    moved = q[..., None] * (1 + shifts[:, None])
+    many = moved.reshape(s.d, K * S)
+    after = slopes(s, jnp.repeat(t, S), jnp.repeat(chart, S), many, jnp.zeros((s.nu, K * S)))
+    smooth = jnp.einsum("ijk,jks->iks", derivative, moved - q[..., None])
+    rounding = jnp.max(jnp.abs(after.reshape(s.d, K, S) - f[..., None] - smooth), axis=-1)
+    return f, change, derivative, rounding
+
+
+@quick_jit
+def _reached(system, chart: int, t, q) -> Float[Array, "A d"]:
+    """A state in every chart, by resets from the guess's; NaN in charts that none leads to."""
+    s = Structure(system)
+    states = {chart: q[: s.dims[chart]]}
+    for _ in s.charts:
+        for g, transition in enumerate(s.transitions):
+            a, b = s.chart_index(transition.source), s.chart_index(transition.target)
+            if a in states and b not in states:
+                states[b] = s.reset(g, t, states[a], jnp.zeros(s.nu))
+    blank = jnp.full(s.d, jnp.nan)
+    pad = lambda a: jnp.zeros(s.d).at[: s.dims[a]].set(states[a])  # noqa: E731
+    return jnp.stack([pad(a) if a in states else blank for a in range(len(s.charts))])
+
+
+def _time_scale(near: _Seen) -> float:
+    """The time of the fastest mode of the field's derivative at the first point (the guess) that
+    has one; in free flight none has, and the time is that in which a state changes by its size."""
+    for derivative in np.moveaxis(near.derivative, -1, 0):
+        if (rate := np.max(np.abs(np.linalg.eigvals(derivative)))) > 0:
+            return 1 / float(rate)
+    q, f, change = (np.abs(x[:, 0]) for x in (near.q, near.f, near.change))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.concatenate([np.sqrt(q / change), q / f])
+    return float(min(times[(times > 0) & (times < np.inf)], default=1.0))
+
+
+def _floor(seen: _Seen, time: float) -> Float[np.ndarray, "d K"]:
+    return _TIMES_ROUNDING * time * seen.rounding
+
+
+def _by_name(s: Structure, chart: Int[np.ndarray, " K"], size: Float[np.ndarray, "d K"]) -> Sizes:
+    """The largest size of each state in any chart; 1 for one that is zero everywhere."""
+    sizes = dict.fromkeys(s.state_names(), 0.0)
+    for a, column in zip(chart, size.T, strict=True):
+        for name, x in zip(s.charts[a].states, column, strict=False):
+            if np.isfinite(x):
+                sizes[name] = max(sizes[name], float(x))
+    return {name: size if size > 0 else 1.0 for name, size in sizes.items()}

@@ -1,0 +1,86 @@
+"""What a fit predicts that it was not fitted to, and the order that predicts best."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import DefinitionError
+from ..experiments.record import Record, uninterrupted_records
+from ..identify.multipliers.denominator import Denominator
+from ..identify.series.arx import delayed_outputs, total_least_squares
+from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.fit import assemble, fit_series
+from ..identify.series.output_error import OutputErrorProblem, linearize
+from ..identify.series.series_fit import SeriesFit
+from ..identify.series.simulation import simulate_record
+from ..identify.series.validation import Validation, validate
+from .data import SectionData
+
+
+# Cycles to choose an order from, and to try it on. Doubled: both take twice as long, and weaker
+# multipliers are seen.
+CYCLES_LOOKED_AT = 1000
+# Relative difference of two misfits that are as good as equal. Doubled: smaller orders are chosen.
+_AS_GOOD = 0.02
+
+
+def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
+    """The number of multipliers that predicts best what it was not fitted to.
+
+    For each number a first, consistent estimate (total least squares) is made from all but the last
+    `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
+    within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
+
+    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
+    """
+    early, late = _split(data, share)
+    grid = CycleGrid.from_data(early)
+    rest = uninterrupted_records(late)
+    misfits = []
+    for d in range(1, most + 1):
+        problem = OutputErrorProblem.from_grid(grid, d, grid.n_sections, free_start=True)
+        c = total_least_squares(delayed_outputs(problem, d))
+        found = linearize(problem, c)
+        if (found.freedom <= 2 * d).any():
+            break
+        fit = assemble(grid, problem, found, Denominator.of_unknown_accuracy(c))
+        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
+        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
+    if not misfits:
+        raise DefinitionError(
+            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
+            "sections: record more, or take fewer sections."
+        )
+    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+
+
+class HeldOut(NamedTuple):
+    """A fit to the first part of each record, tried on the rest."""
+
+    fit: SeriesFit
+    validation: Validation
+
+
+def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
+    """Fit all but the last `share` of every record, and simulate that.
+
+    Of long recordings the first 1000 cycles are looked at.
+
+    **Raises:** `DefinitionError` if too few cycles are left for either.
+    """
+    if not 0 < share < 1:
+        raise DefinitionError(f"share must lie between 0 and 1, not {share}.")
+    early, late = _split(data, share)
+    fit = fit_series(early, order, check=False)
+    return HeldOut(fit, validate(fit, late))
+
+
+def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
+    early, late = [], []
+    enough = min(1.0, CYCLES_LOOKED_AT / data.cycles)
+    for r in data.records:
+        end = round(len(r.u) * enough)
+        cut = round(end * (1 - share))
+        early.append(r.part(0, cut))
+        late.append(r.part(cut, end))
+    return early, late

@@ -1,0 +1,1 @@
+"""Where in its cycle a recorded system is: from an angle, crossings, or events."""

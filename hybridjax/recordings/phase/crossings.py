@@ -1,0 +1,83 @@
+"""Phase that grows by one from each event, or crossing of a level, to the next."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ...errors import DefinitionError
+from ...sections.crossing import AtEvent, Crossing
+from ..recording import Recording
+from .winding import Phase, Winding
+
+
+# Bandwidth of a signal whose crossings are taken, in cycles per cycle. Doubled: crossings are less
+# late where the signal is steep, and noisier.
+_CROSSING_HARMONICS = 16
+# Intervals shorter than this part of the median do not count when the period is found. Doubled: a
+# recording with most of its events doubled is understood, one of irregular cycles no longer.
+_SPURIOUS = 0.25
+# An event this part of a period after the one before is doubled. Doubled: every event is.
+_DOUBLED = 0.5
+# An event was missed in an interval of more than so many periods. Doubled: an interval with one
+# event missed is taken for a long cycle.
+_MISSED = 1.5
+# Cycles by which a causal phase goes on until the next event, at least. Doubled: it follows a
+# sudden change of the period with more delay.
+_LEAST_PROGRESS = 0.1
+
+
+def from_crossings(
+    recording: Recording, crossing: Crossing, bandwidth: float | None, causal: bool
+) -> Phase:
+    """One cycle from each crossing to the next; `bandwidth` of the signal's spline in Hz."""
+    event = AtEvent(str(crossing))
+    if bandwidth is None:  # noise adds crossings of the samples themselves
+        rough = from_events(recording.mark(event.name, crossing), event, causal=False)
+        bandwidth = _CROSSING_HARMONICS / rough.period
+    return from_events(recording.mark(event.name, crossing, bandwidth=bandwidth), event, causal)
+
+
+def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
+    """One cycle from each event to the next."""
+    name, times = event.name, []
+    for trial in recording.trials:
+        if name not in trial.events:
+            there = ", ".join(trial.events) or "none"
+            raise DefinitionError(
+                f"trial '{trial.name}' has no event '{name}'; its events are: {there}."
+            )
+        times.append(trial.events[name])
+    intervals = np.concatenate([np.diff(t) for t in times])
+    if len(intervals) < 2:
+        raise DefinitionError(f"there are too few events '{name}' for two cycles.")
+    # Doubled events make two intervals of one, of which one is short; missed events make long ones.
+    # Neither moves the median by much once the short ones are out.
+    period = float(np.median(intervals))
+    period = float(np.median(intervals[intervals > _SPURIOUS * period]))
+    dropped, kept = 0, []
+    for t in times:
+        good = []
+        for x in t:
+            if good and x - good[-1] < _DOUBLED * period:
+                dropped += 1
+            else:
+                good.append(x)
+        kept.append(np.array(good))
+    missed, stretches = 0, []
+    for t in kept:
+        wide = np.flatnonzero(np.diff(t) > _MISSED * period) + 1
+        missed += sum(round(float(t[k] - t[k - 1]) / period) for k in wide)
+        parts = [part for part in np.split(t, wide) if len(part) > 1]
+        if causal:
+            stretches.append(tuple(_extrapolated(p) for p in parts if len(p) > 2))
+        else:
+            stretches.append(tuple(Winding(p, np.arange(len(p), dtype=float), True) for p in parts))
+    return Phase(stretches, dropped=dropped, missed=missed, lead=0 if causal else 1)
+
+
+def _extrapolated(t: Float[np.ndarray, " n"]) -> Winding:
+    """In each cycle the rate that would make the phase right at the next event, if that comes after
+    as long a time as the last one did."""
+    phase = [1.0]
+    for k, (before, own) in enumerate(zip(np.diff(t[:-1]), np.diff(t[1:]), strict=True), 1):
+        phase.append(phase[-1] + max(k + 1 - phase[-1], _LEAST_PROGRESS) * own / before)
+    return Winding(t[1:], np.array(phase), True)

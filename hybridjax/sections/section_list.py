@@ -1,0 +1,94 @@
+"""Sections one by one, and what else may stand for a family."""
+
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from ..engine.target import AbstractLevels
+from ..errors import DefinitionError
+from ..systems.structure import Structure
+from .abstract import AbstractSections, BoundSections, CyclePoint, check_n_sections
+from .crossing import AtEvent, Crossing
+
+
+class SectionList(AbstractSections):
+    """Sections one by one, in the order in which the cycle meets them.
+
+    **Fields:** `items`: a list of `Crossing` and `AtEvent`.
+    """
+
+    label: ClassVar[str] = "sections"
+    items: tuple[Crossing | AtEvent, ...]
+
+    def __init__(self, items: Iterable[Crossing | AtEvent]):
+        """**Raises:** `DefinitionError` for an empty list, and entries of another kind."""
+        self.items = tuple(items)
+        check_n_sections(len(self.items))
+        for item in self.items:
+            if not isinstance(item, Crossing | AtEvent):
+                raise DefinitionError(
+                    f"SectionList takes Crossing and AtEvent objects, not {type(item).__name__}."
+                )
+
+    @property
+    def n_sections(self) -> int:
+        return len(self.items)
+
+    @property
+    def anchor(self) -> None:
+        return None
+
+    def check(self, s: Structure) -> None:
+        for item in self.items:
+            item.check(s)
+
+    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
+        event = [s.transition_index(x.name) if isinstance(x, AtEvent) else -1 for x in self.items]
+        some = any(isinstance(x, Crossing) for x in self.items)
+        never = jnp.full(self.n_sections, jnp.inf)
+        levels = ListLevels(self.items) if some else None
+        return BoundSections(never, jnp.array(event, jnp.int32), levels)
+
+    def describe(self, i: int) -> str:
+        return f"section {i} ({self.items[i]})"
+
+
+class ListLevels(AbstractLevels):
+    """The level functions of the crossings among some sections."""
+
+    items: tuple[Crossing | AtEvent, ...]
+
+    def present(self, s, a):
+        return any(isinstance(x, Crossing) and x.in_chart(s, a) for x in self.items)
+
+    def level(self, s, a, i, t, q):
+        def branch(item):
+            if isinstance(item, Crossing) and item.in_chart(s, a):
+                return lambda: item.level(s, a, t, q)
+            return lambda: jnp.ones(())
+
+        branches = [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
+        return jax.lax.switch(i + 1, branches)
+
+
+FamilyLike = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+"""A family, a single section, or a list of sections."""
+
+
+def as_family(sections: FamilyLike) -> AbstractSections:
+    """A family from a family, a single section, or a list of sections.
+
+    **Raises:** `DefinitionError` for anything else.
+    """
+    if isinstance(sections, Crossing | AtEvent):
+        return SectionList([sections])
+    if isinstance(sections, list | tuple):
+        return SectionList(sections)
+    if not isinstance(sections, AbstractSections):
+        raise DefinitionError(
+            "sections are a family such as ClockPhase(32) or KinematicPhase(32, ...), or a list of "
+            f"Crossing and AtEvent objects; got {type(sections).__name__}."
+        )
+    return sections

@@ -1,0 +1,67 @@
+"""Recordings of simulated systems, whose truth is known."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..experiments.response_function import ResponseFunction, response_function
+from ..orbits.cycle import LimitCycle
+from ..recordings.recording import Recording
+from ..sections.clock import ClockPhase
+from ..systems.output import Output
+
+
+def simulate_recording(
+    cycle: LimitCycle,
+    force: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    outputs: Sequence[str | Output],
+    *,
+    rate: int | float = 500,
+    steps: int = 4,
+    accuracy: float = 1e-9,
+) -> Recording:
+    """What instruments would see of a system that is perturbed by a force, given as samples.
+
+    The force is linear between samples. It is applied in steps of equal length, each with the
+    value in its middle; the error is of second order in their length.
+
+    **Arguments:**
+
+    - `cycle`: where all trials start. `force`: for S trials of n samples.
+    - `outputs`: names or `Output`s to be recorded beside the inputs.
+    - `rate`: samples per unit of time, changed a little so that a whole number of them fits into a
+      period. `steps`: of the force from sample to sample.
+    - `accuracy`: of the simulation, as in `run_experiments`.
+
+    **Returns:** a `Recording` with S trials. A trial that fails ends there.
+
+    **Raises:** `DefinitionError` as `response_function`.
+    """
+    force = np.asarray(force, float)
+    period = float(cycle.period)
+    K = round(rate * period)
+    S, n, nu = force.shape
+    cycles = -(-(n - 1) // K)
+    x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
+    middle = (np.arange(steps) + 0.5) / steps
+    u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
+    u = u.reshape(S, -1, nu)
+    response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
+    y = np.asarray(_respond(response, jnp.asarray(u)))[:, ::steps]
+    names = tuple(x if isinstance(x, str) else x.name for x in outputs)
+    time = np.arange(y.shape[1]) * period / K
+    trials = []
+    for s in range(S):
+        good = slice(0, min(n, int(np.isfinite(y[s]).all(axis=1).sum())))
+        signals = dict(zip(cycle.system.inputs, force[s, good].T, strict=True))
+        signals |= dict(zip(names, y[s, good].T, strict=True))
+        trials.append(Recording(time[good], signals, name=f"trial {s}"))
+    return Recording.join(trials)
+
+
+@eqx.filter_jit
+def _respond(response: ResponseFunction, u: Float[Array, "S n nu"]) -> Float[Array, "S n ny"]:
+    return response(u).y

@@ -1,0 +1,50 @@
+"""A made-up periodic system whose dimension varies, to try things on."""
+
+import numpy as np
+
+from ..linear.ldtp import LDTP
+
+
+_A = (
+    ((0.5, -0.3, 0.2), (0.4, 0.6, -0.1)),
+    ((0.7, 0.2), (-0.5, 0.8), (0.3, 0.1)),
+    ((0.6, 0.1, -0.4), (-0.2, 0.9, 0.3)),
+    ((0.8, -0.6), (0.5, 0.7), (-0.1, 0.4)),
+    ((0.9, 0.2, 0.1), (-0.3, 0.7, 0.5)),
+    ((1.1, -0.4), (0.3, 0.9), (0.2, -0.7)),
+)
+_B = (
+    ((1, 0), (0.5, -0.2)),
+    ((0.3, 0.1), (0, 1), (-0.4, 0.2)),
+    ((0.2, 0.6), (-1, 0.1)),
+    ((0.5, 0), (0.1, -0.3), (0, 0.7)),
+    ((-0.6, 0.4), (0.2, 0.8)),
+    ((0, 0.5), (1, -0.1), (0.3, 0.2)),
+)
+_C = (
+    ((1, 0, 0), (0, 1, -1)),
+    ((1, 0.5), (0, 1)),
+    ((0, 1, 0.2), (1, 0, 0)),
+    ((0.5, 1), (-1, 0)),
+    ((1, 0, 0.3), (0.2, -1, 0)),
+    ((0, 1), (1, 1)),
+)
+_D = (
+    ((0, 0), (0, 0)),
+    ((0.1, 0), (0, 0)),
+    ((0, 0), (0, -0.2)),
+    ((0, 0), (0.3, 0)),
+    ((0, 0), (0, 0)),
+    ((0, 0.1), (0, 0)),
+)
+
+
+def synthetic_ldtp() -> LDTP:
+    """An `LDTP` of 6 sections with the dimensions 3, 2, 3, 2, 3, 2, two inputs and two outputs.
+
+    It comes from no physical system: nothing about it is special, so that algebra which is right
+    here is right. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there
+    is a structural zero beside them.
+    """
+    A, B, C, D = ([np.array(x, float) for x in matrices] for matrices in (_A, _B, _C, _D))
+    return LDTP.from_blocks(A, B, C, D)

@@ -1,0 +1,122 @@
+"""Gradients through whole experiments of the lossy hopper, by its parameters and by the input."""
+
+import functools as ft
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.engine.settings import Settings
+from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.stepping.plan import make_plan
+
+from ..conftest import APEX, OUTPUTS
+
+
+# Compiled in a third of the time, to slower programs.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+compiled = ft.partial(jax.jit, compiler_options=QUICK)
+PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g")
+SETTINGS = Settings(rtol=1e-12, atol=1e-12, max_steps=1024)
+N = 4
+
+
+@pytest.fixture(scope="module", params=["isochron", "kinematic"])
+def experiment(request, lossy_cycle):
+    """A function (parameters, inputs (n, nu)) -> (outputs, result) of one experiment."""
+    family = {
+        "isochron": hj.ClockPhase(N, anchor=APEX),
+        "kinematic": hj.KinematicPhase(
+            N, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
+        ),
+    }[request.param]
+    placed = hj.place_sections(lossy_cycle, family)
+    plan = make_plan(placed, SETTINGS, 1e-11, np.ones((N, 5)))
+    start = jnp.concatenate([placed.lanes.t[None], placed.lanes.q])[:, :1]
+
+    def run(x, u):
+        pick = lambda s: [getattr(s, name) for name in PARAMETERS]  # noqa: E731
+        system = eqx.tree_at(pick, lossy_cycle.system, list(x))
+        other = eqx.tree_at(lambda p: p.cycle.system, placed, system)
+        response = flow_batch(other, plan, start, u[None], OUTPUTS, SETTINGS)
+        return response.y[0], response.result[0]
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def parameters(lossy_cycle):
+    return jnp.stack([getattr(lossy_cycle.system, name) for name in PARAMETERS])
+
+
+def inputs(cycles):
+    return 0.1 * jnp.asarray(np.random.default_rng(0).standard_normal((cycles * N, 1)))
+
+
+def loss(experiment, x, u):
+    y, result = experiment(x, u)
+    return jnp.sum(y**2), result
+
+
+def central(f, x, e=1e-4):
+    steps = e * np.eye(len(x))
+    return np.array([(f(x + d) - f(x - d)) / (2 * e) for d in steps])
+
+
+@pytest.mark.slow
+def test_reverse_and_forward_mode_agree_with_differences(experiment, parameters):
+    u = inputs(3)
+    f = ft.partial(loss, experiment)
+    value = compiled(f)
+    assert value(parameters, u)[1] == hj.Result.OK
+    (by_x, by_u), _ = compiled(jax.grad(f, argnums=(0, 1), has_aux=True))(parameters, u)
+    forward, _ = compiled(jax.jacfwd(f, has_aux=True))(parameters, u)
+    np.testing.assert_allclose(forward, by_x, rtol=1e-9)
+    true = central(lambda x: value(x, u)[0], parameters)
+    np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+    true = central(lambda v: value(parameters, v[:, None])[0], u[:, 0])
+    np.testing.assert_allclose(by_u[:, 0], true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+
+
+@pytest.mark.slow
+def test_experiments_that_are_mapped(experiment, parameters):
+    """The gradient of a map is the sum of gradients, and the map of gradients is a list of them."""
+    many = jnp.stack([inputs(2), -inputs(2)])
+    f = lambda x, u: loss(experiment, x, u)[0]  # noqa: E731
+    each = compiled(jax.vmap(jax.grad(f), (None, 0)))(parameters, many)
+    total = compiled(jax.grad(lambda x, u: jnp.sum(jax.vmap(f, (None, 0))(x, u))))
+    np.testing.assert_allclose(total(parameters, many), each.sum(axis=0), rtol=1e-9)
+    one = compiled(jax.grad(f))
+    for u, found in zip(many, each, strict=True):
+        np.testing.assert_allclose(found, one(parameters, u), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_agree_with_differences(experiment, parameters):
+    """A product with the Hessian, forward over reverse, and a number of it forward twice."""
+    u, v = inputs(1), jnp.array([0.1, 0.2, -0.3, 0.1, 0.05, 0.2, -0.1])
+    f = lambda x: loss(experiment, x, u)[0]  # noqa: E731
+    push = lambda f: lambda x: jax.jvp(f, (x,), (v,))  # noqa: E731
+    both = compiled(push(jax.grad(f)))
+    product = both(parameters)[1]
+    e = 1e-4
+    true = (both(parameters + e * v)[0] - both(parameters - e * v)[0]) / (2 * e)
+    np.testing.assert_allclose(product, true, atol=1e-6 * np.abs(true).max())
+    twice = compiled(push(lambda x: push(f)(x)[1]))(parameters)[1]
+    np.testing.assert_allclose(twice, v @ product, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_reverse_mode_stores_the_states_at_the_sections(experiment, parameters):
+    f = jax.grad(lambda x, u: loss(experiment, x, u)[0])
+
+    def memory(cycles):
+        program = compiled(f).lower(parameters, inputs(cycles)).compile()
+        return program.memory_analysis().temp_size_in_bytes
+
+    short, long = memory(4), memory(16)
+    assert (long - short) / (12 * N) < 512  # bytes for each section
+    assert long < 10_000_000

@@ -1,0 +1,85 @@
+"""Families of one's own."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import hybridjax as hj
+
+
+class ChosenPhases(hj.sections.AbstractSections):
+    """Sections at chosen phases of the clock, in periods."""
+
+    label: ClassVar[str] = "chosen"
+    phases: Float[Array, " N"] = eqx.field(converter=jnp.asarray)
+
+    @property
+    def n_sections(self):
+        return len(self.phases)
+
+    @property
+    def anchor(self):
+        return None
+
+    def check(self, s):
+        pass
+
+    def bind(self, s, point):
+        return hj.sections.BoundSections.at_times(self.phases * point.period)
+
+    def describe(self, i):
+        return f"section {i} (phase {float(self.phases[i]):.3g})"
+
+
+class Levels(hj.sections.AbstractLevels):
+    values: Float[Array, " N"]
+
+    def present(self, s, a):
+        return True
+
+    def level(self, s, a, i, t, q):
+        return q[0] - self.values[i]
+
+
+class FallingPast(hj.sections.AbstractSections):
+    """Sections where the first state falls past each of some values."""
+
+    label: ClassVar[str] = "falling past"
+    values: Float[Array, " N"] = eqx.field(converter=jnp.asarray)
+
+    @property
+    def n_sections(self):
+        return len(self.values)
+
+    @property
+    def anchor(self):
+        return None
+
+    def check(self, s):
+        pass
+
+    def bind(self, s, point):
+        return hj.sections.BoundSections.at_levels(Levels(self.values), self.n_sections)
+
+    def describe(self, i):
+        return f"section {i} (at {float(self.values[i]):.3g})"
+
+
+def test_a_family_of_clock_phases(hopper_cycle):
+    placed = hj.place_sections(hopper_cycle, ChosenPhases([0.1, 0.25, 0.8]))
+    np.testing.assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
+    ldtp = hj.linearize(hopper_cycle, placed, "yM")
+    np.testing.assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
+
+
+def test_a_family_of_levels(vanderpol_cycle):
+    family = FallingPast([1.0, 0.0, -1.0])
+    one_by_one = [hj.Crossing("x", "falling", value=float(x)) for x in family.values]
+    own, listed = (hj.place_sections(vanderpol_cycle, x) for x in (family, one_by_one))
+    np.testing.assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
+    np.testing.assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
+    a, b = (hj.linearize(vanderpol_cycle, x, "v") for x in (own, listed))
+    np.testing.assert_allclose(a.A, b.A, atol=1e-12)

@@ -1,0 +1,129 @@
+"""A, B, C, D between sections: against stored references, and against scipy's differences."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS
+from ..orbits import hopper_scipy
+
+
+LAMBDA = -0.248983334735609 + 0.699333251798004j
+LOSSY = -0.317897006349938 + 0.694628822735891j
+
+
+def padded(x):
+    return np.nan_to_num(np.asarray(x))
+
+
+def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochron_ldtp):
+    data = reference("ldtp_isochron")
+    clock = np.asarray(placed_isochrons.lanes.t) % 1
+    np.testing.assert_allclose(clock, data["clock"] % 1, atol=1e-10)
+    np.testing.assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
+    np.testing.assert_array_equal(isochron_ldtp.dims, data["dim"])
+    np.testing.assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
+    np.testing.assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
+    np.testing.assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
+    np.testing.assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
+    markov = isochron_ldtp.impulse_response(97)[..., 0]
+    np.testing.assert_allclose(markov, data["markov"], atol=1e-8)
+
+
+def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
+    data = reference("htf_exact_isochron")
+    H = np.asarray(isochron_ldtp.htf(data["f"]).H)[..., 0].transpose(1, 0, 2)
+    largest = np.abs(data["H"][:, 16]).max(axis=0)
+    assert np.all(np.abs(H - data["H"]).max(axis=(0, 1)) <= 1e-8 * largest)
+
+
+@pytest.mark.parametrize("family", ["isochron_ldtp", "kinematic_ldtp"])
+def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, request):
+    ldtp = request.getfixturevalue(family)
+    truth = np.array([LAMBDA, np.conj(LAMBDA)])
+    np.testing.assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
+    np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
+    for i in range(32):
+        monodromy = np.asarray(ldtp.monodromy(i))
+        found = sorted(np.linalg.eigvals(monodromy), key=abs)
+        np.testing.assert_allclose(sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9)
+        assert ldtp.rank(i) == 2
+
+
+def angles(apex, count):
+    """Kinematic sections of the scipy hopper, the first of them through its apex."""
+    position, velocity = hopper_scipy.plane(apex)
+    first = np.arctan2(velocity, position)
+    return [("angle", first - 2 * np.pi * i / count) for i in range(count)]
+
+
+def cycle_points(sections, start, retention=1.0):
+    """The scipy hopper's cycle on each of the sections."""
+    points = [hopper_scipy.flow(start, sections[0], retention=retention)]
+    for section in sections[1:]:
+        points.append(hopper_scipy.flow(points[-1], section, retention=retention))
+    return points
+
+
+def check_against_differences(ldtp, sections, points, retention, subset):
+    N = len(sections)
+    scale_A, scale_B = np.max(np.abs(ldtp.A)), np.max(np.abs(ldtp.B))
+    for i in subset:
+        here, there = sections[i], sections[(i + 1) % N]
+        names, after = ldtp.coordinates[i], ldtp.coordinates[(i + 1) % N]
+        if ldtp.coordinates[0][0] != "t" and i == N - 1:
+            there = ("clock", there[1] + 1.0)
+        J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
+        A = np.asarray(ldtp.A)[i, : len(after), : len(names)]
+        B = np.asarray(ldtp.B)[i, : len(after), 0]
+        np.testing.assert_allclose(A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]")
+        np.testing.assert_allclose(B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]")
+
+
+def test_kinematic_sections_agree_with_scipy(reference, kinematic_ldtp, placed_kinematic):
+    sections = angles((0.0, 2.2, 0.0), 32)  # at the apex vM = 0, so the angle is 0
+    points = cycle_points(sections, (0.5, *reference("limit_cycle")["state_clock_half"]))
+    for i, point in enumerate(points):
+        assert abs(float(placed_kinematic.lanes.t[i]) - point[0]) < 1e-10
+        found = placed_kinematic.lanes.q[: len(point) - 1, i]
+        np.testing.assert_allclose(found, point[1:], rtol=0, atol=1e-10)
+    check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
+
+
+def lossy_sections(kind, count):
+    start = (0.5, 1.87978886663710, 1.75832736962547)
+    apex = hopper_scipy.flow(start, ("angle", 0.0), retention=0.8)
+    if kind == "isochron":
+        sections = [("clock", apex[0] + i / count) for i in range(count)]
+    else:
+        sections = angles(apex, count)
+    return sections, cycle_points(sections, start, retention=0.8)
+
+
+@pytest.mark.parametrize("kind", ["isochron", "kinematic"])
+def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
+    # With 32 kinematic sections the jump at touchdown would throw the cycle back over one.
+    N = 32 if kind == "isochron" else 8
+    family = ISOCHRONS if kind == "isochron" else dataclasses.replace(KINEMATIC, n_sections=N)
+    ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
+    np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
+    sections, points = lossy_sections(kind, N)
+    dims = [len(p) for p in points]
+    changes = [i for i in range(N) if dims[i] != dims[(i + 1) % N]]
+    assert len(changes) == 2  # the intervals that contain touchdown and liftoff
+    check_against_differences(ldtp, sections, points, 0.8, [*changes, 0, 2])
+
+
+def test_a_jump_that_goes_back_over_a_section_is_reported(lossy_cycle):
+    with pytest.raises(hj.ComputationError, match=r"section 19 .* is crossed 2 times"):
+        hj.linearize(lossy_cycle, KINEMATIC, OUTPUTS)
+
+
+def test_a_cycle_that_is_rest():
+    """Where the state stands still, only its derivatives say how short steps must be."""
+    cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
+    found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
+    np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)

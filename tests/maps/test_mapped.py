@@ -1,0 +1,65 @@
+"""Cycles, section maps and linearizations of many systems under `jax.vmap`."""
+
+import functools as ft
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import APEX
+
+
+# Compiled in a third of the time, to slower programs.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+compiled = ft.partial(jax.jit, compiler_options=QUICK)
+SECTIONS = hj.ClockPhase(4, anchor=APEX)
+STIFFNESS = jnp.array([[9.8, 10.0], [10.1, 10.3]])
+
+
+def analyze(lossy_cycle, k):
+    """Numbers of the lossy hopper with stiffness k: states, A, B, a section map, a mean."""
+    hopper = eqx.tree_at(lambda s: s.k, lossy_cycle.system, k)
+    cycle = hj.find_limit_cycle(hopper, lossy_cycle)
+    placed = hj.place_sections(cycle, SECTIONS)
+    ldtp = hj.linearize(cycle, placed, outputs="yM")
+    P = hj.section_map(cycle, placed, 1, 3)
+    arrival = P(P.fixed_point + 1e-3 * (P.fixed_point != 0), 0.1)
+    return {
+        "result": cycle.result,
+        "states": placed.lanes.q,
+        "monodromy": ldtp.monodromy(0)[:4, :4],
+        "B": ldtp.B,
+        "arrival": arrival.q,
+    }
+
+
+@pytest.mark.slow
+def test_many_systems_side_by_side(lossy_cycle):
+    """Nested maps over systems equal a loop over them."""
+    one = ft.partial(analyze, lossy_cycle)
+    loop = compiled(one)
+    mapped = compiled(jax.vmap(jax.vmap(one)))(STIFFNESS)
+    for index in np.ndindex(*STIFFNESS.shape):
+        alone = loop(STIFFNESS[index])
+        assert alone["result"] == hj.Result.OK
+        for name, value in alone.items():
+            np.testing.assert_allclose(mapped[name][index], value, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.slow
+def test_gradients_of_many_systems_side_by_side(lossy_cycle):
+    def size(k):
+        found = analyze(lossy_cycle, k)
+        return jnp.sum(found["monodromy"] ** 2) + jnp.sum(found["arrival"] ** 2)
+
+    k = STIFFNESS[0]
+    by_map = compiled(jax.vmap(jax.grad(size)))(k)
+    of_map = compiled(jax.grad(lambda k: jnp.sum(jax.vmap(size)(k))))(k)
+    np.testing.assert_allclose(of_map, by_map, rtol=1e-9)
+    e = 1e-4
+    ends = compiled(jax.vmap(size))(jnp.array([k[0] + e, k[0] - e]))
+    np.testing.assert_allclose(by_map[0], (ends[0] - ends[1]) / (2 * e), rtol=1e-6)

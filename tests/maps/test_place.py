@@ -1,0 +1,209 @@
+"""Sections on a cycle: of every kind, and every way in which they can be wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import APEX, OUTPUTS
+
+
+AtEvent, Crossing = hj.AtEvent, hj.Crossing
+LAMBDA = -0.248983334735609 + 0.699333251798004j
+VDP = 8.59695063603805e-4
+
+
+def test_the_apex_is_section_zero(reference, placed_kinematic):
+    data = reference("limit_cycle")
+    assert abs(placed_kinematic.lanes.t[0] % 1 - data["apex_clock"]) < 1e-10
+    assert np.all(placed_kinematic.duration > 0)
+    np.testing.assert_allclose(np.sum(placed_kinematic.duration), 1.0, atol=1e-12)
+    q = np.asarray(placed_kinematic.lanes.q)
+    angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
+    np.testing.assert_allclose(angle, -2 * np.pi * np.arange(32) / 32, atol=1e-10)
+
+
+def test_a_list_of_sections_of_every_kind(hopper_cycle):
+    """State-based, on events, and in one chart only; the monodromy is that of the cycle."""
+    sections, times, names = zip(
+        (Crossing("ym", "rising", value=0.1), 0.69638656, "t yM vM vm"),
+        (APEX, 0.72334235, "t yM ym vm"),
+        (Crossing("ym", "falling", value=0.1), 1.32666602, "t yM vM vm"),
+        (AtEvent("touchdown"), 1.35098179, "t yM vM"),
+        (Crossing("yM", "rising", value=1.9), 1.46563862, "t vM"),
+        (AtEvent("liftoff"), 1.51631443, "t yM vM ym vm"),
+        strict=True,
+    )
+    placed = hj.place_sections(hopper_cycle, sections)
+    np.testing.assert_allclose(placed.lanes.t, times, atol=1e-8)
+    ldtp = hj.linearize(hopper_cycle, placed, ("yM", "vM"))
+    assert tuple(" ".join(x) for x in ldtp.coordinates) == names
+    np.testing.assert_array_equal(ldtp.dims, [len(names) for names in ldtp.coordinates])
+    np.testing.assert_allclose(ldtp.multipliers, [LAMBDA, np.conj(LAMBDA)], atol=1e-9)
+    assert [ldtp.rank(i) for i in range(6)] == [2] * 6
+
+
+def test_a_number_as_the_anchor(hopper_cycle):
+    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=0.1))
+    np.testing.assert_allclose(clock.lanes.t % 1, [0.1, 0.1 + 1 / 3, 0.1 + 2 / 3], atol=1e-12)
+    family = hj.KinematicPhase(
+        4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=0.3
+    )
+    q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
+    angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
+    np.testing.assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
+
+
+@pytest.mark.parametrize("offset", np.linspace(-0.3, 0.3, 5))
+def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset):
+    """On which side of it is no matter; it was taken for a section that is touched."""
+    center, scale = (1.9, float(offset)), (0.3, 1.9)
+    family = hj.KinematicPhase(
+        4, position="yM", velocity="vM", center=center, scale=scale, anchor=APEX
+    )
+    placed = hj.place_sections(hopper_cycle, family)
+    np.testing.assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
+    assert abs(placed.lanes.q[1, 0]) < 1e-12
+
+
+def test_sections_follow_the_cycle_of_another_hopper(hopper_cycle, lossy_cycle):
+    """A family is a definition, bound to no cycle: its anchor moves with the apex."""
+    family = hj.ClockPhase(32, anchor=APEX)
+    for cycle in (hopper_cycle, lossy_cycle):
+        placed = hj.place_sections(cycle, family)
+        assert abs(placed.lanes.q[1, 0]) < 1e-11
+        np.testing.assert_allclose(placed.duration, 1 / 32, atol=1e-13)
+
+
+def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
+    """Time has no origin there: a multiplier of 1 beside the true one."""
+    ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling")))
+    assert ldtp.outputs == ("x", "v") and ldtp.coordinates[0] == ("x", "v")
+    np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
+    family = hj.KinematicPhase(8, position="x", velocity="v", anchor=Crossing("v", "falling"))
+    ldtp = hj.linearize(vanderpol_cycle, family, "x")
+    np.testing.assert_array_equal(ldtp.dims, np.ones(8))
+    np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_the_unit_of_a_level_does_not_matter(vanderpol_cycle, unit):
+    position, speed = (
+        hj.Output(name, lambda t, q, u, k=k: unit * q[k]) for k, name in enumerate(("X", "V"))
+    )
+    plain = [Crossing("x", "falling", value=0.3), Crossing("v", "rising", value=-0.2)]
+    scaled = [
+        Crossing(position, "falling", value=0.3 * unit),
+        Crossing(speed, "rising", value=-0.2 * unit),
+    ]
+    a, b = (hj.place_sections(vanderpol_cycle, x) for x in (plain, scaled))
+    np.testing.assert_allclose(b.lanes.q, a.lanes.q, atol=1e-11)
+    assert a.coordinates() == b.coordinates()
+    tangent = Crossing(position, "rising", value=2.00861986 * unit)
+    with pytest.raises(hj.ComputationError, match=r"\(X rising\) is tangent"):
+        hj.place_sections(vanderpol_cycle, [tangent, scaled[0]])
+
+
+TOP = Crossing("v", "falling")
+
+
+@pytest.mark.parametrize(
+    "sections, message",
+    [
+        ([TOP, Crossing("x", "rising"), Crossing("x", "falling")], r"out of order: section \d \(x"),
+        ([TOP, Crossing("x", "rising", value=9.0)], r"section 1 \(x rising\) is not reached from"),
+        ([Crossing("x", "rising", value=9.0), TOP], r"section 0 \(x rising\) is not reached on"),
+        ([TOP, Crossing("x", "rising", value=2.00861986)], r"section 1 \(x rising\) is tangent"),
+        ([TOP, TOP], "out of order"),
+        (
+            [TOP, Crossing(hj.Output("xv", lambda t, q, u: q[0] * q[1]), "falling")],
+            r"section 1 \(xv falling\) is crossed 2 times in one period",
+        ),
+        (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
+        (
+            hj.KinematicPhase(4, position="x", velocity="v", center=(9.0, 0.0), anchor=TOP),
+            r"section 1 \(kinematic phase 1/4 after section 0\) is not reached from section 0",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
+    with pytest.raises(hj.ComputationError, match=message):
+        hj.place_sections(vanderpol_cycle, sections)
+
+
+def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
+    with pytest.raises(hj.ComputationError, match=r"section 0 \(twice falling\) is crossed more"):
+        twice = hj.Output("twice", lambda t, q, u: jnp.sin(4 * jnp.pi * t))
+        hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
+
+
+@pytest.mark.parametrize(
+    "define, message",
+    [
+        (lambda: hj.ClockPhase(0), "a whole number of sections, at least 1; got 0"),
+        (lambda: hj.ClockPhase(2.5), "a whole number of sections, at least 1; got 2.5"),
+        (lambda: hj.SectionList([]), "a whole number of sections, at least 1; got 0"),
+        (lambda: hj.SectionList(["x"]), "takes Crossing and AtEvent objects, not str"),
+    ],
+)
+def test_bad_families(define, message):
+    with pytest.raises((hj.DefinitionError, TypeError), match=f"{message}|type"):
+        define()
+
+
+@pytest.mark.parametrize(
+    "sections, message",
+    [
+        ("x", "sections are a family such as ClockPhase|'sections'"),
+        (None, "sections are a family such as ClockPhase|'sections'"),
+        ([AtEvent("bounce")], "there is no event 'bounce'"),
+        ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
+        ([Crossing("x", "falling", charts=("a",))], "there is no chart 'a'"),
+        (hj.KinematicPhase(4, position="x", velocity="w"), "there is no output 'w'"),
+        (hj.ClockPhase(4, anchor=Crossing("w", "falling")), "there is no output 'w'"),
+    ],
+)
+def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
+    with pytest.raises((hj.DefinitionError, TypeError), match=message):
+        hj.place_sections(vanderpol_cycle, sections)
+
+
+def test_sections_of_another_cycle(hopper_cycle, placed_isochrons, lossy_cycle):
+    for use in (
+        lambda: hj.linearize(lossy_cycle, placed_isochrons),
+        lambda: hj.section_map(lossy_cycle, placed_isochrons, 0, 1),
+        lambda: hj.run_experiments(lossy_cycle, placed_isochrons, np.zeros((1, 32, 1)), OUTPUTS),
+    ):
+        with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+            use()
+
+
+def test_sections_that_move_on_an_autonomous_cycle(vanderpol_cycle):
+    period = float(vanderpol_cycle.period)
+    moving = hj.Crossing(lambda t, q: jnp.cos(2 * jnp.pi * t / period), "falling")
+    with pytest.raises(hj.ComputationError, match="depends on time"):
+        hj.place_sections(vanderpol_cycle, [moving])
+
+
+def test_bad_inputs_and_outputs(vanderpol_cycle, hopper_cycle, placed_isochrons):
+    with pytest.raises(hj.DefinitionError, match="there is no input 'force'; inputs are u"):
+        hj.linearize(vanderpol_cycle, hj.ClockPhase(8), inputs="force")
+    with pytest.raises(hj.DefinitionError, match="there is no output 'y'"):
+        hj.linearize(vanderpol_cycle, hj.ClockPhase(8), "y")
+    foot = hj.Output("foot", {"flight": lambda t, q, u: q[2]})
+    with pytest.raises(hj.DefinitionError, match="'foot' is not defined in chart 'stance'"):
+        hj.linearize(hopper_cycle, placed_isochrons, foot)
+
+
+def test_outputs_of_any_kind_and_feedthrough(hopper_cycle, placed_isochrons, isochron_ldtp):
+    def acceleration(t, q, u):
+        leg = 10.0 * (2.0 - (q[0] - (q[2] if q.shape[0] == 4 else 0.0)))
+        return (leg + 20.0 * jnp.sin(2 * jnp.pi * t) + u[0]) / 2.0 - 2.0
+
+    ldtp = hj.linearize(hopper_cycle, placed_isochrons, ["vM", hj.Output("aM", acceleration)])
+    np.testing.assert_allclose(ldtp.D[:, :, 0], np.tile([0.0, 0.5], (32, 1)), atol=1e-15)
+    np.testing.assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
+    flight = np.asarray(ldtp.dims) == 4
+    np.testing.assert_allclose(ldtp.C[flight, 1], [[-5.0, 0.0, 5.0, 0.0]] * flight.sum())
+    np.testing.assert_allclose(ldtp.C[~flight, 1], [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum())

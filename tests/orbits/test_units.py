@@ -1,0 +1,216 @@
+"""Results do not depend on the units of length and time in which a system is written."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import APEX
+
+
+# Units of length and time, in those of the models.
+UNITS = {"micrometers": (1e6, 1.0), "gigameters": (1e-9, 1.0), "milliseconds": (1.0, 1e3)}
+units = pytest.mark.parametrize("unit", UNITS)
+SECTIONS = 8
+FREQUENCIES = np.arange(0.1, 4.0, 0.4)
+
+
+def dimensions(length, time):
+    """What a state or an output is multiplied by, by its first letter; t, and the force."""
+    speed = length / time
+    return {"y": length, "x": length, "v": speed, "t": time, "force": speed / time}
+
+
+def scaled_hopper(length, time, **changes):
+    hopper = hj.models.VerticalHopper(**changes)
+    force = length / time**2
+    p = {
+        "k": hopper.k / time**2, "b": hopper.b / time, "l0": hopper.l0 * length,
+        "a": hopper.a * force, "g": hopper.g * force, "omega": hopper.omega / time,
+    }  # fmt: skip
+    return hj.models.VerticalHopper(m=hopper.m, M=hopper.M, retention=hopper.retention, **p)
+
+
+def hopper_cycle_in(length, time):
+    guess = hj.Guess("stance", (2.0 * length, 1.9 * length / time), 0.5 * time)
+    return hj.find_limit_cycle(scaled_hopper(length, time), guess)
+
+
+class Relaxation(hj.HybridSystem):
+    """Van der Pol's oscillator with a length and a time, and two states that rest: one that is
+    zero, and one that rounding errors move."""
+
+    length: jax.Array = hj.parameter(1.0)
+    time: jax.Array = hj.parameter(1.0)
+    mu: jax.Array = hj.parameter(1.0)
+
+    def charts(self):
+        return {"all": Motion(self)}
+
+    def guess(self):
+        return hj.Guess("all", (2.0 * self.length, 0.0, 0.0, 0.0))
+
+
+class Motion(hj.Chart):
+    states = ("x", "v", "nothing", "rounding")
+    system: Relaxation
+
+    def field(self, t, q, u):
+        x, v, nothing, rounding = q
+        length, time, mu = self.system.length, self.system.time, self.system.mu
+        force = mu * (1 - (x / length) ** 2) * v / time - x / time**2
+        rest = (((x + length) - x) - length - rounding) / time
+        return v, force + u[0], -nothing / time, rest
+
+
+def relaxation_in(length, time, mu=1.0, section=None):
+    return hj.find_limit_cycle(Relaxation(length=length, time=time, mu=mu), section=section)
+
+
+@pytest.fixture(scope="module")
+def relaxation():
+    return relaxation_in(1.0, 1.0)
+
+
+def assert_same_model(model, other, sizes):
+    """A, B, C, D of two models agree, up to what units multiply them by."""
+    by_name = lambda name: sizes["t" if name == "t" else name[0]]  # noqa: E731
+    assert model.coordinates == other.coordinates
+    N, outputs = model.n_sections, np.array([by_name(name) for name in model.outputs])
+    for n in range(N):
+        here, after = (np.array([by_name(c) for c in model.coordinates[k % N]]) for k in (n, n + 1))
+        d, e = len(here), len(after)
+        back = [
+            other.A[n][:e, :d] * here / after[:, None],
+            other.B[n][:e] * sizes["force"] / after[:, None],
+            other.C[n][:, :d] * here / outputs[:, None],
+            other.D[n] * sizes["force"] / outputs[:, None],
+        ]
+        own = model.A[n][:e, :d], model.B[n][:e], model.C[n][:, :d], model.D[n]
+        for mine, theirs in zip(own, back, strict=True):
+            np.testing.assert_allclose(theirs, mine, rtol=1e-9, atol=1e-9 * np.abs(mine).max())
+
+
+@units
+def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, unit):
+    length, time = UNITS[unit]
+    sizes = dimensions(length, time)
+    cycle = hopper_cycle_in(length, time)
+    assert (cycle.result, cycle.event_sequence) == (hj.Result.OK, hopper_cycle.event_sequence)
+    assert cycle.iterations == hopper_cycle.iterations and cycle.residual < 1e-12
+    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    for name, size in hopper_cycle.scale.items():
+        np.testing.assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
+        size = hopper_cycle.state.get(name, 0.0) * sizes[name[0]]
+        np.testing.assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
+    scaled = hj.KinematicPhase(
+        SECTIONS, position="yM", velocity="vM", center=(1.9 * length, 0.0),
+        scale=(0.3 * length, 1.9 * length / time), anchor=APEX,
+    )  # fmt: skip
+    plain = hj.KinematicPhase(
+        SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
+    )
+    clock = hj.ClockPhase(SECTIONS, anchor=APEX)
+    for family, theirs in ((clock, clock), (plain, scaled)):
+        model = hj.linearize(hopper_cycle, family, ("yM", "vM"))
+        other = hj.linearize(cycle, theirs, ("yM", "vM"))
+        assert_same_model(model, other, sizes)
+        np.testing.assert_allclose(other.multipliers(), model.multipliers(), rtol=1e-9)
+        H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
+        back = np.array([sizes["force"] / sizes[name[0]] for name in model.outputs])
+        for k, row in enumerate(back):
+            mine = H[:, :, k]
+            np.testing.assert_allclose(theirs[:, :, k] * row, mine, atol=1e-9 * np.abs(mine).max())
+
+
+@units
+def test_a_branch_of_the_hopper(hopper_cycle, unit):
+    length, time = UNITS[unit]
+    k = np.array([8.0, 10.0])
+    branch = hj.continuation(hopper_cycle, "k", k)
+    other = hj.continuation(hopper_cycle_in(length, time), "k", k / time**2)
+    assert len(other) == len(branch) and other.cycles.ok.all()
+    np.testing.assert_allclose(other.values * time**2, branch.values, rtol=1e-9)
+    np.testing.assert_allclose(other.multipliers, branch.multipliers, rtol=1e-9)
+
+
+@units
+def test_branch_points_of_the_juggler(unit):
+    length, time = UNITS[unit]
+    juggler = hj.models.PaddleJuggler()
+
+    def branch_in(length, time):
+        guess = juggler.guess()
+        state = guess.state * jnp.array([length, length / time])
+        system = hj.models.PaddleJuggler(
+            A=juggler.A * length, T=juggler.T * time, g=juggler.g * length / time**2,
+            restitution=juggler.restitution,
+        )  # fmt: skip
+        cycle = hj.find_limit_cycle(system, hj.Guess(guess.chart, state, guess.time * time))
+        return hj.continuation(cycle, "A", np.array([0.1, 0.35]) * length)
+
+    branch, other = branch_in(1.0, 1.0), branch_in(length, time)
+    assert [p.kind for p in other.points] == [p.kind for p in branch.points] == ["fold", "flip"]
+    for mine, theirs in zip(branch.points, other.points, strict=True):
+        np.testing.assert_allclose(theirs.value / length, mine.value, rtol=1e-9)
+        critical = np.argmin(np.abs(np.abs(mine.multipliers) - 1))
+        np.testing.assert_allclose(np.abs(theirs.multipliers[critical]), 1, rtol=1e-5)
+    assert [e.result for e in other.ends] == [e.result for e in branch.ends]
+
+
+@units
+def test_an_oscillator_without_a_clock(relaxation, unit):
+    """The plane through the guess, its time to return, and the flow out of the multipliers."""
+    length, time = UNITS[unit]
+    for section in (None, hj.Crossing("v", "falling")):
+        cycle = relaxation_in(length, time, section=section)
+        assert cycle.result == hj.Result.OK
+        np.testing.assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
+        np.testing.assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
+
+
+@units
+def test_results_that_are_no_cycles(unit):
+    """A family of cycles, and an equilibrium in place of one."""
+    length, time = UNITS[unit]
+    with pytest.raises(hj.ComputationError, match="multiplier of exactly 1"):
+        relaxation_in(length, time, mu=0.0)
+    inside = hj.Guess("all", (0.1 * length, 0.0, 0.0, 0.0))
+    with pytest.raises(hj.ComputationError, match="ended in an equilibrium"):
+        hj.find_limit_cycle(Relaxation(length=length, time=time, mu=-0.5), inside)
+
+
+@units
+def test_many_cycles_at_once(hopper_cycle, unit):
+    length, time = UNITS[unit]
+    values = [(8.0, 4.0), (10.0, 5.0), (11.0, 6.0), (13.0, 3.0)]
+    many = [hj.models.VerticalHopper(k=k, b=b) for k, b in values]
+    scaled = [scaled_hopper(length, time, k=k, b=b) for k, b in values]
+    found = hj.find_limit_cycles(many, hopper_cycle, batch=2)
+    other = hj.find_limit_cycles(scaled, hopper_cycle_in(length, time), batch=2)
+    np.testing.assert_array_equal(other.result, found.result)
+    np.testing.assert_array_equal(other.iterations, found.iterations)
+    np.testing.assert_allclose(other.multipliers[:, :2], found.multipliers[:, :2], rtol=1e-9)
+
+
+def test_states_that_rest_stop_nothing(relaxation):
+    """Their sizes are 1 where nothing moves, and where rounding errors move a state, what hides
+    these. Both have the multiplier exp(-period) of their decay."""
+    truth = [8.59695063603805e-4, np.exp(-6.66328685932313), np.exp(-6.66328685932313)]
+    found = np.sort_complex(relaxation.multipliers)
+    np.testing.assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
+    assert relaxation.scale["nothing"] == 1.0 and relaxation.scale["rounding"] > 1e-7
+
+
+def test_sizes_that_are_given(hopper_cycle):
+    cycle = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, scale={"ym": 5.0})
+    assert cycle.scale["ym"] == 5.0 and cycle.scale["yM"] == hopper_cycle.scale["yM"]
+    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    many = eqx.filter_vmap(lambda k: hj.models.VerticalHopper(k=k))(jnp.array([10.0, 10.5]))
+    assert hj.find_limit_cycles(many, hopper_cycle, scale={"ym": 3.0})[0].scale["ym"] == 3.0
+    for scale in ({"y": 1.0}, {"ym": 0.0}, {"ym": np.inf}):
+        with pytest.raises(hj.DefinitionError, match="positive sizes of states by name"):
+            hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, scale=scale)

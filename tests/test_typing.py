@@ -1,0 +1,75 @@
+"""Type checkers see what users see: no false errors in the README's sessions, and public signatures
+that say what they take."""
+
+import importlib
+import inspect
+import json
+import pathlib
+import re
+import subprocess
+import sys
+import typing
+
+import pytest
+
+
+ROOT = pathlib.Path(__file__).parents[1]
+BLOCK = re.compile(r"^```(?:python|py)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+# What the README leaves out, and users write.
+MORE = """
+hj.models.VerticalHopper(k=11.0)
+hj.find_limit_cycle(Juggler(g=9.8), hj.Guess("flight", (0.2, 4.5), time=0.1))
+hj.ClockPhase(8, anchor=0.05)
+hj.linearize(cycle, [hj.AtEvent("touchdown"), apex]).multipliers
+hj.section_map(cycle, phase, 0, 0)(cycle.anchor.q[:4, 0])
+hj.fit_series([data, hj.Record(data.u[0], data.y[0], n_sections=32)], order=2).multipliers
+hj.plot.cycle(cycle, sections=hj.place_sections(cycle, phase)).ax.set_title("hopper")
+recording.trials[0].values.shape
+"""
+
+
+def test_a_users_script_has_no_errors(tmp_path):
+    """The README's sessions as one script, checked by pyright's engine in its basic mode."""
+    script = "\n\n".join(BLOCK.findall((ROOT / "README.md").read_text())) + MORE
+    (tmp_path / "session.py").write_text(script)
+    about = {"typeCheckingMode": "basic", "include": ["session.py"], "extraPaths": [str(ROOT)]}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(about))
+    command = [sys.executable, "-m", "basedpyright", "-p", str(tmp_path)]
+    command += ["--pythonpath", sys.executable]
+    found = subprocess.run(command, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+# Arguments that may be anything, each for a reason.
+ANYTHING = {
+    "charts of a system take whatever their subclass declares": {"Chart.field"},
+    "returned by users' functions": {"HybridSystem.period"},
+    "looked at by the function itself, which names what it can do": {"save.thing"},
+}
+ALLOWED = set().union(*ANYTHING.values())
+
+
+def public():
+    """Public functions, and the methods of public classes, by name."""
+    folders = [ROOT / "hybridjax", *(f.parent for f in (ROOT / "hybridjax").glob("*/__init__.pyi"))]
+    for folder in folders:
+        module = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
+        for name in module.__all__:
+            thing = getattr(module, name)
+            if inspect.isfunction(thing):
+                yield pytest.param(name, thing, id=name)
+            elif inspect.isclass(thing) and thing.__module__.startswith("hybridjax"):
+                for part, method in vars(thing).items():
+                    own = inspect.isfunction(method) and method.__qualname__ == f"{name}.{part}"
+                    if own and (part[0] != "_" or part == "__call__"):
+                        yield pytest.param(f"{name}.{part}", method, id=f"{name}.{part}")
+
+
+@pytest.mark.parametrize("name, function", list(public()))
+def test_public_signatures_say_what_they_take(name, function):
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name == "self" or name in ALLOWED or f"{name}.{parameter.name}" in ALLOWED:
+            continue
+        assert parameter.annotation is not inspect.Parameter.empty, f"{name}({parameter.name})"
+        assert parameter.annotation is not typing.Any, f"{name}({parameter.name}: Any)"
