@@ -1,13 +1,9 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
-<<<<<<< HEAD
-import logging
-=======
 import contextlib
->>>>>>> tree
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any
 
@@ -15,9 +11,6 @@ import jax
 
 from ..errors import DefinitionError
 from .precision import require_x64
-
-
-_log = logging.getLogger("hybridjax")
 
 
 def thread_count(workers: int | None) -> int:
@@ -55,24 +48,6 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         return [one.result() for one in running]
 
 
-<<<<<<< HEAD
-def meanwhile(work: Callable[[], Any]) -> Future[Any]:
-    """Begin with `work` in a thread of its own, under the caller's configuration of JAX.
-
-    Its `result()` waits for it, and raises what it has raised. An error is also logged when it
-    happens, since what is made ready ahead is not always asked for.
-    """
-    pool = ThreadPoolExecutor(1)
-    future = pool.submit(_configured(work))
-    future.add_done_callback(_log_error)
-    pool.shutdown(wait=False)
-    return future
-
-
-def _log_error(future: Future) -> None:
-    if not future.cancelled() and (error := future.exception()) is not None:
-        _log.error("what was begun in another thread has failed", exc_info=error)
-=======
 @contextlib.contextmanager
 def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
     """A context during which `work` is done in a thread of its own, under the caller's
@@ -81,7 +56,6 @@ def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
         running = pool.submit(_configured(work))
         yield
         running.result()
->>>>>>> tree
 
 
 def _cores() -> int:
