@@ -29,7 +29,11 @@ def as_vector(value: Any) -> jax.Array:
 
 
 class Structure:
-    """Charts and transitions of `system` by index. Built anew inside every trace: it is cheap."""
+    """Charts and transitions of `system` by index.
+
+    Built once in every trace and handed on: a function of the system is then traced once, however
+    often it is used. (It holds tracers, so it cannot be kept from one trace to the next.)
+    """
 
     def __init__(self, system: HybridSystem | PerLane):
         self.source = system
