@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 
 from .garbage_collector import uncollected
-from .tracing import is_traced
+from .tracing import is_inside_program, is_traced
 
 
 # What makes XLA compile for the CPU in a third of the time: no optimization passes of LLVM, and
@@ -29,15 +29,11 @@ def quick_jit(function: Callable) -> Callable:
         return eqx.filter_jit(function, compiler_options=_options())
 
     def run(*arguments):
-        # JAX refuses the options below the top level only after it has traced the function.
-        if not _on_cpu() or is_traced(arguments):
+        # JAX allows options of the compiler at the top level only, and refuses them elsewhere after
+        # it has traced the function.
+        if not _on_cpu() or is_traced(arguments) or is_inside_program():
             return plain(*arguments)
-        try:
-            return quick()(*arguments)
-        except ValueError as error:
-            if "compiler_options" not in str(error):  # JAX allows them at the top level only
-                raise
-            return plain(*arguments)
+        return quick()(*arguments)
 
     @ft.wraps(function)
     def call(*arguments):

@@ -3,7 +3,7 @@
 XLA on CPU turns `jnp.sin` and its relatives in float64 into one call of the C library for every
 number, 8 to 22 ns each; in float32 they take 2 to 9 ns. The functions here are written in
 additions, multiplications, divisions and selections, which become vector instructions: 2 to 3 ns in
-float64, 0.6 in float32. `vectorized` puts them into a function that was written with `jnp`.
+float64, 0.6 in float32. `rewrite.vectorized` puts them into functions that were written with `jnp`.
 
 - Argument reduction: x = k pi/2 + r with pi/2 cut into pieces of 33 bits (in float32, of 11) (W. J.
   Cody, W. Waite, Software Manual for the Elementary Functions, 1980). Exact for |x| < 1.6e6
@@ -22,13 +22,10 @@ Each has derivatives of all orders, in forward and reverse mode. Arguments of ot
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
-from jax.extend.core import primitives
 
 
 class _Numbers(NamedTuple):
@@ -164,7 +161,7 @@ def _leg(x):
     return jnp.sqrt((1 - x) * (1 + x))
 
 
-def _of_one_type(*dtypes) -> bool:
+def of_one_type(*dtypes) -> bool:
     """Whether arguments of these types are all float64, or all float32."""
     return dtypes[0] in _NUMBERS and all(x == dtypes[0] for x in dtypes)
 
@@ -183,7 +180,7 @@ def _function(plain: Callable, fast: Callable) -> Callable:
 
     @ft.wraps(plain, assigned=("__name__", "__qualname__", "__doc__"), updated=())
     def function(*xs):
-        return (fast if _of_one_type(*map(jnp.result_type, xs)) else plain)(*xs)
+        return (fast if of_one_type(*map(jnp.result_type, xs)) else plain)(*xs)
 
     return function
 
@@ -202,142 +199,3 @@ arctan2 = _function(
 arctan = _function(jnp.arctan, _with_derivatives(_arctan, lambda dx, _, x: dx / (1 + x**2)))
 arcsin = _function(jnp.arcsin, _with_derivatives(_arcsin, lambda dx, _, x: dx / _leg(x)))
 arccos = _function(jnp.arccos, _with_derivatives(_arccos, lambda dx, _, x: -dx / _leg(x)))
-
-_OURS = {
-    primitives.sin_p: sin,
-    primitives.cos_p: cos,
-    primitives.tan_p: tan,
-    primitives.atan2_p: arctan2,
-    primitives.atan_p: arctan,
-    primitives.asin_p: arcsin,
-    primitives.acos_p: arccos,
-}
-# Up to so many of them, a vector is concatenated.
-_FEW = 1
-# Primitives whose inner programs are replaced too. Functions with derivative rules of their own
-# are left alone.
-_OUTER = ("jit", "pjit", "cond", "while", "scan")
-
-
-def vectorized(function: Callable) -> Callable:
-    """`function` with the trigonometric functions of this module in place of those of `jnp`.
-
-    It is traced anew at every call, so it may close over tracers. What is written with `jax.lax`
-    counts too, and so does what is inside of `jit`, `cond`, `while_loop` and `scan`. Away from
-    CPU, `function` is called as it is.
-
-    **Arguments:** `function`, from pytrees of arrays or numbers to a pytree of arrays or numbers.
-
-    **Returns:** a function with the same arguments that returns arrays of the same shapes, dtypes
-    and weak types as `jax.jit(function)` would.
-    """
-
-    @ft.wraps(function, updated=())
-    def call(*arguments: Any) -> Any:
-        if jax.default_backend() != "cpu":
-            return function(*arguments)
-        # A new function every time: a program of earlier parameters is never taken for this one.
-        trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)
-        program, shapes = trace(*arguments)
-        program = program.replace(jaxpr=_replaced(_row_by_row(program.jaxpr)))
-        values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
-        values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]
-        return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(shapes), values)
-
-    return call
-
-
-def _number(eqn: jex.JaxprEqn) -> int:
-    """How many of our functions there are in an equation."""
-    if eqn.primitive in _OURS:
-        return 1
-    if eqn.primitive.name not in _OUTER:
-        return 0
-    items = [x for value in eqn.params.values() for x in _as_tuple(value)]
-    inner = [x.jaxpr.eqns for x in items if isinstance(x, jex.ClosedJaxpr)]
-    return sum(_number(eqn) for eqns in inner for eqn in eqns)
-
-
-def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
-    """A program that puts the numbers of a vector in their places one after the other, if more
-    than a few of our functions are behind them.
-
-    What is concatenated is compiled into one loop. With more than a few of our functions in it,
-    XLA does not find vector instructions for that loop.
-    """
-    eqns = []
-    behind: dict[jex.Var, frozenset] = {}
-    for k, eqn in enumerate(jaxpr.eqns):
-        sources = [behind.get(v, frozenset()) for v in eqn.invars if isinstance(v, jex.Var)]
-        functions = frozenset((k, j) for j in range(_number(eqn))).union(*sources)
-        behind |= dict.fromkeys(eqn.outvars, functions)
-        vector = eqn.primitive.name in ("stack", "concatenate") and eqn.outvars[0].aval.ndim == 1
-        if vector and len(functions) > _FEW:
-            rows = _equation(_rows, tuple(v.aval for v in eqn.invars))
-            eqn = rows.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
-        eqns.append(eqn)
-    return jaxpr.replace(eqns=eqns)
-
-
-@jax.jit
-def _rows(*parts):
-    out, start = jnp.zeros(sum(x.size for x in parts), jnp.result_type(*parts)), 0
-    for x in map(jnp.atleast_1d, parts):
-        out = jax.lax.dynamic_update_slice(out, x, (start,))
-        start += len(x)
-    return out
-
-
-def _replaced(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
-    """A program of the same type with our functions; itself if there is nothing to replace."""
-    eqns = [_replaced_equation(eqn) for eqn in jaxpr.eqns]
-    changed = any(new is not old for new, old in zip(eqns, jaxpr.eqns, strict=True))
-    return jaxpr.replace(eqns=eqns) if changed else jaxpr
-
-
-def _replaced_equation(eqn: jex.JaxprEqn) -> jex.JaxprEqn:
-    if eqn.primitive in _OURS and eqn.params.get("accuracy") is None:
-        avals = tuple(v.aval for v in eqn.invars)
-        if _of_one_type(*(aval.dtype for aval in avals)):
-            ours = _equation(_OURS[eqn.primitive], avals)
-            return ours.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
-    if eqn.primitive.name in _OUTER:
-        params = {name: _replaced_parameter(value) for name, value in eqn.params.items()}
-        if any(params[name] is not value for name, value in eqn.params.items()):
-            return eqn.replace(params=params)
-    return eqn
-
-
-def _replaced_parameter(value: Any) -> Any:
-    if isinstance(value, jex.ClosedJaxpr):
-        return _replaced_program(value)
-    if any(isinstance(item, jex.ClosedJaxpr) for item in _as_tuple(value)):
-        items = tuple(_replaced_program(item) for item in value)
-        same = all(new is old for new, old in zip(items, value, strict=True))
-        return value if same else items
-    return value
-
-
-def _as_tuple(value: Any) -> tuple:
-    return value if type(value) is tuple else (value,)
-
-
-# JAX traces an inner jit once and keeps it: what becomes of it is kept as well, since JAX's caches
-# of its derivatives and its batched form go by the identity of a program.
-_KNOWN: WeakKeyDictionary = WeakKeyDictionary()
-
-
-def _replaced_program(program: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
-    if program not in _KNOWN:
-        jaxpr = _replaced(program.jaxpr)
-        # None: unchanged. (The program itself as the value would keep its own key alive.)
-        _KNOWN[program] = None if jaxpr is program.jaxpr else program.replace(jaxpr=jaxpr)
-    found = _KNOWN[program]
-    return program if found is None else found
-
-
-@ft.lru_cache(maxsize=256)
-def _equation(function: Callable, avals: tuple) -> jex.JaxprEqn:
-    """The equation that applies one of our functions to arguments of these types."""
-    (eqn,) = jax.make_jaxpr(function)(*avals).eqns
-    return eqn

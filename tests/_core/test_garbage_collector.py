@@ -1,6 +1,7 @@
 """The collector of cyclic garbage rests inside, and is left as it was."""
 
 import gc
+import os
 import threading
 
 import pytest
@@ -39,4 +40,16 @@ def test_the_last_thread_that_leaves_turns_it_on(was_on):
     assert not gc.isenabled()
     leave.set()
     thread.join()
+    assert gc.isenabled() == was_on
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+def test_a_forked_process_has_its_collector_as_it_was(was_on):
+    with uncollected:
+        child = os.fork()
+        if child == 0:  # (Without pytest's own cleaning up.)
+            os._exit(0 if gc.isenabled() == was_on and uncollected.inside == 0 else 1)
+        _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
     assert gc.isenabled() == was_on

@@ -1,10 +1,12 @@
 import gc
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from hybridjax._core.memo import remembered
+from hybridjax._core.memo import Memory, remembered
 
 
 class Box(eqx.Module):
@@ -44,3 +46,35 @@ def test_it_is_forgotten_with_its_object():
     calls.clear()
     gc.collect()
     assert len(values) == size
+
+
+def test_threads_get_one_value():
+    """All that ask for it, whoever was first; `make` may ask for other values."""
+    memory, together = Memory(), threading.Barrier(8)
+    boxes = [Box(jnp.asarray(float(k))) for k in range(50)]
+
+    def ask(_):
+        together.wait()
+        made = lambda box: memory.recall(box, "inner", object)  # noqa: E731
+        return [memory.recall(box, "key", lambda box=box: (made(box), object())) for box in boxes]
+
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(ask, range(8)))
+    assert all(x is y for answer in answers for x, y in zip(answer, answers[0], strict=True))
+    assert len(memory) == len(boxes)
+    assert len({id(x) for x in answers[0]}) == len(boxes)
+
+
+def test_objects_that_come_and_go_in_threads():
+    """Ids are used again; each object sees its own value only."""
+    memory = Memory()
+
+    def work(seed):
+        for k in range(2000):
+            box = Box(seed + k)
+            assert memory.recall(box, "key", lambda box=box: box.value) == seed + k
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(0, 80_000, 10_000)))
+    gc.collect()
+    assert len(memory) == 0
