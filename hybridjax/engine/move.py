@@ -14,9 +14,9 @@ from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .lanes import Lanes
 from .replay import replay
-from .search import Moved, Options, Recorded, search
+from .search.search import Moved, Options, Recorded, search
+from .search.stride import Stride, initial_step, stride
 from .settings import Settings
-from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
 

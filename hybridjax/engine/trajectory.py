@@ -20,8 +20,8 @@ from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
 from .hermite import interpolate
 from .move import record
+from .search.stride import initial_step
 from .settings import Settings
-from .stride import initial_step
 from .tape import IDLE
 from .target import until
 from .watch import slopes

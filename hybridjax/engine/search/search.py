@@ -13,21 +13,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.per_lane import shared
-from .._core.results import Result, update_result
-from ..systems.structure import Structure
+from ..._core.per_lane import shared
+from ..._core.results import Result, update_result
+from ...systems.structure import Structure
+from ..event_log import EventLog, blank_log, log_events
+from ..events import arm
+from ..lanes import Lanes
+from ..settings import Settings
+from ..tape import Tape, blank_tape, write_row
+from ..target import Target
+from ..watch import watch
 from .aim import take_aim
 from .attempt import attempt
-from .event_log import EventLog, blank_log, log_events
-from .events import arm
-from .lanes import Lanes
 from .outcome import aims, calmly, eventfully
-from .settings import Settings
 from .state import Approach, State, Task
 from .stride import Stride
-from .tape import Tape, blank_tape, write_row
-from .target import Target
-from .watch import watch
 
 
 class Moved(NamedTuple):
