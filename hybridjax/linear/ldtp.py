@@ -265,7 +265,7 @@ class LDTP(eqx.Module):
         """
         return self.periodic_states(self._input(u)[None], periods)[0]
 
-    def periodic_states(self, u: ArrayLike, periods: int) -> Float[Array, "S d"]:
+    def periodic_states(self, u: Numbers, periods: int) -> Float[Array, "S d"]:
         """As `periodic_state`, for S inputs (S, P N, nu) at once."""
         u = self._input(u, ndim=3)
         if periods < 1 or u.shape[1] != periods * self.n_sections:
