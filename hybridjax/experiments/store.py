@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from .._core.archive import read_module, write_module
 from ..errors import DefinitionError, FileFormatError
+from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import Campaign, chunks, prepare
@@ -41,7 +42,7 @@ _SAME_CYCLE = 1e-7
 def store_experiments(
     folder: str | os.PathLike,
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
