@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.vmap_as_lanes import vmap_to_lanes
+from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .lanes import Lanes
 from .move import constant, record, retrace

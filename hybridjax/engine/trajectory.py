@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._core.compilation.garbage_collector import uncollected
 from .._core.device import on_cpu
 from .._core.execution import Execution
-from .._core.garbage_collector import uncollected
 from .._core.precision import single, single_precision
 from .._core.threads import in_threads, meanwhile
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.precision import require_x64
 from .._core.results import Result

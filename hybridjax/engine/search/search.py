@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._core.per_lane import shared
+from ..._core.lanes.per_lane import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..event_log import EventLog, blank_log, log_events

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._core.compile import quick_jit
+from ..._core.compilation.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.results import Result
 from ...engine.move import move

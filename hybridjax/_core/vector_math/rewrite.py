@@ -16,7 +16,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.extend.core import primitives
 
-from .device import on_cpu
+from ..device import on_cpu
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
-from .device import on_cpu
+from ..device import on_cpu
+from ..tracing import is_inside_program, is_traced
 from .garbage_collector import uncollected
-from .tracing import is_inside_program, is_traced
 
 
 # What makes XLA compile for the CPU in a third of the time: no optimization passes of LLVM, and
