@@ -58,7 +58,7 @@ def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
         raise DefinitionError(
             f"single precision leaves errors of about {rounding:.1e} of the states' sizes in these "
             f"experiments, more than half the accuracy of {accuracy:.1e}: ask for less, e.g. "
-            f"accuracy={3 * rounding:.1g}, or take precision='double'."
+            f"accuracy={3 * rounding:.1g}, or compute in double precision."
         )
     return dataclasses.replace(rough, accuracy=float(accuracy), rounding=rounding)
 
