@@ -86,12 +86,12 @@ def search(
     result = update_result(result, ~finite, Result.BAD_INPUT)
     task = Task(u, target, target.limit - lanes.t, stride, settings)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
-    none = jnp.zeros(L, jnp.int32)
+    none, zero = jnp.zeros(L, jnp.int32), jnp.zeros(L)
     begin = State(
         arm(s, lanes, seen, task.span) if options.new_input else lanes,
         seen,
         aims(seen, task.span),
-        Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
+        Approach(jnp.zeros(L, bool), none, zero, zero, zero, none),
         stride.h,
         jnp.zeros(L),
         result,
