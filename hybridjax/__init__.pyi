@@ -12,12 +12,14 @@ from . import (
     sections as sections,
     testing as testing,
 )
-from ._core.compilation_cache import enable_compilation_cache as enable_compilation_cache
+from ._core.compilation.compilation_cache import (
+    enable_compilation_cache as enable_compilation_cache,
+)
+from ._core.compilation.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.execution import Execution as Execution
-from ._core.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.precision import enable_x64 as enable_x64
 from ._core.results import Result as Result
-from ._core.rewrite import enable_vector_math as enable_vector_math
+from ._core.vector_math.rewrite import enable_vector_math as enable_vector_math
 from .apps.recording_report import write_report as write_report
 from .engine.settings import Settings as Settings
 from .engine.trajectory import Trajectory as Trajectory, simulate as simulate

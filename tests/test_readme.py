@@ -99,6 +99,14 @@ def test_links_lead_somewhere():
                 assert (page.parent / link).exists(), f"{page.name} links to {link}"
 
 
+def test_files_that_documents_name_are_there():
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        if page.name != "CHANGELOG.md":
+            for name in re.findall(r"`(\w+/[\w/]+\.py)\b", page.read_text()):
+                places = ROOT / name, ROOT / "hybridjax" / name
+                assert any(place.exists() for place in places), f"{page.name}: {name}"
+
+
 def test_there_is_one_test_command_for_ci_to_find():
     found = [block for block in blocks("bash") if re.match("python3 -m venv .* pytest$", block)]
     assert len(found) == 1

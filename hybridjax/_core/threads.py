@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from ..errors import DefinitionError
+from .device import on_cpu
 from .precision import require_x64
 
 
@@ -22,7 +23,7 @@ def thread_count(workers: int | None) -> int:
         if workers < 1:
             raise DefinitionError(f"workers is the number of threads, not {workers}.")
         return workers
-    return _cores() if jax.default_backend() == "cpu" else 1
+    return _cores() if on_cpu() else 1
 
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 
 from .. import __version__
-from .._core.compilation_cache import enable_compilation_cache
+from .._core.compilation.compilation_cache import enable_compilation_cache
 from .._core.precision import enable_x64
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.vmap_as_lanes import vmap_to_lanes
+from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .lanes import Lanes
 from .move import constant, record, retrace
-from .search import Moved
+from .search.search import Moved
 from .settings import Settings
 from .tape import Tape
 from .target import Target

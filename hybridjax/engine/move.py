@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.lane_jvp import lane_jvp
-from .._core.per_lane import shared
+from .._core.lanes.lane_jvp import lane_jvp
+from .._core.lanes.per_lane import shared
+from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from .._core.results import Result
-from .._core.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .lanes import Lanes
 from .replay import replay
-from .search import Moved, Options, Recorded, search
+from .search.search import Moved, Options, Recorded, search
+from .search.stride import Stride, initial_step, stride
 from .settings import Settings
-from .stride import Stride, initial_step, stride
 from .tape import Tape
 from .target import Target
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._core.per_lane import PerLane
+from .._core.lanes.per_lane import PerLane
 from .._core.results import Result
 from ..systems.structure import Structure
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
@@ -20,8 +20,8 @@ from ..systems.system import Driven, Guess, HybridSystem
 from .events import start_lanes
 from .hermite import interpolate
 from .move import record
+from .search.stride import initial_step
 from .settings import Settings
-from .stride import initial_step
 from .tape import IDLE
 from .target import until
 from .watch import slopes

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.per_lane import shared
+from .._core.lanes.per_lane import shared
 from ..systems.structure import Structure
 from .lanes import for_each_chart, only
 from .solver.step import LaneField, short_step

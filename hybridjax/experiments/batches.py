@@ -8,8 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._core.compilation.garbage_collector import uncollected
+from .._core.device import on_cpu
 from .._core.execution import Execution
-from .._core.garbage_collector import uncollected
 from .._core.precision import single, single_precision
 from .._core.threads import in_threads, meanwhile
 
@@ -33,8 +34,7 @@ def divide(S: int, execution: Execution) -> Execution:
     if execution.batch is not None:
         size = min(execution.batch, S)
     else:
-        on_cpu = jax.default_backend() == "cpu"
-        most = _BATCH[execution.precision] if on_cpu else _BATCH_ON_ACCELERATOR
+        most = _BATCH[execution.precision] if on_cpu() else _BATCH_ON_ACCELERATOR
         # So many batches that all workers take equally many, and all batches of one size.
         rounds = -(-S // (most * workers))
         size = max(-(-S // (rounds * workers)), min(_UNDIVIDED, S))

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
 from ..maps.place import PATIENCE, as_placed
-from ..maps.placed import PlacedSections
+from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from ..systems.structure import Outputs, Structure
@@ -162,7 +162,7 @@ class Campaign:
 
 def prepare(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     options: Options,

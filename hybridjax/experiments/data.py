@@ -113,7 +113,7 @@ class ExperimentData(eqx.Module):
                 f"the window of P = {P} periods is longer than the record, {n // N} periods of "
                 f"{N} sections."
             )
-        each = (self.result, self.failed_at) + (() if self.error is None else (self.error,))
+        each = self.result, self.failed_at, self.error
         if any(x.shape != (S,) for x in each) or (self.events and len(self.events.time) != S):
             raise DefinitionError(
                 f"result, failed_at, error and events must have one entry for each of {S} "
@@ -153,10 +153,11 @@ class ExperimentData(eqx.Module):
         return np.full(len(self.u), -1) if self.simulated is None else self.simulated.failed_at
 
     @property
-    def error(self) -> Float[np.ndarray, " S"] | None:
+    def error(self) -> Float[np.ndarray, " S"]:
         """Estimates of the largest error of a simulation, relative to the sizes of the states on
-        the cycle, or None if not known."""
-        return None if self.simulated is None else self.simulated.error
+        the cycle; NaN if not known."""
+        known = None if self.simulated is None else self.simulated.error
+        return np.full(len(self.u), np.nan) if known is None else known
 
     @property
     def events(self) -> EventTimes | None:

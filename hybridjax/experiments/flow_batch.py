@@ -88,9 +88,7 @@ def flow_batch(
         target = placed.target(j[None], lanes.t, turns[None])
         target = dataclasses.replace(target, order=cycle.event_sequence)
         stride = plan.stride(i, S)
-        moved = move(
-            s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log
-        )
+        moved = move(s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log)
         # An event may change places with a section, but none may be left out or come in addition.
         due = placed.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1

@@ -67,7 +67,7 @@ def odd_part(data: ExperimentData) -> ExperimentData:
     broken = first != Result.OK
     result = np.where(broken, first, second)
     failed_at = np.where(broken, data.failed_at[::2], data.failed_at[1::2])
-    error = None if data.error is None else np.maximum(data.error[::2], data.error[1::2])
+    error = np.maximum(data.error[::2], data.error[1::2])
     return ExperimentData(
         plus,
         (data.y[::2] - data.y[1::2]) / 2,

@@ -6,6 +6,7 @@ from typing import Unpack
 from tqdm import tqdm
 
 from .._core.execution import Execution
+from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import chunks, prepare
@@ -21,7 +22,7 @@ CHUNK = 640
 
 def run_experiments(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
@@ -70,7 +71,7 @@ def run_experiments(
 
 def stream_experiments(
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.memo import Memory
 from ..errors import ComputationError

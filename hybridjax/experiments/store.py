@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from .._core.archive import read_module, write_module
 from ..errors import DefinitionError, FileFormatError
+from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from .campaign import Campaign, chunks, prepare
@@ -41,7 +42,7 @@ _SAME_CYCLE = 1e-7
 def store_experiments(
     folder: str | os.PathLike,
     cycle: LimitCycle,
-    sections,
+    sections: SectionsLike,
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
@@ -141,11 +142,12 @@ class StoredExperiments:
     def summary(self, limit: int = 5) -> str:
         """As `ExperimentData.summary`, of all experiments."""
         self._complete()
-        codes = []
+        result, failed_at = [], []
         for k in range(len(self)):
             with np.load(self.path(k)) as file:
-                codes.append((file["result"], file["simulated.failed_at"]))
-        return summary(*map(np.concatenate, zip(*codes, strict=True)), self.n_sections, limit)
+                result.append(file["result"])
+                failed_at.append(file["simulated.failed_at"])
+        return summary(np.concatenate(result), np.concatenate(failed_at), self.n_sections, limit)
 
     def _complete(self) -> None:
         gone = self.missing()

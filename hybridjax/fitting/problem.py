@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 from .candidate import candidate_cycle

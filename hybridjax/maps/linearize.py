@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.compile import quick_jit
-from .._core.per_lane import by_lane
+from .._core.compilation.compile import quick_jit
+from .._core.lanes.per_lane import by_lane
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.jacobian import tape_jacobian

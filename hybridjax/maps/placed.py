@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.tape import Tape

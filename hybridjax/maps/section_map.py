@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.results import Result, update_result
 from .._core.tracing import is_traced
 from ..engine.move import move

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.results import Result
 from ..engine.hermite import interpolate
 from ..engine.tape import IDLE

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced

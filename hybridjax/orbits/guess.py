@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from .._core.results import Result
 from ..engine.events import start_lanes
 from ..engine.lanes import Lanes

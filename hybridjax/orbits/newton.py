@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from ..engine.lanes import Lanes
 from .return_map import SINGULAR, ReturnMap, Turn
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .._core.compile import quick_jit
+from .._core.compilation.compile import quick_jit
 from ..engine.watch import slopes
 from ..errors import DefinitionError
 from ..systems.structure import Structure

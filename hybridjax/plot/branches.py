@@ -43,26 +43,26 @@ def branch(
             f"branches to be drawn together need the same parameter; these have {sorted(names)}."
         )
     with panels(ax) as axes:
-        ax = axes[0, 0]
+        panel = axes[0, 0]
         shown = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
             name = _first_state(b) if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):
-                ax.plot(b.values[part], height[part], "-" if stable else "--", color=color)
+                panel.plot(b.values[part], height[part], "-" if stable else "--", color=color)
             for p in b.points:
                 marker, tint = _MARKS[p.kind]
-                ax.plot(
+                panel.plot(
                     p.value, height[p.index], marker, ms=4.5, mfc="white", mec=COLORS[tint],
                     mew=1.2, zorder=5, label=None if p.kind in shown else p.kind,
                 )  # fmt: skip
                 shown.add(p.kind)
         gray = COLORS["gray"]
-        ax.plot([], [], "-", color=gray, label="stable")
-        ax.plot([], [], "--", color=gray, label="unstable")
-        ax.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
-        ax.locator_params(axis="x", nbins=6)
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+        panel.plot([], [], "-", color=gray, label="stable")
+        panel.plot([], [], "--", color=gray, label="unstable")
+        panel.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
+        panel.locator_params(axis="x", nbins=6)
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 
 

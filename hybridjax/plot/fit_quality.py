@@ -80,17 +80,17 @@ def amplitude(
     **Arguments:** `misfit`: one that is allowed; the amplitude up to which it is kept is marked.
     """
     with panels(ax) as axes:
-        ax = axes[0, 0]
+        panel = axes[0, 0]
         for i, name in enumerate(sweep.outputs):
             line = dict(marker="o", color=CYCLE[i % len(CYCLE)], label=label_of(name, labels))
-            ax.loglog(sweep.amplitudes, sweep.misfit[:, i], **line)
+            panel.loglog(sweep.amplitudes, sweep.misfit[:, i], **line)
         bad = sweep.failed > 0
         for a in sweep.amplitudes[bad]:
-            ax.axvline(a, color=COLORS["red"], lw=0.6, ls=":")
+            panel.axvline(a, color=COLORS["red"], lw=0.6, ls=":")
         if misfit is not None:
-            ax.axhline(misfit, color="0.5", lw=0.6)
-            ax.axvline(sweep.limit(misfit), color="0.5", lw=0.6)
-        ax.set_xlabel("amplitude of the input")
-        ax.set_ylabel("misfit / output (rms)")
-        ax.legend()
+            panel.axhline(misfit, color="0.5", lw=0.6)
+            panel.axvline(sweep.limit(misfit), color="0.5", lw=0.6)
+        panel.set_xlabel("amplitude of the input")
+        panel.set_ylabel("misfit / output (rms)")
+        panel.legend()
     return Plot(axes)

@@ -42,21 +42,21 @@ def magnitude(
     if not htfs:
         raise DefinitionError("there is no HTF to draw.")
     with panels(ax, height=2.2) as axes:
-        ax = axes[0, 0]
+        panel = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
             i, j = _index(htf.outputs, output), _index(htf.inputs, input)
             f, order = _sorted(htf)
             for m in harmonics:
                 size = np.abs(np.asarray(htf.harmonic(m))[order, i, j])
                 line = _line(htf, _harmonic_style(m, harmonics), _name(m))
-                ax.plot(f, size, **line)
-                _band(ax, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
+                panel.plot(f, size, **line)
+                _band(panel, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
         name = label_of(htf.outputs[i], labels)
-        ax.set(yscale="log", xlabel=_FREQUENCY, ylabel=f"$|H_m|$, {name}")
-        _frequency_limits(ax, f)
-        top = max(np.nanmax(line.get_ydata()) for line in ax.get_lines())
-        ax.set_ylim(top * 10.0**-decades, top * 2)
-        _legend(ax, htfs)
+        panel.set(yscale="log", xlabel=_FREQUENCY, ylabel=f"$|H_m|$, {name}")
+        _frequency_limits(panel, f)
+        top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
+        panel.set_ylim(top * 10.0**-decades, top * 2)
+        _legend(panel, htfs)
     return Plot(axes)
 
 

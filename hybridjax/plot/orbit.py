@@ -56,32 +56,32 @@ def cycle(
             raise DefinitionError(f"`{what}` and the cycle belong to different systems.")
     orbit = cycle.trajectory(_TURN)
     with panels(ax, height=3.0) as axes:
-        ax = axes[0, 0]
+        panel = axes[0, 0]
         if perturbed is not None:
             pieces = _pieces(perturbed, x, y)
             for _, px, py in pieces:
-                ax.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
-            ax.plot(pieces[0][1][0], pieces[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
+                panel.plot(px, py, color=COLORS["red"], lw=0.7, zorder=1)
+            panel.plot(pieces[0][1][0], pieces[0][2][0], "s", ms=3.5, color=COLORS["red"], zorder=5)
         seen = set()
         for a, px, py in _pieces(orbit, x, y):
             label = None if a in seen else s.names[a]
             seen.add(a)
             color = _CHARTS[a % len(_CHARTS)]
-            ax.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
+            panel.plot(px, py, color=color, lw=1.8, label=label, zorder=3, solid_capstyle="butt")
         _, px, py = orbit(x, y)
         center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
-        _events(ax, s, orbit, (x, y), center)
-        ax.autoscale_view()
-        ax.margins(0.08)
-        ax.locator_params(axis="x", nbins=6)
+        _events(panel, s, orbit, (x, y), center)
+        panel.autoscale_view()
+        panel.margins(0.08)
+        panel.locator_params(axis="x", nbins=6)
         if sections is not None:
             step = max(1, round(sections.n_sections / 8)) if numbers is None else numbers
-            _sections(ax, s, sections, (x, y), center, step)
+            _sections(panel, s, sections, (x, y), center, step)
         if perturbed is not None:
-            ax.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
-        ax.set_xlabel(label_of(x, labels))
-        ax.set_ylabel(label_of(y, labels))
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+            panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
+        panel.set_xlabel(label_of(x, labels))
+        panel.set_ylabel(label_of(y, labels))
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 
 

@@ -63,14 +63,14 @@ def multipliers(
     borders = _borders(estimates or {})
     own = ax is None
     with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
-        ax = axes[0, 0]
-        _unit_circle(ax)
-        boxes = [ax]
+        panel = axes[0, 0]
+        _unit_circle(panel)
+        boxes = [panel]
         far = max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
-        ax.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
-        ax.locator_params(nbins=5)
+        panel.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
+        panel.locator_params(nbins=5)
         if zoom and series:
-            boxes.append(_zoom(ax, true, series, borders))
+            boxes.append(_zoom(panel, true, series, borders))
         for box in boxes:
             box.plot(true.real, true.imag, "+", ms=9, mew=1.2, color="black", label="exact", ls="")
             for k, (label, z) in enumerate(series.items()):
@@ -82,12 +82,12 @@ def multipliers(
                 )  # fmt: skip
                 for border in borders.get(label, ()):
                     box.plot(border.real, border.imag, lw=0.7, color=CYCLE[k % len(CYCLE)])
-        _complex_axes(ax, r"\lambda")
+        _complex_axes(panel, r"\lambda")
         if own and series:
-            shown = ax.get_legend_handles_labels()
-            ax.get_figure(root=True).legend(*shown, loc="outside lower center")
+            shown = panel.get_legend_handles_labels()
+            panel.get_figure(root=True).legend(*shown, loc="outside lower center")
         elif series:
-            ax.legend()
+            panel.legend()
     return Plot(axes)
 
 

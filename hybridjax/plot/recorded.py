@@ -128,23 +128,23 @@ def multiplier_regions(
     """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
     are small; beside them those of plain regression, if given."""
     with panels(ax, height=3.4) as axes:
-        ax = axes[0, 0]
+        panel = axes[0, 0]
         circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
         leading = fit.multipliers[0]
         reach = 0.0
         if np.isfinite(fit.covariance).all():
             reach = 2 * np.abs(fit.ellipse(0) - leading).max()
-        boxes = [ax]
+        boxes = [panel]
         if 0 < reach < 0.1:
             corner = 0.2 if leading.real > 0 else 0.52
-            boxes.append(ax.inset_axes((corner, 0.33, 0.32, 0.32)))
+            boxes.append(panel.inset_axes((corner, 0.33, 0.32, 0.32)))
             boxes[1].set(
                 xlim=(leading.real - reach, leading.real + reach),
                 ylim=(leading.imag - reach, leading.imag + reach),
             )
             boxes[1].tick_params(labelsize="xx-small", length=2)
             boxes[1].locator_params(nbins=3)
-            ax.indicate_inset_zoom(boxes[1], edgecolor="0.4")
+            panel.indicate_inset_zoom(boxes[1], edgecolor="0.4")
         for box in boxes:
             box.plot(circle.real, circle.imag, color=COLORS["gray"], lw=0.6, zorder=0)
             if plain is not None:
@@ -159,7 +159,9 @@ def multiplier_regions(
                     box.fill(border.real, border.imag, color=CYCLE[0], alpha=0.3, lw=0)
             box.set_aspect("equal")
         far = 1.25 * max(1.0, np.abs(fit.multipliers).max())
-        ax.set(xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$")
-        ax.locator_params(nbins=5)
-        ax.legend(loc="upper left")
+        panel.set(
+            xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$"
+        )
+        panel.locator_params(nbins=5)
+        panel.legend(loc="upper left")
     return Plot(axes)

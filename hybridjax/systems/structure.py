@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.per_lane import PerLane, by_lane, shared
+from .._core.lanes.per_lane import PerLane, by_lane, shared
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybridjax._core.compile import quick_jit
+from hybridjax._core.compilation.compile import quick_jit
 from hybridjax._core.tracing import is_inside_program
 
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from hybridjax._core.garbage_collector import uncollected
+from hybridjax._core.compilation.garbage_collector import uncollected
 
 
 @pytest.fixture(params=(True, False))

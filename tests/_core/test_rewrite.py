@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.per_lane import by_lane
-from hybridjax._core.rewrite import vectorized
+from hybridjax._core.lanes.per_lane import by_lane
+from hybridjax._core.vector_math.rewrite import vectorized
 
 
 hj.enable_x64()

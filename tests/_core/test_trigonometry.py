@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from hybridjax._core import trigonometry
+from hybridjax._core.vector_math import trigonometry
 
 
 BOUNDS = {"sin": 2, "cos": 2, "tan": 4, "arctan": 2, "arcsin": 4, "arccos": 4}

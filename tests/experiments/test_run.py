@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
-from hybridjax._core.compile import quick_jit
+from hybridjax._core.compilation.compile import quick_jit
 from hybridjax.experiments import campaign, flow_batch
 
 from ..conftest import OUTPUTS, no_compilation, unchecked

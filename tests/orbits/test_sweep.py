@@ -9,6 +9,7 @@ from hybridjax.orbits.sweep import batches
 
 
 ONES = np.ones(2)
+FOUR = hj.Execution(batch=4)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_without_a_clock_and_in_waves(wheel):
     much shorter than the guess's that the flow from one impact passes the next."""
     slopes = np.linspace(0.08, 0.16, 11)
     systems = [hj.models.RimlessWheel(slope=x) for x in slopes]
-    found = hj.find_limit_cycles(systems, wheel, batch=4)
+    found = hj.find_limit_cycles(systems, wheel, execution=FOUR)
     assert found.ok.all() and np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
     np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
@@ -85,7 +86,9 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
 
     monkeypatch.setattr(batches.Tiles, "_first_step", watched)
     slopes = np.linspace(0.08, 0.1, 11)
-    found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
+    found = hj.find_limit_cycles(
+        [hj.models.RimlessWheel(slope=x) for x in slopes], wheel, execution=FOUR
+    )
     rows, before, after = map(np.concatenate, zip(*steps, strict=True))
     error = [np.abs(q - found.anchor.q[rows, :, 0]).max(axis=1) for q in (before, after)]
     assert len(rows) == 7 and np.all(error[1] < 0.3 * error[0])
@@ -95,9 +98,11 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
 def test_systems_that_are_alike_or_undefined(wheel):
     """Neither takes the others down with it."""
     slopes = [0.08] * 9 + [np.nan, 0.08]
-    found = hj.find_limit_cycles([hj.models.RimlessWheel(slope=x) for x in slopes], wheel, batch=4)
+    found = hj.find_limit_cycles(
+        [hj.models.RimlessWheel(slope=x) for x in slopes], wheel, execution=FOUR
+    )
     np.testing.assert_array_equal(found.failed, [9])
-    alike = hj.find_limit_cycles([found[0].system] * 6, wheel, batch=4)
+    alike = hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR)
     assert alike.ok.all()
 
 

@@ -16,6 +16,7 @@ UNITS = {"micrometers": (1e6, 1.0), "gigameters": (1e-9, 1.0), "milliseconds": (
 units = pytest.mark.parametrize("unit", UNITS)
 SECTIONS = 8
 FREQUENCIES = np.arange(0.1, 4.0, 0.4)
+TWO = hj.Execution(batch=2)
 
 
 def dimensions(length, time):
@@ -189,8 +190,10 @@ def test_many_cycles_at_once(hopper_cycle, unit):
     values = [(8.0, 4.0), (10.0, 5.0), (11.0, 6.0), (13.0, 3.0)]
     many = [hj.models.VerticalHopper(k=k, b=b) for k, b in values]
     scaled = [scaled_hopper(length, time, k=k, b=b) for k, b in values]
-    found = hj.find_limit_cycles(many, hopper_cycle, batch=2)
-    other = hj.find_limit_cycles(scaled, hopper_cycle_in(length, time), batch=2)
+    found = hj.find_limit_cycles(many, hopper_cycle, execution=TWO)
+    other = hj.find_limit_cycles(
+        scaled, hopper_cycle_in(length, time), execution=hj.Execution(batch=2)
+    )
     np.testing.assert_array_equal(other.result, found.result)
     np.testing.assert_array_equal(other.iterations, found.iterations)
     np.testing.assert_allclose(other.multipliers[:, :2], found.multipliers[:, :2], rtol=1e-9)

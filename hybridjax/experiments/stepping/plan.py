@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._core.compile import quick_jit
+from ..._core.compilation.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.results import Result
 from ...engine.move import move
+from ...engine.search.stride import Stride
 from ...engine.settings import Settings
-from ...engine.stride import Stride
 from ...engine.watch import watch
 from ...errors import DefinitionError
 from ...maps.place import PATIENCE
@@ -64,7 +64,7 @@ class Plan(eqx.Module):
 
     **Fields:**
 
-    - `h`: first step; `lead`, `slack`: see `engine.stride.Stride`.
+    - `h`: first step; `lead`, `slack`: see `engine.search.stride.Stride`.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
         cycle and relative to the states' scales: the largest that it ever leads to at a later
         section, summed over all periods as if each made the same error.

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.compile import quick_jit
+from ..._core.compilation.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.precision import single, single_precision
 from ..._core.results import Result
 from ...engine.move import move
+from ...engine.search.stride import Stride
 from ...engine.settings import Settings
-from ...engine.stride import Stride
 from ...errors import DefinitionError
 from ...maps.placed import PlacedSections
 from ...systems.structure import Structure
@@ -58,7 +58,7 @@ def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
         raise DefinitionError(
             f"single precision leaves errors of about {rounding:.1e} of the states' sizes in these "
             f"experiments, more than half the accuracy of {accuracy:.1e}: ask for less, e.g. "
-            f"accuracy={3 * rounding:.1g}, or take precision='double'."
+            f"accuracy={3 * rounding:.1g}, or compute in double precision."
         )
     return dataclasses.replace(rough, accuracy=float(accuracy), rounding=rounding)
 

@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..._core.arguments import Numbers
-from ..._core.compile import quick_jit
+from ..._core.compilation.compile import quick_jit
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError

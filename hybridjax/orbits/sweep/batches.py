@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from ..._core.compile import quick_jit
-from ..._core.garbage_collector import uncollected
+from ..._core.compilation.compile import quick_jit
+from ..._core.compilation.garbage_collector import uncollected
 from ..._core.results import Result
 from ..._core.threads import in_threads
 from ...engine.lanes import Lanes

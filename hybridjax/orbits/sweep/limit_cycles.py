@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ..._core.execution import Execution
 from ..._core.memo import remembered
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.threads import thread_count
 from ...engine.lanes import Lanes
 from ...engine.settings import SWEEP, Settings
 from ...errors import DefinitionError
@@ -28,6 +28,8 @@ from .batches import FULL, QUICK, Tiles
 # Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
 # Doubled, it is 6 s.
 _SMALL = 2000
+# Systems per compiled call. Doubled: fewer calls, whose arrays leave the cache.
+_BATCH = 250
 
 
 class LimitCycles(eqx.Module):
@@ -113,9 +115,7 @@ def find_limit_cycles(
     *,
     scale: Mapping[str, float] | None = None,
     settings: Settings | None = None,
-    batch: int = 250,
-    workers: int | None = None,
-    progress: bool = False,
+    execution: Execution | None = None,
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
@@ -131,15 +131,17 @@ def find_limit_cycles(
     - `guess`: a limit cycle of a similar system.
     - `scale`: sizes of states by name, by default those of the guess.
     - `settings`: accuracy of the flow; by default 1e-9 per step.
-    - `batch`: systems per compiled call.
-    - `workers`: threads that run calls at the same time; by default all cores on CPU.
-    - `progress`: show a progress bar over the systems.
+    - `execution`: how it is run: systems per compiled call (`batch`, by default 250), threads
+        (`workers`), a progress bar over the systems. Always in double precision.
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
 
-    **Raises:** `DefinitionError` for systems that do not belong together.
+    **Raises:** `DefinitionError` for systems that do not belong together, or single precision.
     """
+    execution = Execution() if execution is None else execution
+    if execution.precision != "double":
+        raise DefinitionError("limit cycles are found in double precision only.")
     systems = _stacked(systems)
     require_x64(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)
@@ -156,8 +158,8 @@ def find_limit_cycles(
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
     map = dataclasses.replace(guess.return_map, settings=settings)
     programs = QUICK if S <= _SMALL else FULL
-    tiles = Tiles(systems, map, min(batch, S), thread_count(workers), programs)
-    found = tiles.solve(S, progress)
+    tiles = Tiles(systems, map, min(execution.batch or _BATCH, S), execution.threads, programs)
+    found = tiles.solve(S, execution.progress)
     turn = found.turn
     return LimitCycles(
         systems, guess.base, found.period, found.anchor, turn.legs, turn.factors,

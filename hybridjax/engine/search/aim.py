@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.precision import at_precision
-from ..systems.structure import Structure
-from ..systems.transition import Scheduled
-from .events import next_schedule
+from ..._core.precision import at_precision
+from ...systems.structure import Structure
+from ...systems.transition import Scheduled
+from ..events import next_schedule
 from .state import State, Task
 
 

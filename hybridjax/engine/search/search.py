@@ -13,21 +13,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.per_lane import shared
-from .._core.results import Result, update_result
-from ..systems.structure import Structure
+from ..._core.lanes.per_lane import shared
+from ..._core.results import Result, update_result
+from ...systems.structure import Structure
+from ..event_log import EventLog, blank_log, log_events
+from ..events import arm
+from ..lanes import Lanes
+from ..settings import Settings
+from ..tape import Tape, blank_tape, write_row
+from ..target import Target
+from ..watch import watch
 from .aim import take_aim
 from .attempt import attempt
-from .event_log import EventLog, blank_log, log_events
-from .events import arm
-from .lanes import Lanes
 from .outcome import aims, calmly, eventfully
-from .settings import Settings
 from .state import Approach, State, Task
 from .stride import Stride
-from .tape import Tape, blank_tape, write_row
-from .target import Target
-from .watch import watch
 
 
 class Moved(NamedTuple):
@@ -86,12 +86,12 @@ def search(
     result = update_result(result, ~finite, Result.BAD_INPUT)
     task = Task(u, target, target.limit - lanes.t, stride, settings)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
-    none = jnp.zeros(L, jnp.int32)
+    none, zero = jnp.zeros(L, jnp.int32), jnp.zeros(L)
     begin = State(
         arm(s, lanes, seen, task.span) if options.new_input else lanes,
         seen,
         aims(seen, task.span),
-        Approach(jnp.zeros(L, bool), none, *jnp.zeros((3, L)), none),
+        Approach(jnp.zeros(L, bool), none, zero, zero, zero, none),
         stride.h,
         jnp.zeros(L),
         result,

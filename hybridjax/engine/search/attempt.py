@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.precision import at_precision
-from ..systems.structure import Structure
+from ..._core.precision import at_precision
+from ...systems.structure import Structure
+from ..events import width
+from ..hermite import NEAR, control_points, root_near_end
+from ..lanes import for_each_chart, only
+from ..solver.step import Step, rk_step
+from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 from .aim import Aim
-from .events import width
-from .hermite import NEAR, control_points, root_near_end
-from .lanes import for_each_chart, only
-from .solver.step import Step, rk_step
 from .state import State, Task
-from .watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 
 
 # A crossing slower than this part of the function's rate elsewhere in the step is a grazing. Twice

@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.precision import at_precision
-from .._core.results import Result, update_result
-from ..systems.structure import Structure
+from ..._core.precision import at_precision
+from ..._core.results import Result, update_result
+from ...systems.structure import Structure
+from ..events import apply_resets, enabled, keep_pace, rearm, width
+from ..hermite import CubicCrossing, first_crossing
+from ..lanes import Lanes
+from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
+from ..watch import Watch, pick, watch
 from .aim import Aim, Way
 from .attempt import SLOW, Attempt
-from .events import apply_resets, enabled, keep_pace, rearm, width
-from .hermite import CubicCrossing, first_crossing
-from .lanes import Lanes
 from .state import Approach, State, Task
-from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
-from .watch import Watch, pick, watch
 
 
 # Steps below this part of the time allowed (in double and in single precision) are not taken: the

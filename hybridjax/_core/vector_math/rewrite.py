@@ -16,6 +16,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.extend.core import primitives
 
+from ..device import on_cpu
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
 
 
@@ -70,7 +71,7 @@ def vectorized(function: Callable) -> Callable:
 
     @ft.wraps(function, updated=())
     def call(*arguments: Any) -> Any:
-        if not _enabled or jax.default_backend() != "cpu":
+        if not _enabled or not on_cpu():
             return function(*arguments)
         # A new function every time: a program of earlier parameters is never taken for this one.
         trace = jax.make_jaxpr(lambda *arguments: function(*arguments), return_shape=True)

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..systems.structure import Structure
-from .lanes import Lanes, for_each_chart, only
-from .settings import Settings
-from .watch import chart_field
+from ...systems.structure import Structure
+from ..lanes import Lanes, for_each_chart, only
+from ..settings import Settings
+from ..watch import chart_field
 
 
 # The first step, as a part of the time in which the state changes by its size (for errors of

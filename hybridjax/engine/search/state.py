@@ -5,12 +5,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.results import Result
-from .lanes import Lanes
-from .settings import Settings
+from ..._core.results import Result
+from ..lanes import Lanes
+from ..settings import Settings
+from ..target import Target
+from ..watch import Watch
 from .stride import Stride
-from .target import Target
-from .watch import Watch
 
 
 class Task(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from .rewrite import vectorized
+from ..vector_math.rewrite import vectorized
 
 
 # From this number of lanes on, trigonometric functions are computed for several at once. Twice as

@@ -6,8 +6,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 
+from ..device import on_cpu
+from ..tracing import is_inside_program, is_traced
 from .garbage_collector import uncollected
-from .tracing import is_inside_program, is_traced
 
 
 # What makes XLA compile for the CPU in a third of the time: no optimization passes of LLVM, and
@@ -31,7 +32,7 @@ def quick_jit(function: Callable) -> Callable:
     def run(*arguments):
         # JAX allows options of the compiler at the top level only, and refuses them elsewhere after
         # it has traced the function.
-        if not _on_cpu() or is_traced(arguments) or is_inside_program():
+        if not on_cpu() or is_traced(arguments) or is_inside_program():
             return plain(*arguments)
         return quick()(*arguments)
 
@@ -40,12 +41,8 @@ def quick_jit(function: Callable) -> Callable:
         with uncollected:
             return run(*arguments)
 
-    call.lower = lambda *arguments: (quick() if _on_cpu() else plain).lower(*arguments)
+    call.lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)
     return call
-
-
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
 
 
 @ft.cache

@@ -5,7 +5,7 @@ import os
 import jax
 import jax.numpy as jnp
 
-from ..errors import ComputationError
+from ...errors import ComputationError
 
 
 # Loops that touch fewer bytes than this in one iteration become one kernel: all of them. (XLA's own
