@@ -119,7 +119,7 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
         model = hj.linearize(hopper_cycle, family, ("yM", "vM"))
         other = hj.linearize(cycle, theirs, ("yM", "vM"))
         assert_same_model(model, other, sizes)
-        np.testing.assert_allclose(other.multipliers(), model.multipliers(), rtol=1e-9)
+        np.testing.assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
         H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
         back = np.array([sizes["force"] / sizes[name[0]] for name in model.outputs])
         for k, row in enumerate(back):
