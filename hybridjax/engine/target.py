@@ -41,7 +41,7 @@ class Target(eqx.Module):
     """End right after the transition of this index; -1 for none."""
     limit: Float[Array, " L"]
     """Give up at this time."""
-    order: tuple[int, ...] | None = eqx.field(static=True)
+    event_sequence: tuple[int, ...] | None = eqx.field(static=True)
     """Transitions expected on one turn of the limit cycle, counted from the first event after
     the start; `None` if any order will do."""
     levels: AbstractLevels | PerLane | None

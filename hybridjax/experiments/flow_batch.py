@@ -86,7 +86,7 @@ def flow_batch(
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
         target = placed.target(j[None], lanes.t, turns[None])
-        target = dataclasses.replace(target, order=cycle.event_sequence)
+        target = dataclasses.replace(target, event_sequence=cycle.event_sequence)
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log)
         # An event may change places with a section, but none may be left out or come in addition.

@@ -123,7 +123,7 @@ def eventfully(
     speed = jnp.abs(_of(end.rate, aim.which))
     slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
     pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
-    expected = _expected(target.order, lanes.events, fired)
+    expected = _expected(target.event_sequence, lanes.events, fired)
     falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
     after = Lanes(
@@ -238,11 +238,11 @@ def _of(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
 
 
 def _expected(
-    order: tuple[int, ...] | None, events: Int[Array, " L"], fired: Int[Array, " L"]
+    sequence: tuple[int, ...] | None, events: Int[Array, " L"], fired: Int[Array, " L"]
 ) -> Bool[Array, " L"]:
     """Whether the next event of each lane is the one that the limit cycle has."""
-    if order is None:
+    if sequence is None:
         return jnp.ones(fired.shape, bool)
-    if not order:
+    if not sequence:
         return jnp.zeros(fired.shape, bool)
-    return jnp.array(order)[events % len(order)] == fired
+    return jnp.array(sequence)[events % len(sequence)] == fired
