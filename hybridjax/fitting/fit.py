@@ -63,9 +63,9 @@ def fit_model(
     - `guess`: of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: how many guesses of the parameters to try at most: those of `system`, then others
-        around them. Once one
-        has converged to a cost that the data explain (as large as their standard deviations make
-        it, or without these 1e-12 of the data's squares), the rest is not tried.
+        around them. Once one has converged to a cost that the data explain (as large as their
+        standard deviations make it, or without these 1e-12 of the data's squares), the rest is not
+        tried.
     - `spread`: the other guesses have coordinates uniformly drawn within this distance: 0.2 means
         factors between exp(-0.2) and exp(0.2). `seed` of the draw.
     - `max_steps`: evaluations of the model from each guess.

@@ -2,8 +2,9 @@
 
 Every size is one number for each name of a state, whatever chart it is in. On a cycle it is the
 state's largest modulus there. Before the cycle is known it is what the field at the guess makes of
-the state in one period. Wherever rounding errors of the field move a state by more than that, as
-they do a state that a symmetry keeps at zero, the size is so large that they are tolerated.
+the state in the time of its fastest mode, or of its clock if that is faster. Wherever rounding
+errors of the field move a state by more than that, as they do a state that a symmetry keeps at
+zero, the size is so large that they are tolerated.
 """
 
 from collections.abc import Mapping
@@ -29,8 +30,8 @@ Sizes = dict[str, float]
 # moved by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to
 # what moves them are computed half as accurately.
 _TIMES_ROUNDING = 5e13
-# A period may be so many times that of the fastest mode at the guess. Doubled, sizes of states that
-# rest are guessed twice as large.
+# Without a clock, the period may be so many times that of the fastest mode at the guess. Doubled,
+# sizes of states that rest are guessed twice as large.
 _MODES = 20.0
 # Shifts of states by which rounding errors of the field are seen, in rounding errors of the states:
 # odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
@@ -44,7 +45,8 @@ class GuessSizes(NamedTuple):
 
     sizes: Sizes
     time: float
-    """In which the states change by their sizes."""
+    """In which the states change by their sizes: one over the rate of the fastest mode, or over the
+    clock's if that is faster."""
 
 
 def sizes_near(
