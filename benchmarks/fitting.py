@@ -83,7 +83,7 @@ def exact(kind: str, data, cycle, seeds: int) -> None:
         factors = 1 + 0.2 * np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
         wrong = hj.models.VerticalHopper(**dict(zip(NAMES, true * factors, strict=True)))
         begin = time.process_time()
-        fit = hj.fit_model(wrong, data.clean(), NAMES, guess=cycle, starts=4, seed=seed)
+        fit = hj.fit_model(wrong, data.clean(), NAMES, guess=cycle, guesses=4, seed=seed)
         seconds.append(time.process_time() - begin)
         if seed == 0:
             show(f"{kind}.first", seconds.pop())
@@ -91,8 +91,8 @@ def exact(kind: str, data, cycle, seeds: int) -> None:
             for text in fit.identifiability.descriptions():
                 print(f"fitting.{kind}.not_seen {text}")
         errors.append(np.abs(seen_errors(fit, true)).max())
-        starts.append(len(fit.starts))
-        steps.append(fit.starts.steps.sum())
+        starts.append(len(fit.guesses))
+        steps.append(fit.guesses.steps.sum())
     show(f"{kind}.exact.worst", max(errors))
     show(f"{kind}.exact.good", np.sum(np.array(errors) < 1e-6))
     show(f"{kind}.exact.of", seeds)

@@ -58,7 +58,7 @@ print(estimate)
 # %%
 names = ("m", "M", "k", "b", "l0", "a", "g")
 wrong = hj.models.VerticalHopper(m=1.15, M=1.8, k=11.0, b=4.3, l0=2.2, a=18.0, g=2.1)
-fit = hj.fit_model(wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, starts=4)
+fit = hj.fit_model(wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4)
 print(fit)
 print()
 print(fit.identifiability)

@@ -1,4 +1,4 @@
-"""The limit cycle of a candidate system, with first derivatives only."""
+"""The limit cycle of a candidate system, under a JAX transformation."""
 
 import dataclasses
 
@@ -6,24 +6,29 @@ import jax.numpy as jnp
 
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
 from ..orbits.newton import root
 from ..systems.system import HybridSystem
 
 
-# Newton steps before a candidate is given up. Doubled, hopeless ones take longer.
-_STEPS = 32
+# Newton steps before a candidate is given up. Doubled, hopeless ones take twice as long.
+_NEWTON_STEPS = 32
 
 
-def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
-    """As `find_limit_cycle` under a JAX transformation, in a third of the time to trace.
+def candidate_cycle(
+    system: HybridSystem, guess: LimitCycle, with_factors: bool = True
+) -> LimitCycle:
+    """The cycle of a system near the `guess`, as `find_limit_cycle` gives it.
 
-    Derivatives of a cycle's factors are second derivatives of the flow. Where only sections are
-    placed on the cycle they are not needed: `factors` and `legs` are NaN here.
+    Derivatives of a cycle's factors are second derivatives of the flow. Without them it is traced
+    and compiled in a third of the time: `factors` and `legs` are NaN then.
     """
+    if with_factors:
+        return find_limit_cycle(system, guess)
     map = dataclasses.replace(guess.return_map, system=system)
     if guess.clocked:
         map = dataclasses.replace(map, expected=guess.multiplicity * jnp.asarray(system.period()))
-    q, turn, steps = root(map, False, _STEPS)
+    q, turn, steps = root(map, False, _NEWTON_STEPS)
     period = map.expected if map.base is None else map.turn(q).period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
     return dataclasses.replace(

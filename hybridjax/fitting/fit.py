@@ -15,15 +15,19 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from .model_fit import ModelFit, Starts
+from .model_fit import ModelFit, ParameterGuesses
 from .observations import AbstractObservation
 from .parameters import Free, Parameters, free_parameters
-from .problem import MAX_STEPS, Problem, evaluate, levenberg_marquardt
+from .problem import MAX_STEPS, FitProblem, evaluate, levenberg_marquardt
 from .sensitivity import Identifiability, diagnose
 
 
-# Without variances, a fit that explains all but this part of the data (mean square) is perfect.
+# Without standard deviations, no other guess is tried once the mean square of the residuals,
+# relative to that of the data, is below this. Doubled, fits 1.4 times as far off count as perfect.
 _PERFECT = 1e-12
+# With them, none is tried once the cost, which has a chi square distribution, is above its mean by
+# less than so many of its standard deviations. Doubled, worse local minima count as fits.
+_LIKELY = 4.0
 
 
 def fit_model(
@@ -32,7 +36,7 @@ def fit_model(
     free: Free,
     *,
     guess: Guess | LimitCycle | None = None,
-    starts: int = 1,
+    guesses: int = 1,
     spread: float = 0.2,
     seed: int = 0,
     max_steps: int = MAX_STEPS,
@@ -46,45 +50,47 @@ def fit_model(
     do not see nothing moves, and the result names them.
 
     ```python
-    fit = hj.fit_model(hopper, hj.ObservedHTF(estimate, sections), ("M", "k", "b"), starts=4)
+    fit = hj.fit_model(hopper, hj.ObservedHTF(estimate, sections), ("M", "k", "b"), guesses=4)
     ```
 
     **Arguments:**
 
-    - `system`: where the fit starts.
-    - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them.
+    - `system`: whose parameters are the first guess.
+    - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them; or a
+        subclass of `AbstractObservation` for data of another kind.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
         (infinite where there are none, `None` for the sign of the value). Names may have dots.
     - `guess`: of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
-    - `starts`: how many starts to try at most: `system` itself, then others around it. Once one
-        has converged to a cost that the data explain (as large as their standard deviations make
-        it, or without these 1e-12 of the data's squares), the rest is not tried.
-    - `spread`: the other starts have coordinates uniformly drawn within this distance: 0.2 means
+    - `guesses`: how many guesses of the parameters to try at most: those of `system`, then others
+        around them. Once one has converged to a cost that the data explain (as large as their
+        standard deviations make it, or without these 1e-12 of the data's squares), the rest is not
+        tried.
+    - `spread`: the other guesses have coordinates uniformly drawn within this distance: 0.2 means
         factors between exp(-0.2) and exp(0.2). `seed` of the draw.
-    - `max_steps`: evaluations of the model for each start.
-    - `progress`: show a bar over the starts.
+    - `max_steps`: evaluations of the model from each guess.
+    - `progress`: show a bar over the guesses.
 
-    **Returns:** a `ModelFit`, the best of all starts. Its `result` is a code of `Result`: nothing
+    **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: nothing
     is raised where a fit does not converge.
 
     **Raises:** `DefinitionError` for parameters, bounds or data that do not fit the system;
-    `ComputationError` if no start has a limit cycle on which the data can be observed.
+    `ComputationError` if no guess has a limit cycle on which the data can be observed.
 
     The program is compiled at the first call for each class of systems and kind of data; other
     values of parameters and data use it again.
     """
-    if starts < 1 or max_steps < 1 or not spread > 0:
+    if guesses < 1 or max_steps < 1 or not spread > 0:
         raise DefinitionError(
-            f"starts and max_steps must be at least 1 and spread positive, not {starts}, "
+            f"guesses and max_steps must be at least 1 and spread positive, not {guesses}, "
             f"{max_steps} and {spread}."
         )
     problem, near = _prepare(system, data, free, guess)
     parameters, weighted = problem.parameters, problem.weighted
     x0 = np.asarray(parameters.encode(parameters.read(system)))
-    around = spread * np.random.default_rng(seed).uniform(-1, 1, (starts - 1, len(x0)))
+    around = spread * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
     tried, best = [], None
-    for x in tqdm([x0, *(x0 + around)], "starts", disable=not progress):
+    for x in tqdm([x0, *(x0 + around)], "guesses", disable=not progress):
         found = _from(problem, jnp.asarray(x), system, near, max_steps)
         tried.append(found)
         best = found if best is None or found.cost < best.cost else best
@@ -92,8 +98,8 @@ def fit_model(
             break
     if best.cost == np.inf:
         raise ComputationError(
-            f"none of {starts} starts has a limit cycle on which the data can be observed "
-            f"({best.result.message}): start elsewhere, or give more `starts`."
+            f"none of {guesses} guesses has a limit cycle on which the data can be observed "
+            f"({best.result.message}): give another system, or more `guesses`."
         )
     return _summary(problem, tried, best)
 
@@ -117,23 +123,29 @@ def identifiability(
     problem, near = _prepare(system, data, free, guess)
     parameters, cycle = problem.parameters, find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system))
-    r, J = evaluate(problem, x, cycle)
-    if not np.isfinite(r).all():
+    there = evaluate(problem, x, cycle)
+    if not np.isfinite(there.residuals).all():
         raise ComputationError("the system has a limit cycle, but the data cannot be had from it.")
-    return diagnose(parameters.names, _relative(parameters, x, J))
+    return diagnose(parameters.names, _relative(parameters, x, there.jacobian))
 
 
-def _prepare(system, data, free, guess) -> tuple[Problem, LimitCycle]:
+def _prepare(
+    system: HybridSystem,
+    data: AbstractObservation | Sequence[AbstractObservation],
+    free: Free,
+    guess: Guess | LimitCycle | None,
+) -> tuple[FitProblem, LimitCycle]:
     """The problem, and a limit cycle near which to look for others."""
     parameters = free_parameters(system, free)
     observations = (data,) if isinstance(data, AbstractObservation) else tuple(data)
     if not observations or not all(isinstance(one, AbstractObservation) for one in observations):
         raise DefinitionError(
-            "data are ObservedHTF, ObservedSeries or ObservedCycle objects, one or more."
+            "data are observations (ObservedHTF, ObservedSeries, ObservedCycle, or an "
+            "AbstractObservation of your own), one or more."
         )
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
-    return Problem(parameters, tuple(one.prepare(near) for one in observations)), near
+    return FitProblem(parameters, tuple(one.prepare(near) for one in observations)), near
 
 
 def _anchored(cycle: LimitCycle) -> LimitCycle:
@@ -153,7 +165,9 @@ def _anchored(cycle: LimitCycle) -> LimitCycle:
     )  # fmt: skip
 
 
-def _relative(parameters: Parameters, x, jacobian) -> Float[np.ndarray, "r p"]:
+def _relative(
+    parameters: Parameters, x: Float[Array, " p"], jacobian: Float[Array | np.ndarray, "r p"]
+) -> Float[np.ndarray, "r p"]:
     """From derivatives by coordinates to derivatives by relative changes of the values."""
     values, slopes = jax.jvp(parameters.decode, (x,), (jnp.ones_like(x),))
     return np.asarray(jacobian * _sizes(values) / slopes)
@@ -164,9 +178,9 @@ def _sizes(values):
 
 
 class _Found(eqx.Module):
-    """Where one start led."""
+    """Where one guess led."""
 
-    start: Float[Array, " p"]
+    guess: Float[Array, " p"]
     x: Float[Array, " p"]
     cost: float
     steps: int
@@ -176,34 +190,34 @@ class _Found(eqx.Module):
     jacobian: Float[np.ndarray, "r p"]
 
 
-def _from(problem: Problem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
+def _from(problem: FitProblem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
     p = problem.parameters
     cycle = find_limit_cycle(p.insert(system, p.decode(x)), near, throw=False)
     nothing = np.zeros(0), np.zeros((0, len(x)))
     if int(cycle.result) != Result.OK:
         return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
-    end, r, J, steps, done = levenberg_marquardt(problem, x, cycle, max_steps)
-    r, steps = np.asarray(r), int(steps)
+    end = levenberg_marquardt(problem, x, cycle, max_steps)
+    r, J, steps = np.asarray(end.residuals), np.asarray(end.jacobian), int(end.steps)
     if not np.isfinite(r).all():  # there is a cycle, but not what was observed on it
         return _Found(x, x, np.inf, steps, Result.NOT_CONVERGED, cycle, *nothing)
-    cycle = find_limit_cycle(p.insert(system, p.decode(end)), cycle, throw=False)
-    result = Result.OK if done else Result.NOT_CONVERGED
-    return _Found(x, end, float(r @ r), steps, result, cycle, r, np.asarray(J))
+    cycle = find_limit_cycle(p.insert(system, p.decode(end.x)), cycle, throw=False)
+    result = Result.OK if end.converged else Result.NOT_CONVERGED
+    return _Found(x, end.x, float(r @ r), steps, result, cycle, r, J)
 
 
 def _goal(count: int, parameters: int, weighted: bool) -> float:
-    """The cost of a fit that needs no other start."""
+    """The cost of a fit that needs no other guess."""
     if not weighted:
         return _PERFECT * count
     freedom = max(count - parameters, 1)
-    return freedom + 4 * np.sqrt(2 * freedom)
+    return freedom + _LIKELY * np.sqrt(2 * freedom)
 
 
-def _summary(problem: Problem, tried: list[_Found], best: _Found) -> ModelFit:
+def _summary(problem: FitProblem, tried: list[_Found], best: _Found) -> ModelFit:
     parameters, weighted = problem.parameters, problem.weighted
     decode = lambda x: np.asarray(parameters.decode(x))  # noqa: E731
-    starts = Starts(
-        np.stack([decode(one.start) for one in tried]),
+    guesses = ParameterGuesses(
+        np.stack([decode(one.guess) for one in tried]),
         np.stack([decode(one.x) for one in tried]),
         np.array([one.cost for one in tried]),
         np.array([one.steps for one in tried]),
@@ -219,5 +233,5 @@ def _summary(problem: Problem, tried: list[_Found], best: _Found) -> ModelFit:
     some = left[:, : seen.rank] / singular[: seen.rank] * size[:, None]
     return ModelFit(
         best.cycle.system, best.cycle, parameters.names, values, unit * some @ some.T,
-        best.residuals, best.cost, freedom, seen, starts, int(best.result), problem,
+        best.residuals, best.cost, freedom, seen, guesses, int(best.result), problem,
     )  # fmt: skip

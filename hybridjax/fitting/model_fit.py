@@ -13,14 +13,14 @@ from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem
-from .problem import Problem, evaluate
+from .problem import FitProblem, evaluate
 from .sensitivity import Identifiability
 
 
-class Starts(eqx.Module):
-    """What became of the S starts of a fit, in the order in which they were tried.
+class ParameterGuesses(eqx.Module):
+    """What became of the S guesses of a fit, in the order in which they were tried.
 
-    **Fields:** `values` (S, p), where they began, and `fitted` (S, p), where they ended; `cost`
+    **Fields:** `values` (S, p), the guesses, and `fitted` (S, p), where they led; `cost`
     (S,) there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,), codes.
     """
 
@@ -59,7 +59,7 @@ class ModelFit(eqx.Module):
     - `cost`: sum of their squares. `freedom`: r less the number of combinations that are seen; the
         cost to be expected where all data came with their standard deviations.
     - `identifiability`: which combinations of parameters the data see.
-    - `starts`: what became of each start. `result`: code of the best one.
+    - `guesses`: what became of each guess. `result`: code of the best one.
     - `problem`: what was made small.
     """
 
@@ -72,9 +72,9 @@ class ModelFit(eqx.Module):
     cost: float = eqx.field(static=True)
     freedom: int = eqx.field(static=True)
     identifiability: Identifiability
-    starts: Starts
+    guesses: ParameterGuesses
     result: int = eqx.field(static=True)
-    problem: Problem
+    problem: FitProblem
 
     @property
     def weighted(self) -> bool:
@@ -105,7 +105,8 @@ class ModelFit(eqx.Module):
         if missing:
             raise DefinitionError(f"there is no true value of '{missing[0]}'.")
         values = jnp.array([float(true[name]) for name in self.names])
-        r, _ = evaluate(self.problem, self.problem.parameters.encode(values), self.cycle)
+        x = self.problem.parameters.encode(values)
+        r = np.asarray(evaluate(self.problem, x, self.cycle).residuals)
         more = float(r @ r) - self.cost
         return more if self.weighted else more / (self.cost / self.freedom)
 
@@ -119,11 +120,11 @@ class ModelFit(eqx.Module):
     def __repr__(self) -> str:
         width = max(map(len, self.names))
         expected = f", expected {self.freedom}" if self.weighted else ""
-        converged = int(np.sum(self.starts.ok))
+        converged = int(np.sum(self.guesses.ok))
         lines = [
             f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
-            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.starts)} starts "
-            f"converged, {int(np.sum(self.starts.steps))} evaluations",
+            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.guesses)} guesses "
+            f"converged, {int(np.sum(self.guesses.steps))} evaluations",
         ]
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
             shown = f"+- {error:.2g}" if np.isfinite(error) else "not seen by itself"

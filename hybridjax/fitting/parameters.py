@@ -21,8 +21,9 @@ class Parameters(eqx.Module):
     r"""The free parameters of a system, and coordinates x for them that have no bounds.
 
     With a bound on one side $v = l + e^x$ or $v = h - e^x$; with two $v = l + (h - l)/(1 +
-    e^{-x})$; without any $v = s x$, with the size s of the starting value. A parameter that only
-    keeps its sign is therefore changed by factors.
+    e^{-x})$; without any $v = s x$, with the size s of the first guess (1 if that is zero: then
+    the parameter's unit matters, unless it has bounds). A parameter that only keeps its sign is
+    therefore changed by factors.
 
     **Fields:** `names`; `low`, `high` (p,), infinite where there is no bound; `size` (p,).
     """

@@ -8,10 +8,17 @@ import numpy as np
 from jaxtyping import Float
 
 
-# Singular values of the sensitivities below this part of the largest one are zero.
-_RTOL = 1e-9
-# Entries of a direction count as a ratio of small integers if they are so close to one.
-_CLOSE, _SMALL = 1e-3, 6
+# Singular values of the sensitivities below this part of the largest one are zero. Doubled,
+# combinations that are seen twice as well count as not seen.
+_RANK = 1e-9
+# Entries of a direction that are as close as this to zero, or to ratios of integers, are taken for
+# these: they have no unit. Doubled, so are those twice as far.
+_CLOSE = 1e-3
+# The denominators of such ratios go up to this. Doubled, there are about four times as many.
+_LARGEST_DENOMINATOR = 6
+# Entries by which a basis is solved for, if their smallest singular value is above this. Doubled,
+# forms whose other entries are half as large are left out.
+_REGULAR = 1e-3
 
 
 class Identifiability(eqx.Module):
@@ -63,7 +70,7 @@ def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> I
     """From the sensitivities S of weighted residuals to relative changes of the parameters."""
     _, values, rows = np.linalg.svd(sensitivity, full_matrices=True)
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
-    rank = int(np.sum(values > _RTOL * values[0]))
+    rank = int(np.sum(values > _RANK * values[0]))
     return Identifiability(names, rank, values, _readable(rows[rank:]), sensitivity)
 
 
@@ -75,7 +82,7 @@ def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
 
     def echelon(pivots):
         block = basis[:, pivots]
-        if np.linalg.svd(block, compute_uv=False)[-1] < 1e-3:
+        if np.linalg.svd(block, compute_uv=False)[-1] < _REGULAR:
             return None
         return _rounded(np.linalg.solve(block, basis))
 
@@ -88,7 +95,7 @@ def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
     """Rows scaled to small integers where they are multiples of such."""
     out = []
     for row in rows:
-        nearest = [Fraction(x).limit_denominator(_SMALL) for x in row]
+        nearest = [Fraction(x).limit_denominator(_LARGEST_DENOMINATOR) for x in row]
         if max(abs(float(n) - x) for n, x in zip(nearest, row, strict=True)) < _CLOSE:
             common = np.lcm.reduce([n.denominator for n in nearest])
             row = np.array([float(n * int(common)) for n in nearest])

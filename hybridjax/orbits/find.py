@@ -32,8 +32,9 @@ from .scale import Sizes, alike, given_sizes, scale_of, sizes_near, sizes_of, si
 # An autonomous system is given up if it does not return within so many of the times in which the
 # states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
 _PATIENCE = 1000.0
-# A cycle is computed anew with the sizes that states have on it if one of them is off by more than
-# this factor. Doubled, accuracies are kept to within twice the factor.
+# Rough sizes are replaced by those that states have on the cycle if one of them is off by more than
+# this factor; where it was too large, the cycle is computed anew. Doubled, errors may be twice as
+# large.
 _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
@@ -191,13 +192,17 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     if alike(sizes, rough, _OFF):
         return map, solution
     expected = map.expected if map.base is None else solution.turn.period
-    finer = dataclasses.replace(
+    own = dataclasses.replace(
         map, settings=_in_sizes(map.settings, s, sizes), anchor=solution.anchor, expected=expected
     )
-    again = solve(finer)
+    if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
+        size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
+        distance = jnp.asarray(np.max(np.abs(solution.turn.residual) / size))
+        return own, solution._replace(turn=solution.turn._replace(distance=distance))
+    again = solve(own)
     if int(again.result) not in (Result.OK, Result.SINGULAR):
         return map, solution
-    return finer, again._replace(steps=solution.steps)
+    return own, again._replace(steps=solution.steps)
 
 
 def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:
@@ -250,7 +255,7 @@ def _check_clock(cycle: LimitCycle) -> None:
     a, t = int(cycle.anchor.chart[0]), float(cycle.anchor.t[0])
     f, later, guards, rates = jax.device_get(_at_anchor(cycle))
     f, later = f[: s.dims[a]], later[: s.dims[a]]
-    slow = np.asarray(cycle.return_map.sizes)[: s.dims[a]] / float(cycle.period)
+    slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)
     if np.any(np.abs(later - f) > _SAME_FIELD * np.abs(f) + _SAME_REST * slow):
         raise ComputationError(
             f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "

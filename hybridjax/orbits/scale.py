@@ -2,8 +2,9 @@
 
 Every size is one number for each name of a state, whatever chart it is in. On a cycle it is the
 state's largest modulus there. Before the cycle is known it is what the field at the guess makes of
-the state in one period. Wherever rounding errors of the field move a state by more than that, as
-they do a state that a symmetry keeps at zero, the size is so large that they are tolerated.
+the state in the time of its fastest mode, or of its clock if that is faster. Wherever rounding
+errors of the field move a state by more than that, as they do a state that a symmetry keeps at
+zero, the size is so large that they are tolerated.
 """
 
 from collections.abc import Mapping
@@ -29,8 +30,8 @@ Sizes = dict[str, float]
 # moved by 1e-4 sizes: both must be well above rounding. Doubled, states that are small compared to
 # what moves them are computed half as accurately.
 _TIMES_ROUNDING = 5e13
-# A period may be so many times that of the fastest mode at the guess. Doubled, sizes of states that
-# rest are guessed twice as large.
+# Without a clock, the period may be so many times that of the fastest mode at the guess. Doubled,
+# sizes of states that rest are guessed twice as large.
 _MODES = 20.0
 # Shifts of states by which rounding errors of the field are seen, in rounding errors of the states:
 # odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
@@ -44,7 +45,8 @@ class GuessSizes(NamedTuple):
 
     sizes: Sizes
     time: float
-    """In which the states change by their sizes: the clock's period, if there is one."""
+    """In which the states change by their sizes: one over the rate of the fastest mode, or over the
+    clock's if that is faster."""
 
 
 def sizes_near(
@@ -63,9 +65,12 @@ def sizes_near(
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
     reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
     near = _look(system, reached, np.full(len(reached), float(t)), points[reached].T)
-    time = _time_scale(near) if period is None else period
+    time = _time_scale(near)
+    turn = _MODES * time
+    if period is not None:
+        turn, time = period, min(time, period / (2 * np.pi))
     size = np.abs(near.q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, _MODES * time))), time)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, turn))), time)
 
 
 def sizes_on(
@@ -104,7 +109,9 @@ def scale_of(
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
         scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
-    return jnp.where(np.isnan(scale), 1.0 if otherwise is None else otherwise, scale)
+    if otherwise is None:
+        return jnp.asarray(np.where(np.isnan(scale), 1.0, scale))
+    return jnp.where(np.isnan(scale), otherwise, scale)
 
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"] | None) -> Sizes:
@@ -142,18 +149,24 @@ def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
 @quick_jit
 def _field(system, chart, t, q):
     s = Structure(system)
-    K, S = len(chart), len(_SHIFTS)
-    at = lambda t, q: slopes(s, t, chart, q, jnp.zeros((s.nu, K)))  # noqa: E731
-    f, change = jax.jvp(at, (t, q), (jnp.ones(K), at(t, q)))
-    column = lambda e: jax.jvp(lambda q: at(t, q), (q,), (e[:, None] * jnp.ones(K),))[1]  # noqa: E731
-    derivative = jax.vmap(column, out_axes=1)(jnp.eye(s.d))
+    K, S = len(chart), 1 + len(_SHIFTS)
+
+    def at(t, q):
+        n = len(t) // K
+        return slopes(s, t, jnp.repeat(chart, n), q, jnp.zeros((s.nu, K * n)))
+
     # Not all states by the same part, since a common factor may cancel.
-    shifts = np.stack([np.roll(_SHIFTS, k) for k in range(s.d)]) * np.finfo(float).eps
+    shifts = np.stack([[0.0, *np.roll(_SHIFTS, k)] for k in range(s.d)]) * np.finfo(float).eps
     moved = q[..., None] * (1 + shifts[:, None])
-    many = moved.reshape(s.d, K * S)
-    after = slopes(s, jnp.repeat(t, S), jnp.repeat(chart, S), many, jnp.zeros((s.nu, K * S)))
+    fields = at(jnp.repeat(t, S), moved.reshape(s.d, K * S)).reshape(s.d, K, S)
+    f, still, forwards = fields[..., 0], jnp.zeros((s.d, K)), jnp.ones((1, K))
+    times = jnp.concatenate([still, forwards])  # along each state, then along the flow
+    states = jnp.concatenate([jnp.eye(s.d)[:, :, None] * forwards, f[None]])
+    push = lambda dt, dq: jax.jvp(at, (t, q), (dt, dq))[1]  # noqa: E731
+    along = jax.vmap(push, out_axes=1)(times, states)
+    derivative, change = along[:, :-1], along[:, -1]
     smooth = jnp.einsum("ijk,jks->iks", derivative, moved - q[..., None])
-    rounding = jnp.max(jnp.abs(after.reshape(s.d, K, S) - f[..., None] - smooth), axis=-1)
+    rounding = jnp.max(jnp.abs(fields - f[..., None] - smooth), axis=-1)
     return f, change, derivative, rounding
 
 

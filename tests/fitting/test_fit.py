@@ -33,7 +33,7 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
-    assert "not seen: p and q apart" in repr(fit) and "1 of 1 starts" in repr(fit)
+    assert "not seen: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(fit)
 
 
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
@@ -48,27 +48,27 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         fit.contains({"p": 0.5, "q": 2.0})
 
 
-def test_more_starts_are_tried_only_where_they_are_needed(oscillation):
+def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     nothing_fits = hj.ObservedCycle(
         PHASES, ("x", "v"), np.arange(8.0).reshape(4, 2) - 3.0, period=oscillation.period, **STD
     )
     several = hj.fit_model(
-        oscillation.system, nothing_fits, ("p", "q", "w"), guess=oscillation, starts=3
+        oscillation.system, nothing_fits, ("p", "q", "w"), guess=oscillation, guesses=3
     )
-    assert len(several.starts) == 3 and several.cost == several.starts.cost.min()
-    assert np.ptp(several.starts.values[:, 0]) > 0
-    assert repr(several.starts).count("\n") == 3
+    assert len(several.guesses) == 3 and several.cost == several.guesses.cost.min()
+    assert np.ptp(several.guesses.values[:, 0]) > 0
+    assert repr(several.guesses).count("\n") == 3
     one = hj.fit_model(
-        oscillation.system, observed(oscillation), ("p", "q", "w"), guess=oscillation, starts=3
+        oscillation.system, observed(oscillation), ("p", "q", "w"), guess=oscillation, guesses=3
     )
-    assert len(one.starts) == 1
+    assert len(one.guesses) == 1
 
 
 @pytest.mark.parametrize(
     "options, message",
     [
         ({"free": "mass"}, "no parameter of Oscillator"),
-        ({"starts": 0}, "starts and max_steps"),
+        ({"guesses": 0}, "guesses and max_steps"),
         ({"spread": 0.0}, "spread positive"),
         ({"data": ()}, "one or more"),
     ],
@@ -95,7 +95,7 @@ def test_the_limit_cycle_of_the_hopper_does_not_see_a_common_scale(seen_in_cycle
 def test_the_hopper_comes_back_from_its_htfs(hopper_cycle, hopper_htf, seen_in_htf):
     data = hj.ObservedHTF(hopper_htf, SECTIONS)
     wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
-    fit = hj.fit_model(wrong, data, HOPPER, guess=hopper_cycle, starts=4)
+    fit = hj.fit_model(wrong, data, HOPPER, guess=hopper_cycle, guesses=4)
     true = hopper_cycle.system
     for name in ("m", "M", "k", "b"):
         assert float(getattr(fit.system, name)) == pytest.approx(
@@ -110,7 +110,7 @@ def test_the_hopper_comes_back_from_experiments(hopper_cycle):
     data = hj.run_experiments(hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0)
     wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
     fit = hj.fit_model(
-        wrong, hj.ObservedSeries(data, SECTIONS), HOPPER, guess=hopper_cycle, starts=4
+        wrong, hj.ObservedSeries(data, SECTIONS), HOPPER, guess=hopper_cycle, guesses=4
     )
     assert fit.identifiability.complete
     for name in HOPPER:
