@@ -12,19 +12,13 @@ import nbformat
 
 
 HERE = pathlib.Path(__file__).resolve().parent
-SETUP = """
-get_ipython().run_line_magic("matplotlib", "inline")
-get_ipython().run_line_magic("config", "InlineBackend.print_figure_kwargs = {'dpi': 75}")
-"""
 
 
 def build(source: pathlib.Path, target: pathlib.Path) -> None:
     notebook = jupytext.read(source)
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(SETUP))
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook.metadata = nbformat.from_dict({"kernelspec": kernel})
     nbclient.NotebookClient(notebook, timeout=1200, record_timing=False).execute()
-    del notebook.cells[0]
     for number, cell in enumerate(notebook.cells):
         cell.id = f"cell-{number}"
         cell.metadata = {}

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,12 +64,20 @@ _STYLE = {
 _FONTS_IN_FILES = {"pdf.fonttype": 42, "svg.fonttype": "none"}
 
 
+@functools.cache
+def _load_backend() -> None:
+    """In Jupyter, the backend turns interactive mode on when it is loaded, which is when the first
+    figure is made. Inside of `style` that would be undone, and no later figure would be shown."""
+    pyplot.switch_backend(matplotlib.get_backend())
+
+
 def style() -> contextlib.AbstractContextManager:
     """The package's look, for figures of your own: `with hj.plot.style(): ...`.
 
     Functions of this module use it when they make the figure; on Axes that they are given they
     leave fonts and sizes alone. Global settings of matplotlib are never changed.
     """
+    _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
 
 
