@@ -3,12 +3,15 @@
 pip install jupytext nbclient ipykernel && python notebooks/build.py [NAME ...]
 """
 
+import base64
+import io
 import pathlib
 import sys
 
 import jupytext
 import nbclient
 import nbformat
+from PIL import Image
 
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -28,8 +31,18 @@ def build(source: pathlib.Path, target: pathlib.Path) -> None:
         for output in cell.outputs:
             if "execution_count" in output:
                 output.execution_count = count
+            if "image/png" in output.get("data", {}):
+                output.data["image/png"] = small(output.data["image/png"])
     notebook.metadata = nbformat.from_dict({"kernelspec": kernel})
     nbformat.write(notebook, target)
+
+
+def small(image: str) -> str:
+    """A picture with a palette: it looks the same, in a third of the size."""
+    made = io.BytesIO()
+    with Image.open(io.BytesIO(base64.b64decode(image))) as picture:
+        picture.convert("RGB").quantize(128).save(made, "png", optimize=True)
+    return base64.b64encode(made.getvalue()).decode()
 
 
 if __name__ == "__main__":
