@@ -147,7 +147,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
             hits += error <= np.asarray(estimate.confidence_radius())
             variances.append(np.stack([estimate.variance, estimate.noise_variance]))
     exact = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H)
-    name = f"coverage.{rms}.{each}_realisations"
+    name = f"coverage.{rms}.{each}_realizations"
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
     family.show(f"{name}.mean", hits.mean() / runs)
     family.show(f"{name}.least", hits.min() / runs)

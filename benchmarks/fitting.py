@@ -6,10 +6,10 @@ limit cycle. Printed, as `name value` lines:
 
 - `seen`: how many combinations of the 7 parameters the data see; the others are named.
 - `first`: CPU seconds of the first fit, nearly all of it for tracing and compiling.
-- `exact`: fits to data without noise, `--seeds` starts with every parameter wrong by up to 20 %,
-  each with up to 4 starts (itself and others within 20 % of it). `worst`: largest relative error
-  of a combination that is seen; `good`: how many are within 1e-6; `starts` and `steps`:
-  starts and evaluations in all; `cpu`: seconds for each fit.
+- `exact`: fits to data without noise, `--seeds` systems with every parameter wrong by up to 20 %,
+  each with up to 4 guesses (itself and others within 20 % of it). `worst`: largest relative error
+  of a combination that is seen; `good`: how many are within 1e-6; `guesses` and `steps`:
+  guesses and evaluations in all; `cpu`: seconds for each fit.
 - `noise`: fits to `--draws` draws of white noise at 40 dB, starting at the truth. `covered`: how
   often the joint 95 % region holds the true parameters; `p`: of the two-sided binomial test;
   `mean`: mean chi square relative to its expectation.
@@ -78,7 +78,7 @@ def show(name: str, value) -> None:
 
 def exact(kind: str, data, cycle, seeds: int) -> None:
     true = np.array([float(getattr(cycle.system, name)) for name in NAMES])
-    errors, starts, steps, seconds = [], [], [], []
+    errors, guesses, steps, seconds = [], [], [], []
     for seed in range(seeds):
         factors = 1 + 0.2 * np.random.default_rng(seed).uniform(-1, 1, len(NAMES))
         wrong = hj.models.VerticalHopper(**dict(zip(NAMES, true * factors, strict=True)))
@@ -91,12 +91,12 @@ def exact(kind: str, data, cycle, seeds: int) -> None:
             for text in fit.identifiability.descriptions():
                 print(f"fitting.{kind}.not_seen {text}")
         errors.append(np.abs(seen_errors(fit, true)).max())
-        starts.append(len(fit.guesses))
+        guesses.append(len(fit.guesses))
         steps.append(fit.guesses.steps.sum())
     show(f"{kind}.exact.worst", max(errors))
     show(f"{kind}.exact.good", np.sum(np.array(errors) < 1e-6))
     show(f"{kind}.exact.of", seeds)
-    show(f"{kind}.exact.starts", sum(starts))
+    show(f"{kind}.exact.guesses", sum(guesses))
     show(f"{kind}.exact.steps", sum(steps))
     show(f"{kind}.exact.cpu", np.mean(seconds))
 
@@ -128,7 +128,7 @@ def main() -> None:
     )
     kinds = {"htf": HTFs, "series": Series}
     parser.add_argument("--only", default="htf,series", help="of htf,series")
-    parser.add_argument("--seeds", type=int, default=50, help="wrong starts without noise")
+    parser.add_argument("--seeds", type=int, default=50, help="wrong systems without noise")
     parser.add_argument("--draws", type=int, default=200, help="draws of noise")
     options = parser.parse_args()
     hj.enable_x64()

@@ -56,7 +56,7 @@ print(recording)
 angle = hj.KinematicPhase(32, position="yM", velocity="vM")
 phase = hj.recordings.estimate_phase(recording, angle)
 data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"))
-fit = hj.fit_series(data.records, order=2)
+fit = hj.fit_series(data, order=2)
 print(phase, data, fit, sep="\n")
 
 # %% [markdown]

@@ -65,7 +65,7 @@ TRANSFORMATIONS = {
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 @pytest.mark.parametrize("transformation", TRANSFORMATIONS)
-def test_vectorised_agrees_under_transformations(function, transformation):
+def test_vectorized_agrees_under_transformations(function, transformation):
     if function is looped and transformation in ("vjp", "second", "checkpoint"):
         pytest.skip("JAX does not reverse while_loop")
     transform = TRANSFORMATIONS[transformation]
@@ -85,12 +85,12 @@ def left(function, *xs):
     return set(re.findall(r"= (sin|cos|tan|atan2?|asin|acos)[ \[]", program))
 
 
-def test_vectorised_works_outside_of_jit():
+def test_vectorized_works_outside_of_jit():
     np.testing.assert_allclose(vectorized(plain)(0.3, 0.7), plain(0.3, 0.7), rtol=1e-15)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
-def test_vectorised_replaces_everything(function):
+def test_vectorized_replaces_everything(function):
     assert bool(left(function, 0.3, 0.7)) == (function is not no_trigonometry)
     assert not left(vectorized(function), 0.3, 0.7)
 

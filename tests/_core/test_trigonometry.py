@@ -80,7 +80,7 @@ def test_hardest_arguments():
     assert np.min(np.abs(truth)) < 1e-18
 
 
-def test_huge_arguments_are_those_of_a_neighbour():
+def test_huge_arguments_are_those_of_a_neighbor():
     x = np.exp(RNG.uniform(math.log(1e6), 53 * math.log(2), 20000))
     for name in ("sin", "cos"):
         truth = getattr(np, name)(x.astype(np.longdouble))

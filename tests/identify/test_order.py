@@ -44,7 +44,7 @@ def test_the_level_of_the_rank_test(small, variance):
 
 
 @pytest.mark.parametrize("freedom", [3.0, 8.0])
-def test_variances_from_few_realisations(freedom, small, variance):
+def test_variances_from_few_realizations(freedom, small, variance):
     """They make noise look larger than it is, and its tails longer; not like more multipliers."""
     _, htf = small
     runs, wrong, refused = 12, 0, 0

@@ -92,14 +92,14 @@ def test_sums_of_parts_are_those_of_the_whole(model):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
 
 
-def test_without_repeats_or_realisations_nothing_is_known(model):
+def test_without_repeats_or_realizations_nothing_is_known(model):
     estimate = hj.estimate_htf(realized(model, 1))
     assert estimate.variance is None and estimate.variance_freedom is None
     with pytest.raises(hj.DefinitionError, match="several realizations"):
         estimate.confidence_radius()
 
 
-def test_a_failed_realisation_leaves_the_others(model):
+def test_a_failed_realization_leaves_the_others(model):
     data = realized(model, 2, noise=0.1)
     result = np.zeros(len(data.u), int)
     result[0] = hj.Result.BLOW_UP

@@ -106,7 +106,7 @@ def test_systems_that_are_alike_or_undefined(wheel):
     assert alike.ok.all()
 
 
-def test_programs_in_threads_factorise_nothing(wheel):
+def test_programs_in_threads_factorize_nothing(wheel):
     """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
     start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.anchor, wheel.period))

@@ -30,7 +30,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     np.testing.assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
 
 
-def test_chart_colours_meet_at_the_events(hopper_cycle):
+def test_chart_colors_meet_at_the_events(hopper_cycle):
     ax = hj.plot.cycle(hopper_cycle).ax
     liftoff = hopper_cycle.trajectory().events[0].before
     lines = labeled(ax)
