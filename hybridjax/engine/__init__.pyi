@@ -1,1 +1,2 @@
+from .lanes import Lanes as Lanes
 from .trajectory import Event as Event

@@ -15,6 +15,6 @@ from .identification import Identification as Identification
 from .impulse import ImpulseResponses as ImpulseResponses, impulse_responses as impulse_responses
 from .phase.estimation import PhaseDefinition as PhaseDefinition, estimate_phase as estimate_phase
 from .phase.tracker import PhaseTracker as PhaseTracker
-from .phase.winding import Phase as Phase
+from .phase.winding import Phase as Phase, Winding as Winding
 from .recording import Trial as Trial
 from .sampling import section_data as section_data

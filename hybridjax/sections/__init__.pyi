@@ -3,5 +3,6 @@ from .abstract import (
     AbstractSections as AbstractSections,
     BoundSections as BoundSections,
     CyclePoint as CyclePoint,
+    Structure as Structure,
 )
 from .section_list import FamilyLike as FamilyLike

@@ -9,9 +9,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+# Subclasses of `AbstractSections` meet these two, which other layers define.
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
-from ..systems.structure import Structure
+from ..systems.structure import Structure as Structure
 from .crossing import Crossing, number
 
 
