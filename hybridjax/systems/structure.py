@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from .._core.lanes.per_lane import PerLane, by_lane, shared
 from .._core.tracing import is_traced
@@ -78,7 +79,7 @@ class Structure:
             raise DefinitionError(f"there is no event '{name}'; events are {_list(names)}.")
         return names.index(name)
 
-    def chart_input(self, a: int, t, u: jax.Array) -> jax.Array:
+    def chart_input(self, a: int, t: ArrayLike, u: jax.Array) -> jax.Array:
         """g_a(û): the inputs that chart a uses."""
         if self.drive is not None:
             u = u + jnp.broadcast_to(jnp.asarray(self.drive(t), float), u.shape)
@@ -87,7 +88,7 @@ class Structure:
             return u
         return u[np.array([self.system.inputs.index(n) for n in names], int)]
 
-    def field(self, a: int, t, q, u) -> jax.Array:
+    def field(self, a: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
     def guards(self, a: int) -> list[int]:
@@ -101,17 +102,17 @@ class Structure:
     def _out(self, a: int):
         return [(g, tr) for g, tr in enumerate(self.transitions) if tr.source == self.names[a]]
 
-    def guard(self, g: int, t, q, u) -> jax.Array:
+    def guard(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transitions[g]
         a = self.chart_index(tr.source)
         return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, t, u)), float)
 
-    def reset(self, g: int, t, q, u) -> jax.Array:
+    def reset(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         tr = self.transitions[g]
         return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), t, u)))
 
-    def enabled(self, g: int, t, q, u) -> jax.Array:
+    def enabled(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         tr = self.transitions[g]
         if tr.enabled is None:
             return jnp.asarray(True)
