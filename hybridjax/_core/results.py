@@ -42,7 +42,7 @@ _MESSAGES = {
     Result.SINGULAR: "J - I is singular: the cycle is not isolated",
     Result.BAD_INPUT: "the start or the input is NaN or infinite",
     Result.EQUILIBRIUM: "the iteration ended in an equilibrium instead of a cycle",
-    Result.EXTRA_TURNS: "a round met the section more often than asked (its period is shorter)",
+    Result.EXTRA_TURNS: "a turn met the section more often than asked (its period is shorter)",
 }
 
 

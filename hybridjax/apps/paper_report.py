@@ -33,7 +33,7 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
         summary["families"][name] = {
             "experiments": family.data.summary(),
-            "multipliers_from_linearisation": _complex(family.ldtp.multipliers),
+            "multipliers_from_linearization": _complex(family.ldtp.multipliers),
             "multipliers_fit_structured": _complex(family.structured.multipliers),
             "multipliers_fit_structured_error": family.structured.compare(true).max_error,
             "multipliers_fit_2p1z": {
@@ -144,7 +144,7 @@ def table(summary: dict) -> str:
 
     rows.append(f"  {'Jacobian of the return map':38}{true[0]:>28.9f}")
     for name, family in summary["families"].items():
-        z = nearest(_number(v) for v in family["multipliers_from_linearisation"])
+        z = nearest(_number(v) for v in family["multipliers_from_linearization"])
         row(f"product of A[n], {name}", z, abs(z - true[0]))
         for output, fit in family["multipliers_fit_2p1z"].items():
             z = nearest(_number(v) for v in fit["multipliers"])
