@@ -67,6 +67,7 @@ def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
 def trials(tmp_path, hopper_cycle):
     """What the README's recording is read from."""
     force = [hj.testing.random_force(200, 100, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
+    force = np.stack(force)
     made = hj.testing.simulate_recording(hopper_cycle, force, OUTPUTS, rate=100, steps=1)
     for name, trial in zip(("trial1", "trial2"), made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
