@@ -56,7 +56,12 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle(resting):
 
 def test_sections_may_be_constants_of_several_compiled_functions(resting):
     """Charts hold what the system computes for them, which belongs to the function's trace."""
-    response = hj.response_function(resting, hj.ClockPhase(4), "x")
-    u = jnp.zeros((2, 8, 1)).at[1, 0].set(0.1)
-    alone, together = eqx.filter_jit(lambda u: response(u).y), jax.jit(lambda u: 2 * response(u).y)
-    np.testing.assert_allclose(together(u), 2 * alone(u), rtol=1e-12)
+    placed = hj.place_sections(resting, hj.ClockPhase(4))
+    placed = eqx.tree_at(lambda p: p.cycle.system, placed, Resting(damping=1.1))
+
+    def field(q):
+        return placed.structure().field(0, 0.0, q, jnp.zeros(1))
+
+    q = jnp.array([0.1, 0.2, 0.3])
+    twice = jax.jit(lambda q: 2 * field(q))(q)
+    np.testing.assert_allclose(twice, 2 * jax.jit(field)(q), rtol=1e-12)

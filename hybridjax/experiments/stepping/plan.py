@@ -81,7 +81,7 @@ class Plan(eqx.Module):
     slack: Float[Array, " N"]
     weight: Float[Array, " N"]
 
-    def stride(self, k, lanes: int) -> Stride:
+    def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
         """How `lanes` lanes set out from section k."""
         fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
