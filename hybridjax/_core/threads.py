@@ -9,19 +9,13 @@ from typing import Any
 
 import jax
 
-from ..errors import DefinitionError
 from .device import on_cpu
 from .precision import require_x64
 
 
 def thread_count(workers: int | None) -> int:
-    """How many threads to use: by default all cores on CPU, and one on an accelerator.
-
-    **Raises:** `DefinitionError` for numbers below one.
-    """
+    """How many threads to use: by default all cores on CPU, and one on an accelerator."""
     if workers is not None:
-        if workers < 1:
-            raise DefinitionError(f"workers is the number of threads, not {workers}.")
         return workers
     return _cores() if on_cpu() else 1
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from tqdm import tqdm
 
 from .._core.compilation.compile import quick_jit
@@ -20,12 +20,13 @@ from ..maps.place import PATIENCE, as_placed
 from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
-from ..systems.structure import Outputs, Structure
+from ..systems.structure import Outputs
 from .batches import compiling, divide, in_batches
 from .data import ExperimentData, Simulated
+from .design.design import DISCARD
 from .events import EventTimes, in_order
-from .flow_batch import EventLog, flow_batch, observe
-from .inputs import DISCARD, DesignLike, Inputs, check_inputs
+from .flow_batch import IntervalEvents, flow_batch
+from .inputs import DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
 from .options import Options
 from .start import CycleStart, Start, SteadyStart, predict_start
@@ -122,7 +123,7 @@ class Campaign:
             others.append((part.result, part.failed_at, part.error, part.log))
         *each, logs = zip(*others, strict=True)
         result, failed_at, error = map(np.concatenate, each)
-        log = EventLog(*map(np.concatenate, zip(*logs, strict=True))) if capacity else None
+        log = IntervalEvents(*map(np.concatenate, zip(*logs, strict=True))) if capacity else None
         error = error.astype(float) + stepping.rounding
         return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, log
 
@@ -138,9 +139,9 @@ class Campaign:
         )
 
     def _cycle_outputs(self) -> Float[np.ndarray, "N ny"]:
-        return np.asarray(_outputs_on_cycle(self.placed, tuple(self.outputs.items)))
+        return np.asarray(self.placed.observe(self.outputs.items))
 
-    def _cycle_log(self) -> EventLog:
+    def _cycle_log(self) -> IntervalEvents:
         """The events of one period of the limit cycle, by the same steps as in experiments."""
         placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
         start = CycleStart(placed).states(np.zeros((1, 0, 0)), 0)
@@ -151,12 +152,14 @@ class Campaign:
         ).log
         return log
 
-    def _events(self, log: EventLog | None, cycle_log: EventLog | None) -> EventTimes | None:
+    def _events(
+        self, log: IntervalEvents | None, cycle_log: IntervalEvents | None
+    ) -> EventTimes | None:
         if log is None or cycle_log is None:
             return None
         N, period = self.placed.n_sections, np.asarray(self.placed.cycle.period)
         own, cycle = (in_order(x, N, float(period)) for x in (log, cycle_log))
-        names = tuple(t.name for t in Structure(self.placed.cycle.system).transitions)
+        names = tuple(t.name for t in self.placed.structure().transitions)
         return EventTimes(*own, cycle.time[0], cycle.event[0], period, n_sections=N, names=names)
 
 
@@ -174,7 +177,7 @@ def prepare(
     """
     placed = as_placed(cycle, sections)
     require_x64(cycle)
-    z = Structure(cycle.system).resolve_outputs(outputs)
+    z = placed.structure().resolve_outputs(outputs)
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
@@ -246,13 +249,6 @@ def _compiling_ahead(
     N, m = placed.n_sections, 1 + placed.lanes.q.shape[0]
     plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
     start, u = jnp.asarray(np.zeros((m, shape[0]))), jnp.asarray(np.zeros(shape))
-    s = Structure(placed.cycle.system)
+    s = placed.structure()
     settings = Settings(1.0, 1.0, PATIENCE, np.ones((len(s.charts), s.d)))
     return compiling(program, (placed, plan, start, u, tuple(z.items), settings, 0), execution)
-
-
-@quick_jit
-def _outputs_on_cycle(placed: PlacedSections, outputs) -> Float[Array, "N ny"]:
-    s = Structure(placed.cycle.system)
-    u = jnp.zeros((s.nu, placed.n_sections))
-    return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T

@@ -22,7 +22,7 @@ class Simulated(eqx.Module):
 
     - `failed_at`: (S,) the sample at which an experiment failed, -1 where it did not.
     - `error`: (S,) estimates of the largest error of the states at any section, relative to their
-      sizes on the cycle, or None.
+      sizes (`LimitCycle.scale`), or None.
     - `events`: when events happened, or None.
     """
 
@@ -102,7 +102,7 @@ class ExperimentData(eqx.Module):
         S, n, _ = self.u.shape
         N, P, ny = self.n_sections, self.periods, self.y.shape[2]
         if N < 1 or P < 1:
-            raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
+            raise DefinitionError(f"n_sections ({N}) and periods ({P}) must be at least 1.")
         if n % N:
             raise DefinitionError(
                 f"the record has {n} samples, not a multiple of N = {N} sections: cut it to whole "
@@ -154,8 +154,8 @@ class ExperimentData(eqx.Module):
 
     @property
     def error(self) -> Float[np.ndarray, " S"]:
-        """Estimates of the largest error of a simulation, relative to the sizes of the states on
-        the cycle; NaN if not known."""
+        """Estimates of the largest error of a simulation, relative to the sizes of the states
+        (`LimitCycle.scale`); NaN if not known."""
         known = None if self.simulated is None else self.simulated.error
         return np.full(len(self.u), np.nan) if known is None else known
 

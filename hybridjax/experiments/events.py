@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .flow_batch import EventLog
+from .flow_batch import IntervalEvents
 
 
 class ExperimentEvent(NamedTuple):
@@ -85,7 +85,7 @@ class EventList(NamedTuple):
     sample: Int[np.ndarray, "S E"]
 
 
-def in_order(log: EventLog, n_sections: int, period: float) -> EventList:
+def in_order(log: IntervalEvents, n_sections: int, period: float) -> EventList:
     """Events one after the other from those between sections, without gaps."""
     time, event, count = (np.asarray(x) for x in log)
     S, n, K = time.shape

@@ -15,16 +15,15 @@ from ..engine.settings import Settings
 from ..maps.outputs import observe
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
-from ..systems.structure import Structure
 from .stepping.plan import Plan
 
 
 # The error that rounding alone may leave at a section, relative to the states' scales. Twice as
 # much is seen in `error` only where accuracies near 1e-13 are asked for.
-ROUNDING = 1e-13
+_LEAST_ERROR = 1e-13
 
 
-class EventLog(NamedTuple):
+class IntervalEvents(NamedTuple):
     """Events of S experiments between consecutive sections, the first K of each interval."""
 
     time: Float[Array, "S n K"]
@@ -49,7 +48,7 @@ class Response(NamedTuple):
     end: Float[Array, "S m"]
     """Times and states on section 0 after the last sample, the time counted within one period as
     that of the start is; NaN after a failure."""
-    log: EventLog | None
+    log: IntervalEvents | None
     """Events, if they were asked for."""
 
 
@@ -69,8 +68,7 @@ def flow_batch(
     sections are kept. Differentiable in both modes; reverse mode stores the states at the sections,
     and computes what lies between them again.
     """
-    system, cycle = placed.cycle.system, placed.cycle
-    s = Structure(system)
+    s, cycle = placed.structure(), placed.cycle
     z = s.resolve_outputs(outputs)
     N, (S, n, _) = placed.n_sections, u.shape
     one_turn = len(cycle.event_sequence)
@@ -113,12 +111,12 @@ def flow_batch(
     (lanes, result), (y, ok, shares, log) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = ROUNDING + jnp.max(each_turn, axis=0)
+    error = _LEAST_ERROR + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
     y, log = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x, -1, 0), (y, log))
     return Response(y, result, failed_at, error, end.T, log)
 
 
-def _log(moved: Moved, beginning: Float[Array, " 1"]) -> EventLog:
+def _log(moved: Moved, beginning: Float[Array, " 1"]) -> IntervalEvents:
     """The events on the way to one section, time counted from `beginning`."""
-    return EventLog(moved.log.time - beginning, moved.log.event, moved.log.count)
+    return IntervalEvents(moved.log.time - beginning, moved.log.event, moved.log.count)

@@ -11,9 +11,6 @@ from .design.design import Design
 
 DesignLike = Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"]
 
-# Cycles at the start of experiments from the limit cycle that are discarded where nothing else is
-# said (the paper's). Twice as many square what is left of the transient.
-DISCARD = 20
 # Experiments whose inputs are looked at together for NaN, since an array may lie on disk. Twice as
 # many take twice the memory.
 _LOOK = 1024

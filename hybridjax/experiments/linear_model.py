@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from .data import ExperimentData
-from .design.design import Design
-from .inputs import DISCARD
+from .design.design import DISCARD, Design
 from .noise import ProcessNoise
 
 

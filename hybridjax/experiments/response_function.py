@@ -15,7 +15,6 @@ from ..maps.place import as_placed
 from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
-from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .flow_batch import Response, flow_batch
 from .stepping.plan import Stepping, plan_flow
@@ -98,7 +97,7 @@ def response_function(
     """
     placed = as_placed(cycle, sections)
     require_x64(cycle)
-    z = Structure(cycle.system).resolve_outputs(outputs)
+    z = placed.structure().resolve_outputs(outputs)
     stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS_PER_PERIOD // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)

@@ -13,7 +13,7 @@ from .campaign import chunks, prepare
 from .data import ExperimentData
 from .inputs import DesignLike
 from .noise import ProcessNoise
-from .options import Options, OptionsByName, Start
+from .options import Options, OptionsByName, StartName, options_of
 
 
 # Experiments in one part of a stream. Twice as many need twice the memory.
@@ -26,7 +26,7 @@ def run_experiments(
     design: DesignLike,
     outputs: Sequence[str | Output] | str | Output,
     *,
-    start: Start = "cycle",
+    start: StartName = "cycle",
     discard: int | None = None,
     process_noise: ProcessNoise | None = None,
     accuracy: float | None = None,
@@ -53,7 +53,7 @@ def run_experiments(
         default 20 from the cycle (the paper's) and 0 from a periodic start.
     - `process_noise`: a random input beside the excitation, which is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
-        every section, relative to their largest sizes on the cycle. By default 1e-9, and 1e-4 in
+        every section, relative to their sizes (`LimitCycle.scale`). By default 1e-9, and 1e-4 in
         single precision. `data.error` is each experiment's own estimate.
     - `record_events`: whether to record when events happen, as `data.events`.
     - `execution`: batches, threads, precision, and whether to show a progress bar.
@@ -90,8 +90,10 @@ def stream_experiments(
     **Returns:** an iterator over `ExperimentData` of consecutive experiments; each chunk is run
     when it is asked for.
 
-    **Raises:** as `run_experiments`; for arguments that do not fit together at once.
+    **Raises:** as `run_experiments`; for arguments that do not fit together at once; `TypeError`
+    for an argument that does not exist.
     """
-    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
+    chosen = options_of(stream_experiments, options)
+    campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
     parts = chunks(len(campaign.inputs), chunk)
     return map(campaign.run, tqdm(parts, "chunks", disable=not campaign.execution.progress))

@@ -16,8 +16,8 @@ from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
-from . import options
 from .batches import in_batches
+from .options import StartName
 from .steady import Prediction
 from .stepping.plan import Stepping
 
@@ -26,7 +26,7 @@ from .stepping.plan import Stepping
 class CycleStart:
     """All experiments start on the limit cycle."""
 
-    name: ClassVar[options.Start] = "cycle"
+    name: ClassVar[StartName] = "cycle"
     placed: PlacedSections
 
     def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
@@ -44,7 +44,7 @@ class PeriodicStart:
     **Fields:** `model`, the linearization at `placed`; `periods` of the window that repeats.
     """
 
-    name: ClassVar[options.Start] = "periodic"
+    name: ClassVar[StartName] = "periodic"
     placed: PlacedSections
     model: LDTP
     periods: int
@@ -67,7 +67,7 @@ class SteadyStart:
     **Fields:** `program`, `settle_batch` compiled; `stepping` and `execution`, how it is run.
     """
 
-    name: ClassVar[options.Start] = "steady"
+    name: ClassVar[StartName] = "steady"
     predicted: PeriodicStart
     stepping: Stepping
     execution: Execution

@@ -23,7 +23,7 @@ from .stepping.plan import Plan
 MOST_STEPS = 12
 
 
-class Settled(NamedTuple):
+class NewtonState(NamedTuple):
     """Where Newton's method has come to, for S experiments."""
 
     start: Float[Array, "m S"]
@@ -40,7 +40,7 @@ def settle(
     size: Float[Array, "m #S"],
     accuracy: float | Float[Array, ""],
     slope: Float[Array, "S m m"] | None = None,
-) -> Settled:
+) -> NewtonState:
     """Newton's method for all experiments side by side, until no step is larger than `accuracy`
     times `size`. An experiment that is done stays where it is.
 
@@ -57,10 +57,10 @@ def settle(
         on = settled.change > accuracy  # not where it is NaN
         move, slope = step(settled.start)
         change = jnp.max(jnp.abs(move) / size, axis=0)
-        new = Settled(settled.start + move, change, slope)
+        new = NewtonState(settled.start + move, change, slope)
         return jax.tree_util.tree_map(lambda x, y: _choose(on, x, y), new, settled), k + 1
 
-    begin = Settled(start, jnp.full(start.shape[1], jnp.inf), slope)
+    begin = NewtonState(start, jnp.full(start.shape[1], jnp.inf), slope)
     return jax.lax.while_loop(unfinished, advance, (begin, 0))[0]
 
 

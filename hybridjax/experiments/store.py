@@ -7,6 +7,7 @@ each chunk, an `ExperimentData` as `save` writes it. A chunk appears complete or
 import dataclasses
 import hashlib
 import json
+import operator
 import os
 import uuid
 import zipfile
@@ -28,15 +29,20 @@ from .campaign import Campaign, chunks, prepare
 from .data import ExperimentData, summary
 from .design.design import Design
 from .inputs import DesignLike
-from .options import Options, OptionsByName
+from .options import OptionsByName, options_of
 from .run import CHUNK
 
 
 _MANIFEST = "experiments.json"
-_FORMAT = "hybridjax experiments 2"
-# Cycles found on different machines are the same up to this, relative to their size. Twice as much
-# takes cycles for the same that differ twice as much.
+_FORMAT = "hybridjax experiments 3"
+# Cycles found on different machines are the same up to this: their times relative to the period,
+# their states relative to the states' sizes. Twice as much takes cycles for the same that differ
+# twice as much.
 _SAME_CYCLE = 1e-7
+# Sizes of states, which accuracies are relative to, are the same up to this factor: the size of a
+# state that rests at zero is that of rounding errors, which differ from machine to machine. Twice
+# as much takes accuracies for the same that differ twice as much.
+_SAME_SIZES = 4.0
 
 
 def store_experiments(
@@ -65,13 +71,14 @@ def store_experiments(
     **Returns:** `StoredExperiments`.
 
     **Raises:** `DefinitionError` if the folder holds experiments on another system, cycle, family
-    or design, or cannot be written; `FileFormatError` for a chunk that is damaged; and as
-    `run_experiments`.
+    or design, or cannot be written; `FileFormatError` for a chunk that is damaged; `TypeError`
+    for an argument that does not exist; and as `run_experiments`.
     """
     rank, size = share
     if not 0 <= rank < size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
-    campaign = prepare(cycle, sections, design, outputs, Options(**options), chunk)
+    chosen = options_of(store_experiments, options)
+    campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
     parts = chunks(len(campaign.inputs), chunk)
     folder = Path(folder)
     _open(folder, _describe(campaign, chunk))
@@ -178,14 +185,8 @@ def _open(folder: Path, about: dict[str, Any]) -> None:
         raise DefinitionError(f"cannot write to '{folder}': {error.strerror}.") from error
     assert there is not None
     for name, value in about.items():
-        if name == "cycle":
-            mine, theirs = np.asarray(value), np.asarray(there.get(name))
-            same = mine.shape == theirs.shape and bool(
-                np.allclose(mine, theirs, rtol=_SAME_CYCLE, atol=_SAME_CYCLE * np.abs(mine).max())
-            )
-        else:
-            same = there.get(name) == value
-        if not same:
+        same = _same_cycle if name == "cycle" else operator.eq
+        if not same(value, there.get(name)):
             raise DefinitionError(
                 f"'{folder}' holds other experiments (its `{name}` is not the same): give these "
                 "a folder of their own."
@@ -232,10 +233,26 @@ def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
         "accuracy": stepping.accuracy,
         "precision": campaign.execution.precision,
         "design": digest,
-        "cycle": np.concatenate(
-            [np.ravel(x) for x in (placed.cycle.period, lanes.t, lanes.q, stepping.scales)]
-        ).tolist(),
+        "cycle": {
+            "points": np.concatenate([lanes.t[None], lanes.q]).T.tolist(),
+            "scales": np.asarray(stepping.scales).tolist(),
+        },
     }
+
+
+def _same_cycle(mine: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether the sections lie on the same cycle; each is described by its points (t, q) at the
+    sections and by the scales of these, of which that of time is the period."""
+    points, scales = np.array(mine["points"]), np.array(mine["scales"])
+    if points.shape != np.shape(theirs["points"]):
+        return False
+    apart = np.abs(points - theirs["points"]) / scales
+    ratio = np.array(theirs["scales"]) / scales
+    period, sizes = ratio[:, 0], ratio[:, 1:]
+    return bool(
+        max(np.max(apart), np.max(np.abs(period - 1))) <= _SAME_CYCLE
+        and np.all((sizes <= _SAME_SIZES) & (sizes >= 1 / _SAME_SIZES))
+    )
 
 
 def _identity(about: dict[str, Any]) -> str:

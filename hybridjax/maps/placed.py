@@ -64,7 +64,9 @@ class PlacedSections(eqx.Module):
         return jnp.append(self.lanes.t[0], self.lanes.q[:, 0])
 
     def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions, made anew."""
+        """The system by the indices of its charts and transitions, made anew: where the sections
+        are constants of compiled functions, it holds values of one trace that mean nothing in the
+        next."""
         return Structure(self.cycle.system)
 
     def observe(self, outputs: Sequence[str | Output] | str | Output) -> Float[Array, "N ny"]:

@@ -18,6 +18,12 @@ _LONGEST_GAP = 0.25
 _FASTEST_DRIFT = 4
 
 
+def check_drift(cycles: int | float) -> None:
+    """**Raises:** `DefinitionError` for a drift that is too fast to be told from responses."""
+    if not cycles >= _FASTEST_DRIFT:
+        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles}.")
+
+
 def without_drift(
     recording: Recording, phase: Phase, signals: str | Sequence[str], cycles: int | float
 ) -> Recording:
@@ -32,8 +38,7 @@ def without_drift(
     """
     signals = (signals,) if isinstance(signals, str) else signals
     columns = [recording.column(x) for x in signals]
-    if not cycles >= _FASTEST_DRIFT:
-        raise DefinitionError(f"drift takes four cycles or more, not {cycles}.")
+    check_drift(cycles)
     if len(phase.stretches) != len(recording.trials):
         raise DefinitionError(
             f"the phase is of {len(phase.stretches)} trials, the recording has "

@@ -54,7 +54,7 @@ def identify_recording(
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
     them.
 
-    **Arguments:** as for `section_data`, and
+    **Arguments:** as for `section_data`, of which `max_gap` keeps its default, and
 
     - `order`: the number of multipliers; None lets `choose_order` find it.
     - `drift`: changes that take longer than so many cycles are no response to the inputs: they are

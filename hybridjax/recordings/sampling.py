@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
+from .drift import check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
@@ -23,8 +24,6 @@ _GAP_SECTIONS, _GAP_SAMPLES = 1.0, 3.001
 # The number of sections where neither the call nor the phase says it. Doubled: half the time from
 # section to section, twice the bandwidth.
 _N_SECTIONS = 32
-# The least number of cycles that drift may take. Doubled: faster drift is refused.
-_FASTEST_DRIFT = 4
 # Rounding of the phase, in sections, at the ends of a stretch. Doubled: nothing changes.
 _ROUNDING = 1e-9
 
@@ -72,8 +71,8 @@ def section_data(
     inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _refuse_constant(recording, inputs, outputs)
-    if drift is not None and drift < _FASTEST_DRIFT:
-        raise DefinitionError(f"drift takes more than four cycles, not {drift}.")
+    if drift is not None:
+        check_drift(drift)
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if len(phase.stretches) != len(recording.trials):

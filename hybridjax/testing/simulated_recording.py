@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..engine.settings import EXPERIMENT
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
@@ -17,11 +18,11 @@ from ..systems.output import Output
 def simulate_recording(
     cycle: LimitCycle,
     force: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
-    outputs: Sequence[str | Output],
+    outputs: Sequence[str | Output] | str | Output,
     *,
     rate: int | float = 500,
     steps: int = 4,
-    accuracy: float = 1e-9,
+    accuracy: float = EXPERIMENT,
 ) -> Recording:
     """What instruments would see of a system that is perturbed by a force, given as samples.
 
@@ -51,7 +52,7 @@ def simulate_recording(
     u = u.reshape(S, -1, nu)
     response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
     y = np.asarray(_respond(response, jnp.asarray(u)))[:, ::steps]
-    names = tuple(x if isinstance(x, str) else x.name for x in outputs)
+    names = tuple(x if isinstance(x, str) else x.name for x in response.outputs)
     time = np.arange(y.shape[1]) * period / K
     trials = []
     for s in range(S):

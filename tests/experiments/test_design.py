@@ -171,10 +171,12 @@ def test_bad_arguments_of_a_design(message, arguments):
     {
         "must lie in": dict(band=(0, 17.0)),
         "the band from 3.0 to 2.0": dict(band=(3.0, 2.0)),
-        "periods .* must be at least 1": dict(periods=-2),
+        "n_sections .32. and periods .-2. must be at least 1": dict(periods=-2),
         "not a positive number": dict(amplitude=0.0),
         "more than the 620": dict(experiments=621),
-        "wider band": dict(band=(0, 0.01)),
+        "no multiple of 1/64 other than those of 1/2 lies": dict(band=(0, 0.01)),
+        "no odd multiple of 1/64 other than those of 1/2": dict(band=(0, 0.01), lines="odd"),
+        "no multiple of 1/64 lies": dict(band=(0.001, 0.01), lines="two-phase"),
         "need at least 40 for 2 inputs": dict(experiments=39, inputs=2),
     }.items(),
 )

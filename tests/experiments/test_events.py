@@ -5,7 +5,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments.events import in_order
-from hybridjax.experiments.flow_batch import EventLog
+from hybridjax.experiments.flow_batch import IntervalEvents
 
 
 N, PERIOD = 2, 10.0
@@ -24,7 +24,7 @@ def events():
     )
     count = np.array([[1, 1, 1, 1], [0, 2, 1, 0]])
     event = np.where(time < 6, 0, 1)
-    listed = in_order(EventLog(time, event, count), N, PERIOD)
+    listed = in_order(IntervalEvents(time, event, count), N, PERIOD)
     return hj.experiments.EventTimes(
         *listed, CYCLE, np.array([0, 1]), np.array(PERIOD), n_sections=N, names=("up", "down")
     )

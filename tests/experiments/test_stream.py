@@ -3,6 +3,7 @@
 All runs have batches of 40 experiments of 84 cycles, as in `test_run`: one program is compiled.
 """
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments import store
 from hybridjax.experiments.batches import divide
 
 from ..conftest import OUTPUTS, no_compilation
@@ -204,6 +206,45 @@ def test_folders_without_experiments(tmp_path, arguments):
 def test_bad_numbers(arguments, tmp_path, change, message):
     with pytest.raises(hj.DefinitionError, match=message):
         hj.experiments.store_experiments(tmp_path, *arguments, **BATCH | change)
+
+
+def test_arguments_that_do_not_exist(arguments, tmp_path):
+    with pytest.raises(
+        TypeError, match="stream_experiments has no argument 'stat'; .* chunk, start"
+    ):
+        hj.experiments.stream_experiments(*arguments, stat="cycle")
+    with pytest.raises(TypeError, match="store_experiments has no argument 'works'.* share, start"):
+        hj.experiments.store_experiments(tmp_path, *arguments, works=2)
+
+
+@pytest.mark.parametrize(
+    ("part", "entry", "change", "same"),
+    [
+        ("points", 0, 1e-9, True),
+        ("points", 0, 1e-6, False),
+        ("points", 2, 1e-9, True),
+        ("points", 2, 1e-6, False),
+        ("scales", 0, 1e-6, False),
+        ("scales", 2, 1.0, True),
+        ("scales", 2, 9.0, False),
+    ],
+)
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+def test_each_part_of_a_cycle_is_compared_in_its_own_size(
+    tmp_path, part, entry, change, same, unit
+):
+    """(t, q) and what counts as 1 in each; sizes of states that rest are those of rounding."""
+    scales = np.array([[1.0, 2.0, unit], [1.0, 2.0, unit]])
+    cycle = {"points": 0.3 * scales, "scales": scales}
+    about = {"format": store._FORMAT, "cycle": {k: x.tolist() for k, x in cycle.items()}}
+    store._open(tmp_path, about)
+    cycle[part] = cycle[part].copy()
+    cycle[part][1, entry] += change * scales[1, entry]
+    about["cycle"] = {k: x.tolist() for k, x in cycle.items()}
+    with (
+        contextlib.nullcontext() if same else pytest.raises(hj.DefinitionError, match="its `cycle`")
+    ):
+        store._open(tmp_path, about)
 
 
 def test_estimates_of_parts_that_do_not_fit_together(whole):

@@ -147,3 +147,13 @@ def test_other_bad_files(tmp_path):
         hj.read_recording(tmp_path / "b.csv")
     with pytest.raises(hj.DefinitionError, match="no file to read"):
         hj.read_recording()
+
+
+def test_a_simulated_recording_of_one_output(hopper_cycle):
+    made = [
+        hj.testing.simulate_recording(hopper_cycle, np.zeros((1, 9, 1)), outputs, rate=8, steps=1)
+        for outputs in ("yM", ("yM",))
+    ]
+    for recording in made:
+        assert recording.signals == ("u", "yM")
+    np.testing.assert_array_equal(made[0].trials[0].values, made[1].trials[0].values)

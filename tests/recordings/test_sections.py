@@ -61,7 +61,7 @@ def test_slow_drift_is_taken_out(wave):
     assert sample(flat).rms()[1][0] < 0.02
     assert sample(flat).records[0].drift == np.inf and sample(flat, drift=9).records[0].drift == 9
     for phase, cycles, message in [
-        (rough, 3, "four cycles or more"),
+        (rough, 3, "4 cycles or more, not 3"),
         (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
@@ -88,7 +88,7 @@ def test_bad_arguments(wave):
         ({"inputs": "g"}, "no signal 'g'"),
         ({"n_sections": 16}, "n_sections is 16, but the phase is that of a family of 8"),
         ({"n_sections": 0, "phase": lambda t, s: 2 * np.pi * t}, "one section or more"),
-        ({"drift": 1}, "more than four cycles"),
+        ({"drift": 1}, "4 cycles or more, not 1"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             sample(wave, **options)

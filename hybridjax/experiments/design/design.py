@@ -15,6 +15,19 @@ from .partition import check_sharing, is_real, meets_itself, regular
 Number = int | float
 Numbers = Sequence[Number] | np.ndarray
 
+# Cycles at the start of experiments from the limit cycle that are discarded where nothing else is
+# said (the paper's). Twice as many square what is left of the transient.
+DISCARD = 20
+# Phases of a line are all the same if the mean of exp(2i phase) is this close to 1 in modulus.
+# Twice as much refuses phases that differ by 1.4 times as much.
+_SAME_PHASES = 1e-6
+# A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Twice as much refuses
+# signals that are twice as large.
+_VANISHING = 1e-3
+# Lines are multiples of 1/P up to this, in lines. Twice as much takes frequencies for multiples
+# that are twice as far from one.
+_OFF_LINE = 1e-6
+
 
 class Design(eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
@@ -118,7 +131,7 @@ class Design(eqx.Module):
         """
         P, N = self.periods, self.n_sections
         if N < 1 or P < 1:
-            raise DefinitionError(f"sections ({N}) and periods ({P}) must be at least 1.")
+            raise DefinitionError(f"n_sections ({N}) and periods ({P}) must be at least 1.")
         empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
         if len(empty) or len(self.experiment) == 0:
             raise DefinitionError("every experiment of a design needs at least one frequency.")
@@ -144,13 +157,13 @@ class Design(eqx.Module):
         power, square = np.bincount(group, np.abs(u) ** 2), u**2
         alike = np.hypot(np.bincount(group, square.real), np.bincount(group, square.imag)) / power
         self._refuse(
-            (meets_itself(self.line, P, N, highest) & (alike > 1 - 1e-6)[group]),
+            (meets_itself(self.line, P, N, highest) & (alike > 1 - _SAME_PHASES)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (multisine(lines='two-phase') does so), or "
             "leave it out",
         )
         self._refuse(
-            is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < 1e-3),
+            is_real(self.line, P, N) & (np.abs(np.cos(self.phase)) < _VANISHING),
             "is zero at every section with this phase: give it the phase 0",
         )
 
@@ -283,7 +296,7 @@ class Design(eqx.Module):
         with np.errstate(divide="ignore"):
             return 4 * noise**2 / (samples * power)
 
-    def cycles(self, discard: int = 20) -> int:
+    def cycles(self, discard: int = DISCARD) -> int:
         """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
         return self.experiments * (self.periods + discard)
 
@@ -330,7 +343,7 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
         raise DefinitionError(f"periods must be at least 1, not {periods}.")
     exact = np.asarray(frequencies, float) * periods
     lines = np.rint(exact)
-    wrong = ~(np.abs(exact - lines) < 1e-6)
+    wrong = ~(np.abs(exact - lines) < _OFF_LINE)
     if wrong.any():
         f = float(np.asarray(frequencies)[np.argmax(wrong)])
         raise DefinitionError(

@@ -22,6 +22,10 @@ from .partition import (
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
 
+# Rounding of the edges of a band, in lines. Twice as much changes nothing unless an edge lies that
+# close to a line.
+_EDGE = 1e-9
+
 
 def multisine(
     n_sections: int = 32,
@@ -174,7 +178,7 @@ def _lines(n_sections: int, periods: int, band: tuple[Number, Number], lines: Li
     """The lines j of a band."""
     if n_sections < 1 or periods < 1:
         raise DefinitionError(
-            f"sections ({n_sections}) and periods ({periods}) must be at least 1."
+            f"n_sections ({n_sections}) and periods ({periods}) must be at least 1."
         )
     f_min, f_max = band
     if not 0 <= f_min <= f_max <= n_sections / 2:
@@ -182,16 +186,17 @@ def _lines(n_sections: int, periods: int, band: tuple[Number, Number], lines: Li
             f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}] cycles per "
             "period."
         )
-    low, high = int(np.ceil(f_min * periods - 1e-9)), int(np.floor(f_max * periods + 1e-9))
+    low, high = int(np.ceil(f_min * periods - _EDGE)), int(np.floor(f_max * periods + _EDGE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~is_half_integer(j, periods)]
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:
+        which = f"{'odd ' * (lines == 'odd')}multiple of 1/{periods}"
+        but = "" if lines == "two-phase" else " other than those of 1/2"
         raise DefinitionError(
-            f"no multiple of 1/{periods} other than those of 1/2 lies between {f_min} and {f_max}: "
-            "take more periods or a wider band."
+            f"no {which}{but} lies between {f_min} and {f_max}: take more periods or a wider band."
         )
     return j
 

@@ -19,6 +19,12 @@ from jaxtyping import Bool, Complex, Int
 from ...errors import DefinitionError
 
 
+# Normal equations are singular if, with unknowns scaled to size 1, the least eigenvalue is below
+# this, or if one unknown's size is below this part of another's. Twice as much refuses experiments
+# that tell inputs apart 1.4 times as well.
+_SINGULAR = 1e-6
+
+
 def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
     """`min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between two."""
     rest = line % periods
@@ -61,10 +67,10 @@ def _around(lines: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Int[
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Whether normal equations can be solved, whatever the sizes of the unknowns."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    there = size.min(axis=1) > 1e-6 * size.max(axis=1)
+    there = size.min(axis=1) > _SINGULAR * size.max(axis=1)
     size = np.where(there[:, None], size, 1.0)
     least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
-    return there & (least > 1e-6)
+    return there & (least > _SINGULAR)
 
 
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:

@@ -22,7 +22,6 @@ from ...engine.watch import watch
 from ...errors import DefinitionError
 from ...maps.place import PATIENCE
 from ...maps.placed import PlacedSections
-from ...systems.structure import Structure
 
 
 # Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
@@ -51,6 +50,12 @@ _CAUTION = 3.0
 # Errors of different sections cancel in part; credit for it is given up to this ratio. Twice as
 # much lets estimates be half as large where nearly everything cancels.
 _MOST_CANCELLATION = 30.0
+# Error estimates, and the room that steps have for them, are at least this part of the tolerance.
+# Twice as much counts twice the error estimate of steps that are all but exact.
+_LEAST_SHARE = 1e-6
+# Bounds on the time to the next level as a multiple of Newton's guess, beyond which the guess means
+# nothing. Twice as wide, worse guesses set the length of the last step.
+_LEAST_LEAD, _LARGEST_LEAD = 0.3, 3.0
 # Errors per section that are taken for granted, relative to the states' scales: a few units in the
 # last place. Twice as much changes nothing above accuracies of 1e-13.
 _ROUNDING = 1e-15
@@ -64,7 +69,8 @@ class Plan(eqx.Module):
 
     **Fields:**
 
-    - `h`: first step; `lead`, `slack`: see `engine.search.stride.Stride`.
+    - `h`: first step. `lead`: time to section k + 1 as a multiple of Newton's guess at section k.
+    - `slack`: a step's error estimate may be this many times the tolerance.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
         cycle and relative to the states' scales: the largest that it ever leads to at a later
         section, summed over all periods as if each made the same error.
@@ -75,7 +81,7 @@ class Plan(eqx.Module):
     slack: Float[Array, " N"]
     weight: Float[Array, " N"]
 
-    def stride(self, k, lanes: int) -> Stride:
+    def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
         """How `lanes` lanes set out from section k."""
         fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
@@ -100,7 +106,7 @@ def make_plan(
         error[..., 0] = 0.0
     impact = np.maximum(_impact(J, error, scale), _ROUNDING)
     impact = np.where(np.isnan(impact), np.inf, impact)
-    estimate = np.maximum(ways.estimate, 1e-6)
+    estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 
     # The largest share of the accuracy for each section that keeps their sum.
     section = np.arange(N)
@@ -109,7 +115,7 @@ def make_plan(
         total = impact[best, section].sum()
         if total <= accuracy:
             break
-    spare = np.clip(accuracy / total, 1e-6, _MOST_SLACK)
+    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
     impact, estimate = impact[best, section], estimate[best, section]
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
     together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
@@ -153,7 +159,7 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
     by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
     rtol = jnp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
-    s = Structure(placed.cycle.system)
+    s = placed.structure()
     u = jnp.zeros((s.nu, N))
 
     def block(xs):
@@ -181,14 +187,14 @@ def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray,
 
 def _lead(placed: PlacedSections, target):
     """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
-    s, lanes = Structure(placed.cycle.system), placed.lanes
+    s, lanes = placed.structure(), placed.lanes
     N = placed.n_sections
     everywhere = jnp.ones(N, bool)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)), target, everywhere)
     value, rate = seen.value[-1], seen.rate[-1]
     falls = (value > 0) & (rate < 0)
     lead = placed.duration * jnp.where(falls, -rate / jnp.where(falls, value, 1.0), 0.0)
-    return jnp.where((lead > 0.3) & (lead < 3.0), lead, 1.0)
+    return jnp.where((lead > _LEAST_LEAD) & (lead < _LARGEST_LEAD), lead, 1.0)
 
 
 def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
@@ -215,27 +221,13 @@ def _accumulated(J, error, scale) -> float:
     return largest
 
 
-def state_sizes(placed: PlacedSections) -> Float[np.ndarray, "A d"]:
-    """Sizes of states, by chart: the largest that a state of this name has at any section, in any
-    chart; 1 for one that is always zero, and beyond a chart's dimension."""
-    s = Structure(placed.cycle.system)
-    chart, q = np.asarray(placed.lanes.chart), np.abs(np.asarray(placed.lanes.q))
-    sizes = np.ones((len(s.charts), s.d))
-    for name in s.state_names():
-        places = [(a, c.states.index(name)) for a, c in enumerate(s.charts) if name in c.states]
-        size = max((q[k, chart == a].max(initial=0.0) for a, k in places), default=0.0)
-        for place in places:
-            sizes[place] = size if size > 0 else 1.0
-    return sizes
-
-
 class Stepping(eqx.Module):
     """How lanes step from section to section, and how precise that is.
 
     **Fields:**
 
-    - `plan`, `settings`: first steps, and tolerances.
-    - `scales`: of time and states at each section.
+    - `plan`: how lanes set out from each section. `settings`: tolerances.
+    - `scales`: of time (the period) and of states (`LimitCycle.scale`) at each section.
     - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
     - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
     """
@@ -267,10 +259,11 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
     accuracy = float(accuracy)
 
     def make() -> Stepping:
-        sizes = state_sizes(placed)
-        settings = Settings(accuracy, accuracy, PATIENCE, sizes)
-        time = np.full((placed.n_sections, 1), float(placed.cycle.period))
-        scales = np.concatenate([time, sizes[np.asarray(placed.lanes.chart)]], axis=1)
+        cycle = placed.cycle
+        settings = Settings(accuracy, accuracy, PATIENCE, cycle.settings.scale)
+        time = np.full((placed.n_sections, 1), float(cycle.period))
+        sizes = np.asarray(cycle.return_map.sizes_in(placed.lanes.chart))
+        scales = np.concatenate([time, sizes], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
     return _made.recall(placed, accuracy, make)

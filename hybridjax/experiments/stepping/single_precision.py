@@ -17,7 +17,6 @@ from ...engine.search.stride import Stride
 from ...engine.settings import Settings
 from ...errors import DefinitionError
 from ...maps.placed import PlacedSections
-from ...systems.structure import Structure
 from .plan import Plan, Stepping, check_accuracy, plan_flow
 
 
@@ -27,6 +26,9 @@ _LANES = 32
 # Their distance from the cycle, relative to the states' scales. Twice as much shows more of the
 # curvature of section maps, which counts as if it were a rounding error.
 _DISTANCE = 1e-4
+# Directions in which lanes differ by less than this part of the most are left out of the fit of
+# section maps. Twice as much leaves out directions that are known twice as well.
+_INDEPENDENT = 1e-6
 # Rounding errors of a step's error estimate, in units of the last place of the state. Twice as many
 # let estimates be twice as large before a step is made shorter.
 _ROUNDINGS_PER_STEP = 8.0
@@ -74,7 +76,7 @@ def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:
     """
     scale = stepping.scales
     N, n = scale.shape
-    s, clocked = Structure(placed.cycle.system), placed.cycle.clocked
+    s, clocked = placed.structure(), placed.cycle.clocked
     moves = np.arange(n - 1) < np.array(s.dims)[np.asarray(placed.lanes.chart)][:, None]
     moves = np.concatenate([np.asarray(placed.time_is_state)[:, None], moves], axis=1)
     cycle = np.concatenate([placed.lanes.t[None], placed.lanes.q]).T
@@ -93,7 +95,7 @@ def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:
     if not clocked:
         added[..., 0] = 0.0
     x, z = (start - start.mean(axis=0)) / scale, ends - ends.mean(axis=0)
-    maps = [np.linalg.pinv(x[:, k], rcond=1e-6) @ z[:, k] for k in range(N)]
+    maps = [np.linalg.pinv(x[:, k], rcond=_INDEPENDENT) @ z[:, k] for k in range(N)]
     return _followed(np.array(maps), added)
 
 
@@ -127,7 +129,7 @@ def _sections(
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
     target = placed.target(i, lanes.t, turns)
     stride = Stride(plan.h[k], plan.lead[k], plan.slack[k])
-    s = Structure(placed.cycle.system)
+    s = placed.structure()
     moved = move(s, lanes, jnp.zeros((s.nu, L)), target, settings, stride)
     t = moved.lanes.t - turns * placed.cycle.period
     ends = jnp.concatenate([t[None], moved.lanes.q])
