@@ -102,7 +102,7 @@ def rounding_error(
     def change(shift):
         return jnp.abs(field(t * (1 + shift[0]), q * (1 + shift[1:, None])) - f)
 
-    changes = jax.lax.map(change, shifts)
+    changes = jax.vmap(change)(shifts)
     return jnp.max(jnp.where(jnp.isfinite(changes), changes, 0.0), axis=0)
 
 
