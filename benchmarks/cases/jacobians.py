@@ -40,7 +40,7 @@ def run(show, options) -> None:
         exact = _on_sections(task, full)
         for rtol in RTOL:
             name = f"{task.label}.program.rtol_{rtol:.0e}"
-            settings = hj.Settings(rtol=rtol, atol=rtol)
+            settings = hj.Settings(rtol, rtol, scale=task.cycle.settings.scale)
             cycle = dataclasses.replace(task.cycle, settings=settings)
             work = ft.partial(_program, hj.place_sections(cycle, task.placed.family))
             (A, B), compiling, seconds = first_and_later(work, repeat)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.precision import at_precision
+from ..errors import DefinitionError
 from .solver.step import Step
 
 
@@ -34,6 +35,10 @@ STEADY_START = 1e-10
 # Rounding errors of a time or a state, relative to it, in double and in single precision. Twice as
 # much: events that are as near to each other are taken for one.
 ROUNDING = 4e-15, 2e-6
+# A step may have an error of so many rounding errors of the rates at its end, as they are seen
+# there: those at its stages may be larger. Doubled, states at rounding level take fewer steps, and
+# all others may err twice as much where they are moved by large ones.
+_TIMES_ROUNDING = 10.0
 
 
 def _number(x) -> Array:
@@ -59,34 +64,38 @@ class Settings(eqx.Module):
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
     scale: Float[Array, "A d"] | None = eqx.field(converter=_numbers, default=None)
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
-    anything above zero. `None`: sizes are taken from each step (see `tolerance`)."""
+    anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
+    enough for derivatives."""
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
 
     def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
         """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`
-        is small, those that the states usually have (1 if that is not known)."""
+        is small, those that the states usually have, which must be known."""
+        if self.scale is None:
+            raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
         own = ft.reduce(jnp.maximum, map(jnp.abs, q))
-        usual = 1.0 if self.scale is None else self.scale[a, : len(own)].reshape(len(own), -1)
+        usual = self.scale[a, : len(own)].reshape(len(own), -1)
         return own + self.atol / self.rtol * usual
 
     def tolerance(
         self,
-        size: Float[Array, "n L"],
+        a: int,
         q: Float[Array, "n L"],
         tau: Float[Array, " #L"],
         step: Step,
+        rounding: Float[Array, "n L"],
     ) -> Float[Array, "n L"]:
-        """The error that a step of length tau from states `q` may have, where `size` is theirs.
+        """The error that a step over tau from states `q` of chart a may have.
 
         Where the usual sizes are not known, a state is taken to be as large as it is at the ends
-        of the step, or as it would become at the rates there if that is more, and rounding errors
-        of the largest of all states are allowed in each.
+        of the step, or as it would become at the rates there if that is more. Rounding errors are
+        allowed: its own, and the `rounding` errors of its rate.
         """
         if self.scale is not None:
-            return self.rtol * size
+            return self.rtol * self.size(a, q, step.q)
         own = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
         change = jnp.abs(tau) * jnp.maximum(jnp.abs(step.f0), jnp.abs(step.f1))
-        rounding = at_precision(*ROUNDING) * jnp.max(own, axis=0, initial=0.0)
+        rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * jnp.abs(tau) * rounding
         tolerance = self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
         return jnp.maximum(tolerance, jnp.finfo(own.dtype).tiny)  # where all is at rest at zero

@@ -7,12 +7,8 @@ import jax.numpy as jnp
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..orbits.newton import root
+from ..orbits.newton import MAX_STEPS, root
 from ..systems.system import HybridSystem
-
-
-# Newton steps before a candidate is given up. Doubled, hopeless ones take twice as long.
-_NEWTON_STEPS = 32
 
 
 def candidate_cycle(
@@ -25,10 +21,8 @@ def candidate_cycle(
     """
     if with_factors:
         return find_limit_cycle(system, guess)
-    map = dataclasses.replace(guess.return_map, system=system)
-    if guess.clocked:
-        map = dataclasses.replace(map, expected=guess.multiplicity * jnp.asarray(system.period()))
-    q, turn, steps = root(map, False, _NEWTON_STEPS)
+    map = guess.return_map.at_phase_of(system)
+    q, turn, steps = root(map, False, MAX_STEPS)
     period = map.expected if map.base is None else map.turn(q).period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
     return dataclasses.replace(

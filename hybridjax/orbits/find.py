@@ -23,18 +23,17 @@ from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .cycle import LimitCycle
-from .guess import begin, check_beginning, guessed_lane
+from .guess import begin, check_beginning, check_section, guessed_lane
 from .newton import Solution, solve
 from .return_map import ReturnMap
-from .scale import Sizes, alike, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
+from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the
 # states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
 _PATIENCE = 1000.0
-# Rough sizes are replaced by those that states have on the cycle if one of them is off by more than
-# this factor; where it was too large, the cycle is computed anew. Doubled, errors may be twice as
-# large.
+# A cycle is computed anew in the sizes that states have on it if a rough one was larger by more
+# than this factor. Doubled, errors may be twice as large.
 _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
@@ -76,7 +75,8 @@ def find_limit_cycle(
     **Arguments:**
 
     - `guess`: a rough `Guess`, by default the model's own. A `LimitCycle` of a similar system is
-        the best guess.
+        the best guess: a clocked system begins at the same phase of its own clock. It goes without
+        `settle` and `max_period`.
     - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
         flow. Newton starts at the guess if it lies on the section, else where the flow from the
@@ -92,7 +92,7 @@ def find_limit_cycle(
         thousand times that in which the states change at the guess.
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
-        do not depend on units.
+        do not depend on units (under a JAX transformation, on the guess).
     - `settings`: accuracy of the flow; 1e-12 by default.
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
@@ -113,14 +113,17 @@ def find_limit_cycle(
     settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
+    check_section(s, section)
+    if not traced:
+        check_beginning(system, multiplicity, settle, max_period)
     if isinstance(guess, LimitCycle):
-        _check_multiplicity(guess, multiplicity)
+        _check_fits(guess, s, multiplicity, settle, max_period)
         conserved = guess.conserved if conserved is None else conserved
-        multiplicity, base = guess.multiplicity, guess.base if section is None else section
         settings = _in_sizes(settings, s, given, guess.settings.scale)
-        anchor, expected = guess.anchor, guess.period
-        if guess.clocked:
-            expected = multiplicity * jnp.asarray(system.period(), float)
+        map = guess.return_map.at_phase_of(system)
+        map = dataclasses.replace(
+            map, settings=settings, base=map.base if section is None else section
+        )
     elif traced:
         raise DefinitionError(
             "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
@@ -129,7 +132,6 @@ def find_limit_cycle(
     else:
         multiplicity = 1 if multiplicity is None else multiplicity
         lane, period = guessed_lane(system, guess), system.period()
-        check_beginning(system, section, multiplicity, settle, max_period)
         near = sizes_near(
             system, int(lane.chart[0]), lane.t[0], lane.q[:, 0],
             None if period is None else float(period),
@@ -137,13 +139,14 @@ def find_limit_cycle(
         settings = _in_sizes(settings, s, near.sizes | given)
         max_period = _PATIENCE * near.time if max_period is None else float(max_period)
         anchor, base, expected = begin(
-            system, lane, section, multiplicity, settle, max_period, settings
+            system, lane, section, multiplicity, settle, max_period, settings, near.time
         )
+        map = ReturnMap(system, settings, anchor, base, expected, {}, multiplicity)
     conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
-    map = ReturnMap(system, settings, anchor, base, expected, conserved, multiplicity)
+    map = dataclasses.replace(map, conserved=conserved)
     if traced:
         return _cycle(map, solve(map, False, True), guess.event_sequence)
-    _check_values(system, anchor, conserved)
+    _check_values(system, map.anchor, conserved)
     map, solution = _in_own_sizes(map, _solve(map), given)
     codes = np.ravel(solution.turn.codes)
     cycle = _cycle(map, solution, tuple(int(g) for g in codes if g >= 0))
@@ -189,8 +192,6 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     rough = sizes_of(s, map.settings.scale)
     sizes = sizes_on(map.system, legs.t, legs.chart, legs.q, period)
     sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
-    if alike(sizes, rough, _OFF):
-        return map, solution
     expected = map.expected if map.base is None else solution.turn.period
     own = dataclasses.replace(
         map, settings=_in_sizes(map.settings, s, sizes), anchor=solution.anchor, expected=expected
@@ -215,10 +216,24 @@ def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) 
     )  # fmt: skip
 
 
-def _check_multiplicity(guess: LimitCycle, multiplicity: int | None) -> None:
+def _check_fits(
+    guess: LimitCycle,
+    s: Structure,
+    multiplicity: int | None,
+    settle: ArrayLike,
+    max_period: ArrayLike | None,
+) -> None:
+    """Raise for what makes no sense where a cycle is the guess."""
     if multiplicity not in (None, guess.multiplicity):
         raise DefinitionError(
-            f"the guess closes after {guess.multiplicity} turns, not {multiplicity}: give a Guess."
+            f"the guess has multiplicity {guess.multiplicity}, not {multiplicity}: give a Guess."
+        )
+    if guess.clocked != (s.system.period() is not None):
+        raise DefinitionError("of the guess and the system, only one has a clock: give a Guess.")
+    if max_period is not None or is_traced(settle) or settle:
+        raise DefinitionError(
+            "the search begins on the cycle that is the guess, and knows its period: leave out "
+            "`settle` and `max_period`, or give a Guess."
         )
 
 

@@ -26,6 +26,14 @@ from ..systems.system import Guess, HybridSystem
 from ..systems.transition import Scheduled
 
 
+# A guess lies on the section if it would meet it within this part of the time in which the states
+# change by their sizes. Doubled, the search begins at guesses that are twice as far from it.
+_ON_SECTION = 1e-6
+# A schedule divides the clock's period if the quotient is this near to a whole number. Doubled,
+# turns that differ twice as much from the last one are taken for equal.
+_WHOLE = 1e-6
+
+
 class _Plane(eqx.Module):
     """The hyperplane through a point, across the flow (in sizes of the states)."""
 
@@ -77,14 +85,14 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
 
 def check_beginning(
     system: HybridSystem,
-    section: Crossing | AtEvent | None,
-    multiplicity: int,
+    multiplicity: int | None,
     settle: ArrayLike,
     max_period: ArrayLike | None,
 ) -> None:
     """**Raises:** `DefinitionError` for arguments of `find_limit_cycle` that make no sense."""
     s = Structure(system)
-    if not isinstance(multiplicity, int | np.integer) or multiplicity < 1:
+    whole = isinstance(multiplicity, int | np.integer) and multiplicity >= 1
+    if multiplicity is not None and not whole:
         raise DefinitionError(
             f"multiplicity must be a whole number, at least 1; got {multiplicity}."
         )
@@ -97,18 +105,24 @@ def check_beginning(
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
             ratio = np.inf if period is None else float(period / transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < 1e-6:
+            if not abs(ratio - round(min(ratio, 1e9))) < _WHOLE:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise no turn is like the last one."
                 )
-    if period is not None and section is not None:
+
+
+def check_section(s: Structure, section: Crossing | AtEvent | None) -> None:
+    """**Raises:** `DefinitionError` for a section that the system does not have, or any section of
+    a clocked system."""
+    if section is None:
+        return
+    if s.system.period() is not None:
         raise DefinitionError(
             "a clocked system returns to itself after its clock's period: leave out `section` "
             "(sections of any kind are for linearize and run_experiments)."
         )
-    if section is not None:
-        section.check(s)
+    section.check(s)
 
 
 def begin(
@@ -119,8 +133,10 @@ def begin(
     settle: ArrayLike,
     max_period: float,
     settings: Settings,
+    time: float,
 ) -> Beginning:
-    """From a guess to a state on the section, and the period to be expected.
+    """From a guess to a state on the section, and the period to be expected. `time` is that in
+    which the states change by their sizes at the guess.
 
     **Raises:** `ComputationError` where the flow does not lead there, or nothing moves.
     """
@@ -143,10 +159,9 @@ def begin(
             f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
             "moves: start elsewhere."
         )
-    on_section = rate < 0 and abs(level) <= -1e-9 * max_period * rate
+    on_section = rate < 0 and abs(level) <= -_ON_SECTION * time * rate
     if section is None:
-        sizes = np.ones(s.d) if settings.scale is None else np.asarray(settings.scale[a])
-        sizes = sizes[: s.dims[a]]
+        sizes = np.asarray(settings.scale)[a, : s.dims[a]]
         plane = _Plane(jnp.asarray(q), jnp.asarray(f / sizes**2 / np.linalg.norm(f / sizes)))
         section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1

@@ -20,6 +20,8 @@ from .return_map import SINGULAR, ReturnMap, Turn
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
 # Doubled, it sometimes ends one step earlier; halved, rounding may keep it from ending.
 _ATOL, _RTOL = 1e-12, 1e-11
+# Newton steps before a cycle is given up. Doubled, hopeless ones take twice as long.
+MAX_STEPS = 32
 # Along a direction in which J - I is singular, neither Newton nor a derivative moves.
 _SOLVER = lx.SVD(rcond=SINGULAR)
 
@@ -38,7 +40,7 @@ class Solution(NamedTuple):
 
 @quick_jit
 def solve(
-    map: ReturnMap, damped: bool = False, once_more: bool = False, max_steps: int = 32
+    map: ReturnMap, damped: bool = False, once_more: bool = False, max_steps: int = MAX_STEPS
 ) -> Solution:
     """Newton's method from the anchor's state.
 

@@ -124,8 +124,6 @@ class ReturnMap(eqx.Module):
 
     def sizes_in(self, chart: Int[Array, " L"]) -> Float[Array, "L d"]:
         """What counts as 1 in each state of some charts."""
-        if self.settings.scale is None:
-            return jnp.ones((len(chart), self.structure.d))
         return self.settings.scale[chart]
 
     @property
@@ -139,7 +137,7 @@ class ReturnMap(eqx.Module):
         if self.base is not None:
             return dataclasses.replace(self, system=system)
         expected = self.multiplicity * jnp.asarray(system.period(), float)
-        time = self.anchor.t / self.expected * expected
+        time = self.anchor.t * (expected / self.expected)
         anchor = eqx.tree_at(lambda x: x.t, self.anchor, time)
         return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
 

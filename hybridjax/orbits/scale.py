@@ -33,9 +33,15 @@ _TIMES_ROUNDING = 5e13
 # Without a clock, the period may be so many times that of the fastest mode at the guess. Doubled,
 # sizes of states that rest are guessed twice as large.
 _MODES = 20.0
-# Shifts of states by which rounding errors of the field are seen, in rounding errors of the states:
-# odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
+# Shifts of states and of times by which rounding errors of the field are seen, in their rounding
+# errors: odd ones and even ones, of several sizes. Doubled, the errors seen are at most doubled.
 _SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
+# So many rounding errors of time, as in a phase omega * t, are none of the field: they
+# move it as its derivative by time says. Doubled, rounding is seen a little less.
+_TIME_ROUNDING = 2.0
+# Phases of the clock at which rounding errors of the field are seen at a guess: an odd number, lest
+# they be those of a symmetry. Doubled, a state that rounding moves is found more surely.
+_PHASES = 7
 # Points at which fields are seen in one call, so that one program serves guesses and cycles.
 _POINTS = 16
 
@@ -64,13 +70,18 @@ def sizes_near(
     points = np.asarray(_reached(system, chart, t, q))
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
     reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
-    near = _look(system, reached, np.full(len(reached), float(t)), points[reached].T)
+    phases = np.zeros(1) if period is None else period * np.arange(_PHASES) / _PHASES
+    R, n = len(reached), len(phases)
+    times, states = np.repeat(float(t) + phases, R), np.tile(points[reached].T, n)
+    seen = _look(system, np.tile(reached, n), times, states)
+    near = _Seen(*(x[..., :R] for x in seen))
     time = _time_scale(near)
     turn = _MODES * time
     if period is not None:
         turn, time = period, min(time, period / (2 * np.pi))
     size = np.abs(near.q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, _floor(near, turn))), time)
+    floor = _floor(seen, turn).reshape(s.d, n, R).max(axis=1)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, floor)), time)
 
 
 def sizes_on(
@@ -114,16 +125,11 @@ def scale_of(
     return jnp.where(np.isnan(scale), otherwise, scale)
 
 
-def sizes_of(s: Structure, scale: Float[Array, "A d"] | None) -> Sizes:
+def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     """Sizes by name, from `Settings.scale`."""
-    scale = np.ones((len(s.charts), s.d)) if scale is None else np.asarray(scale)
+    scale = np.asarray(scale)
     charts = list(enumerate(s.charts))
     return {n: float(scale[a, k]) for a, c in reversed(charts) for k, n in enumerate(c.states)}
-
-
-def alike(a: Mapping[str, float], b: Mapping[str, float], factor: float) -> bool:
-    """Whether no size differs by more than a factor."""
-    return all(1 / factor <= a[name] / b[name] <= factor for name in a)
 
 
 class _Seen(NamedTuple):
@@ -136,7 +142,7 @@ class _Seen(NamedTuple):
     derivative: Float[np.ndarray, "d d K"]
     """Of the field by the state."""
     rounding: Float[np.ndarray, "d K"]
-    """By how much rounding errors change the field, seen at states that all but agree."""
+    """By how much rounding errors change the field, seen at states and times that all but agree."""
 
 
 def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
@@ -149,24 +155,32 @@ def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
 @quick_jit
 def _field(system, chart, t, q):
     s = Structure(system)
-    K, S = len(chart), 1 + len(_SHIFTS)
+    K, n, eps = len(chart), len(_SHIFTS), np.finfo(float).eps
+    S = 1 + 2 * n
 
     def at(t, q):
         n = len(t) // K
         return slopes(s, t, jnp.repeat(chart, n), q, jnp.zeros((s.nu, K * n)))
 
-    # Not all states by the same part, since a common factor may cancel.
-    shifts = np.stack([[0.0, *np.roll(_SHIFTS, k)] for k in range(s.d)]) * np.finfo(float).eps
-    moved = q[..., None] * (1 + shifts[:, None])
-    fields = at(jnp.repeat(t, S), moved.reshape(s.d, K * S)).reshape(s.d, K, S)
+    # First none, then states (not all by the same part, since a common factor may cancel), then t.
+    shifts = np.zeros((s.d, S))
+    shifts[:, 1 : n + 1] = [np.roll(_SHIFTS, k) for k in range(s.d)]
+    moved = q[..., None] * (1 + eps * shifts[:, None])
+    later = t[:, None] * (1 + eps * np.concatenate([np.zeros(n + 1), _SHIFTS]))
+    fields = at(later.ravel(), moved.reshape(s.d, K * S)).reshape(s.d, K, S)
     f, still, forwards = fields[..., 0], jnp.zeros((s.d, K)), jnp.ones((1, K))
     times = jnp.concatenate([still, forwards])  # along each state, then along the flow
     states = jnp.concatenate([jnp.eye(s.d)[:, :, None] * forwards, f[None]])
     push = lambda dt, dq: jax.jvp(at, (t, q), (dt, dq))[1]  # noqa: E731
     along = jax.vmap(push, out_axes=1)(times, states)
     derivative, change = along[:, :-1], along[:, -1]
+    by_time = (change - jnp.einsum("ijk,jk->ik", derivative, f))[..., None]
     smooth = jnp.einsum("ijk,jks->iks", derivative, moved - q[..., None])
-    rounding = jnp.max(jnp.abs(fields - f[..., None] - smooth), axis=-1)
+    smooth = smooth + by_time * (later - t[:, None])
+    off = jnp.abs(fields - f[..., None] - smooth)
+    of_time = _TIME_ROUNDING * eps * jnp.abs(by_time * t[:, None])
+    off = jnp.concatenate([off[..., : n + 1], off[..., n + 1 :] - of_time], axis=-1)
+    rounding = jnp.max(off, axis=-1)  # not negative: without a shift there is none
     return f, change, derivative, rounding
 
 

@@ -23,7 +23,8 @@ def flow(states, size, duration=DURATION):
     q = jnp.zeros((s.d, L)).at[:2].set(states.T)
     lanes = start_lanes(s, jnp.zeros(L), jnp.full(L, 1, jnp.int32), q)
     u, end = jnp.zeros((1, L)), until(jnp.full(L, duration))
-    return move(s, lanes, u, end, Settings(1e-12, 1e-12), event_log=size)
+    settings = Settings(1e-12, 1e-12, scale=np.ones((len(s.charts), s.d)))
+    return move(s, lanes, u, end, settings, event_log=size)
 
 
 def truth(state):

@@ -19,7 +19,11 @@ from ..conftest import no_compilation
 
 # Compiled in half the time, to slower programs.
 compiled = ft.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-TIGHT = Settings(rtol=1e-13, atol=1e-13, max_steps=256)
+
+
+def tight(s):
+    """Settings for states of size 1."""
+    return Settings(1e-13, 1e-13, 256, np.ones((len(s.charts), s.d)))
 
 
 def flow(system, chart, q, u, t, end):
@@ -28,7 +32,7 @@ def flow(system, chart, q, u, t, end):
     q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
     index = jnp.full(1, s.chart_index(chart), jnp.int32)
     lanes = start_lanes(s, t[None], index, q)
-    moved = move(s, lanes, u[:, None], until(end[None]), TIGHT)
+    moved = move(s, lanes, u[:, None], until(end[None]), tight(s))
     return moved.lanes.q[:, 0], moved.result[0]
 
 
@@ -114,7 +118,7 @@ def test_lanes_fail_one_by_one():
     end = jnp.full(4, 0.6)
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
-    moved = move(s, lanes, u, until(end), TIGHT)
+    moved = move(s, lanes, u, until(end), tight(s))
     bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])

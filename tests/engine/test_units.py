@@ -160,6 +160,30 @@ def test_states_at_rest_stop_nothing(function, start, end):
         np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
 
 
+@pytest.mark.parametrize("large", [1e6, 1e9])
+def test_states_of_other_sizes_do_not_matter(large):
+    """A small oscillation beside a large state that stays what it is, in other units."""
+    field = lambda t, q, u: (q[1], -q[0], 0.0 * q[2])  # noqa: E731
+    found = hj.simulate(Any(field, 3), "x", (1e-6, 0.0, large), 100.0)
+    exact = np.stack([np.cos(found.t), -np.sin(found.t)], axis=1)
+    np.testing.assert_allclose(found.after[:, :2] / 1e-6, exact, rtol=0, atol=1e-8)
+    assert len(found.t) < 1500
+
+
+def test_a_state_that_rounding_moves_beside_others():
+    """It takes no more steps than they do: rounding depends on a state, or on time."""
+    small = lambda t: (1 + 0.1 * jnp.cos(3 * t)) * 3 - 3 - 0.3 * jnp.cos(3 * t)  # noqa: E731
+    field = lambda t, q, u: (q[1], -q[0], -q[2] + (q[0] + 3.0 - q[0] - 3.0), small(t) - q[3])  # noqa: E731
+    found = hj.simulate(Any(field, 4), "x", (1.0, 0.0, 0.0, 0.0), 30.0)
+    assert len(found.t) < 400
+    np.testing.assert_allclose(found.after[-1], (np.cos(30.0), -np.sin(30.0), 0, 0), atol=1e-8)
+
+
+def test_derivatives_need_sizes():
+    with pytest.raises(hj.DefinitionError, match="need the sizes of states"):
+        flow(1.0, 1.0, None, True)
+
+
 def test_a_weak_force_counts_where_it_is_all_there_is():
     """From rest at zero under a force of 1e-9, to as many digits as under a force of 1."""
     found = hj.simulate(

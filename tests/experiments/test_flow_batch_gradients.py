@@ -20,7 +20,7 @@ from ..conftest import APEX, OUTPUTS
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 compiled = ft.partial(jax.jit, compiler_options=QUICK)
 PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g")
-SETTINGS = Settings(rtol=1e-12, atol=1e-12, max_steps=1024)
+SETTINGS = Settings(1e-12, 1e-12, 1024, np.ones((2, 4)))
 N = 4
 
 

@@ -111,7 +111,7 @@ def test_bad_input(juggling):
         hj.DefinitionError, match="multiplicity must be a whole number, at least 1; got 0"
     ):
         hj.find_limit_cycle(juggling.system, multiplicity=0)
-    with pytest.raises(hj.DefinitionError, match="closes after 1 turns, not 2"):
+    with pytest.raises(hj.DefinitionError, match="has multiplicity 1, not 2"):
         hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
 

@@ -9,6 +9,7 @@ import pytest
 import hybridjax as hj
 
 from ..conftest import APEX
+from ..toys import Field
 
 
 # Units of length and time, in those of the models.
@@ -208,12 +209,41 @@ def test_states_that_rest_stop_nothing(relaxation):
     assert relaxation.scale["nothing"] == 1.0 and relaxation.scale["rounding"] > 1e-7
 
 
+class Shaken(hj.HybridSystem):
+    """A damped oscillator under a clock, beside a state that only rounding moves, by time."""
+
+    def charts(self):
+        def field(t, q, u):
+            beat = jnp.cos(3 * t)
+            rounding = (1 + 0.1 * beat) * 3 - 3 - 0.3 * beat
+            return q[1], -q[0] - 0.2 * q[1] + beat, rounding - q[2]
+
+        return {"all": Field(("x", "v", "w"), field)}
+
+    def period(self):
+        return 2 * np.pi / 3
+
+
+def test_a_state_that_rounding_moves_by_time_stops_nothing():
+    amplitude = 1 / (1 - 9 + 0.6j)
+    for time in (0.0, 0.3):
+        cycle = hj.find_limit_cycle(Shaken(), hj.Guess("all", (0.0, 0.0, 0.0), time))
+        assert cycle.scale["w"] > 1e-7
+        x = (amplitude * np.exp(3j * time)).real
+        np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
+        decay = np.sort(np.abs(cycle.multipliers))
+        truth = np.exp(-np.array([1.0, 0.1, 0.1]) * 2 * np.pi / 3)
+        np.testing.assert_allclose(decay, truth, rtol=1e-9)
+
+
 def test_sizes_that_are_given(hopper_cycle):
     cycle = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, scale={"ym": 5.0})
-    assert cycle.scale["ym"] == 5.0 and cycle.scale["yM"] == hopper_cycle.scale["yM"]
+    assert cycle.scale["ym"] == 5.0
+    np.testing.assert_allclose(cycle.scale["yM"], hopper_cycle.scale["yM"], rtol=1e-9)
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
     many = eqx.filter_vmap(lambda k: hj.models.VerticalHopper(k=k))(jnp.array([10.0, 10.5]))
-    assert hj.find_limit_cycles(many, hopper_cycle, scale={"ym": 3.0})[0].scale["ym"] == 3.0
+    found = hj.find_limit_cycles(many, hopper_cycle, scale={"ym": 3.0})
+    assert found.scale == hopper_cycle.scale | {"ym": 3.0}
     for scale in ({"y": 1.0}, {"ym": 0.0}, {"ym": np.inf}):
         with pytest.raises(hj.DefinitionError, match="positive sizes of states by name"):
             hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, scale=scale)

@@ -12,7 +12,7 @@ from ...systems.structure import Structure
 from ..events import width
 from ..hermite import NEAR, control_points, root_near_end
 from ..lanes import for_each_chart, only
-from ..solver.step import Step, rk_step
+from ..solver.step import Step, rk_step, rounding_error
 from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 from .aim import Aim
 from .state import State, Task
@@ -109,11 +109,17 @@ def attempt(
             lambda: rk_step(flow.field, t, q, tau, unroll),
             lambda: Step(q, q, q, q),
         )
-        size = task.settings.size(a, q, step.q)
-        tolerance = task.settings.tolerance(size, q, tau, step)
+        rounding = jnp.zeros_like(q)
+        if task.settings.scale is None:
+            rounding = jax.lax.cond(
+                some,
+                lambda: rounding_error(flow.field, t + tau, step.q, step.f1),
+                lambda: jnp.zeros_like(q),
+            )
+        tolerance = task.settings.tolerance(a, q, tau, step, rounding)
         error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * size
+            aside = _ASIDE * task.settings.size(a, q, step.q)
             direction = np.cos(1.0 + np.arange(n))[:, None]
             near = jax.lax.cond(
                 some & tangents,

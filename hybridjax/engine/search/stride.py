@@ -15,6 +15,10 @@ from ..watch import chart_field
 # _FIRST_RTOL; the method has order 7), and at most as a part of the time allowed. Twice as much: a
 # few more first steps are too long and taken again; half: one more step until they have grown.
 _FIRST_STEP, _FIRST_RTOL, _FIRST_STEP_OF_SPAN = 0.1, 1e-2, 0.01
+# Where sizes of states are not known, a state that happens to begin near zero changes by its own at
+# once: the first step is no shorter than this part of the time allowed. Twice as much: stiff
+# systems try a first step more; half: hardly a difference.
+_SHORTEST = 1e-6
 
 
 class Stride(NamedTuple):
@@ -46,14 +50,14 @@ def initial_step(
     def work(a, here, out):
         q = only(here, lanes.q[: s.dims[a]])
         f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
-        if settings.scale is None:
-            size = jnp.linalg.norm(q, axis=0)
-        else:
-            size = settings.size(a, q)
-        rate = jnp.max(jnp.abs(f) / size, axis=0, initial=0.0)
-        time = jnp.where(jnp.isfinite(rate) & (rate > 0), 1 / rate, jnp.inf)
+        known = settings.scale is not None
+        rates = jnp.abs(f) / (settings.size(a, q) if known else jnp.abs(q))
+        rate = jnp.max(jnp.where(jnp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
+        time = jnp.where(rate > 0, 1 / rate, jnp.inf)
         part = _FIRST_STEP * (settings.rtol / _FIRST_RTOL) ** (1 / 7)
-        return jnp.where(here, jnp.minimum(part * time, _FIRST_STEP_OF_SPAN * span), out)
+        first = jnp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
+        first = first if known else jnp.maximum(first, _SHORTEST * span)
+        return jnp.where(here, first, out)
 
     everywhere = jnp.ones(lanes.t.shape[0], bool)
     return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)

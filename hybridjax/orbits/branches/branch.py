@@ -14,6 +14,10 @@ from ..cycle import LimitCycle
 from ..sweep.limit_cycles import LimitCycles
 
 
+# A multiplier is shown with a point if its modulus is this near to 1; critical ones are 1 to
+# rounding. Doubled, others that are all but critical are shown twice as often.
+_ON_CIRCLE = 1e-6
+
 KINDS = ("fold", "branch point", "flip", "Neimark-Sacker")
 
 
@@ -98,7 +102,7 @@ class Branch(eqx.Module):
         """One line for each marked point and each end."""
         lines = [f"from {self.parameter} = {self.ends[0].value:.9g}: {self.ends[0].message}"]
         for p in self.points:
-            on = p.multipliers[np.abs(np.abs(p.multipliers) - 1) < 1e-6]
+            on = p.multipliers[np.abs(np.abs(p.multipliers) - 1) < _ON_CIRCLE]
             at = ", ".join(f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in on)
             lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
         lines.append(f"to {self.parameter} = {self.ends[1].value:.9g}: {self.ends[1].message}")

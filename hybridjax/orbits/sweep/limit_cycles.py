@@ -74,6 +74,11 @@ class LimitCycles(eqx.Module):
         )  # fmt: skip
 
     @property
+    def scale(self) -> dict[str, float]:
+        """What counts as 1 in each state of every cycle, by name."""
+        return self[0].scale
+
+    @property
     def ok(self) -> Bool[np.ndarray, " S"]:
         """Which cycles were found."""
         return self.result == Result.OK
