@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
+from .._core.memo import Memory
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
@@ -193,11 +194,13 @@ def prepare(
     execution = divide(together, execution)
     samples = inputs.cycles * N
     small = len(inputs) * samples <= _SMALL
-    if options.record_events:  # what has room for the events is known after the plan
-        ahead = contextlib.nullcontext()
-    else:
-        shape = execution.batch, samples, nu
+    shape = execution.batch, samples, nu
+    kind = small, shape, z.names, execution.precision
+    # What has room for events is known after the plan only.
+    if not options.record_events and _kinds.is_new(placed, kind):
         ahead = _compiling_ahead(_FLOW[small], placed, shape, z, execution)
+    else:
+        ahead = contextlib.nullcontext()
     with ahead:
         single = execution.precision == "single"
         stepping = (plan_single if single else plan_flow)(placed, accuracy)
@@ -239,6 +242,11 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
             "experiments would leave it: stabilize the system, or use the exact linearization "
             "(`linearize`), which needs no experiments."
         )
+
+
+# The kinds of programs that were compiled for placed sections; others, with outputs of the same
+# names, are compiled when they are called.
+_kinds = Memory()
 
 
 def _compiling_ahead(
