@@ -95,3 +95,9 @@ def test_bad_records(message, change):
     hj.ExperimentData(**GOOD)
     with pytest.raises(hj.DefinitionError, match=message):
         hj.ExperimentData(**(GOOD | change))
+
+
+def test_the_window_is_the_last_periods():
+    data = hj.ExperimentData(np.ones((2, 20, 1)), np.ones((2, 20, 1)), n_sections=4, periods=3)
+    assert data.window == slice(8, None) and data.windows() == [slice(8, 20)]
+    assert data.u[:, data.window].shape[1] == 12
