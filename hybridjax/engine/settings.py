@@ -1,11 +1,15 @@
 """Accuracy and effort of the flow, and every accuracy that the package takes by default."""
 
 import functools as ft
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
 from .._core.precision import at_precision
 from ..errors import DefinitionError
 from .solver.step import Step
@@ -41,14 +45,15 @@ ROUNDING = 4e-15, 2e-6
 _TIMES_ROUNDING = 10.0
 
 
-def _number(x) -> Array:
+def _number(x: PositiveScalar) -> Array:
     return jnp.asarray(x, float)
 
 
-def _numbers(x) -> Array | None:
+def _numbers(x: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None) -> Array | None:
     return None if x is None else jnp.asarray(x, float)
 
 
+@checked
 class Settings(eqx.Module):
     """Accuracy and effort of the flow.
 
@@ -60,7 +65,7 @@ class Settings(eqx.Module):
     """Error of a step relative to each state's own size."""
     atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
     """Error of a step relative to each state's `scale`."""
-    max_steps: int = eqx.field(static=True, default=256)
+    max_steps: StepCount = eqx.field(static=True, default=256)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
     scale: Float[Array, "A d"] | None = eqx.field(converter=_numbers, default=None)
     """Sizes that states usually have, by chart, padded to the dimension of the largest with

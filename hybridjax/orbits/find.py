@@ -6,9 +6,10 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -23,7 +24,7 @@ from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .cycle import LimitCycle
-from .guess import begin, check_beginning, check_section, guessed_lane
+from .guess import begin, check_clock, check_section, guessed_lane
 from .newton import Solution, solve
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
@@ -51,16 +52,17 @@ _SAME_FIELD, _SAME_REST = 1e-6, 1e-9
 _DUE = 1e-9
 
 
+@checked
 def find_limit_cycle(
     system: HybridSystem,
     guess: Guess | LimitCycle | None = None,
     *,
     section: Crossing | AtEvent | None = None,
-    multiplicity: int | None = None,
-    conserved: Mapping[str, ArrayLike] | None = None,
-    settle: ArrayLike = 0.0,
-    max_period: ArrayLike | None = None,
-    scale: Mapping[str, float] | None = None,
+    multiplicity: Count | None = None,
+    conserved: Mapping[str, Scalar] | None = None,
+    settle: Wait = 0.0,
+    max_period: Duration | None = None,
+    scale: Mapping[str, Positive] | None = None,
     settings: Settings | None = None,
     throw: bool = True,
 ) -> LimitCycle:
@@ -115,7 +117,7 @@ def find_limit_cycle(
     given |= given_sizes(s, scale)
     check_section(s, section)
     if not traced:
-        check_beginning(system, multiplicity, settle, max_period)
+        check_clock(system)
     if isinstance(guess, LimitCycle):
         _check_fits(guess, s, multiplicity, settle, max_period)
         conserved = guess.conserved if conserved is None else conserved
@@ -137,7 +139,7 @@ def find_limit_cycle(
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
-        max_period = _PATIENCE * near.time if max_period is None else float(max_period)
+        max_period = _PATIENCE * near.time if max_period is None else max_period
         anchor, base, expected = begin(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
         )
@@ -220,8 +222,8 @@ def _check_fits(
     guess: LimitCycle,
     s: Structure,
     multiplicity: int | None,
-    settle: ArrayLike,
-    max_period: ArrayLike | None,
+    settle: float,
+    max_period: float | None,
 ) -> None:
     """Raise for what makes no sense where a cycle is the guess."""
     if multiplicity not in (None, guess.multiplicity):
@@ -230,7 +232,7 @@ def _check_fits(
         )
     if guess.clocked != (s.system.period() is not None):
         raise DefinitionError("of the guess and the system, only one has a clock: give a Guess.")
-    if max_period is not None or is_traced(settle) or settle:
+    if max_period is not None or settle:
         raise DefinitionError(
             "the search begins on the cycle that is the guess, and knows its period: leave out "
             "`settle` and `max_period`, or give a Guess."
@@ -240,9 +242,6 @@ def _check_fits(
 def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, Array]) -> None:
     s = Structure(system)
     s.resolve_outputs(tuple(conserved)).require(int(anchor.chart[0]))
-    for name, value in conserved.items():
-        if value.shape != () or not np.isfinite(value):
-            raise DefinitionError(f"the conserved '{name}' must be one finite number; got {value}.")
 
 
 def _check_conserved(cycle: LimitCycle) -> None:

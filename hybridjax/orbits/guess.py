@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.compilation.compile import quick_jit
@@ -62,10 +61,6 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
     """
     s = Structure(system)
     guess = system.guess() if guess is None else guess
-    if not isinstance(guess, Guess | None):
-        raise DefinitionError(
-            f"the guess is a Guess(chart, state) or a LimitCycle, not {type(guess).__name__}."
-        )
     if guess is None:
         raise DefinitionError(
             f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
@@ -83,22 +78,9 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
     return start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
 
 
-def check_beginning(
-    system: HybridSystem,
-    multiplicity: int | None,
-    settle: ArrayLike,
-    max_period: ArrayLike | None,
-) -> None:
-    """**Raises:** `DefinitionError` for arguments of `find_limit_cycle` that make no sense."""
+def check_clock(system: HybridSystem) -> None:
+    """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
     s = Structure(system)
-    whole = isinstance(multiplicity, int | np.integer) and multiplicity >= 1
-    if multiplicity is not None and not whole:
-        raise DefinitionError(
-            f"multiplicity must be a whole number, at least 1; got {multiplicity}."
-        )
-    for name, value in (("settle", settle), ("max_period", max_period)):
-        if value is not None and not (np.isfinite(value) and value >= 0):
-            raise DefinitionError(f"{name} must be a finite time, not negative; got {value}.")
     period = system.period()
     if period is not None and not (np.isfinite(period) and period > 0):
         raise DefinitionError(f"the clock's period must be positive; it is {period}.")
@@ -130,7 +112,7 @@ def begin(
     lanes: Lanes,
     section: Crossing | AtEvent | None,
     multiplicity: int,
-    settle: ArrayLike,
+    settle: float,
     max_period: float,
     settings: Settings,
     time: float,
@@ -142,7 +124,7 @@ def begin(
     """
     s, period = Structure(system), system.period()
     if settle:
-        wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
+        wait = settle if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
         _require(moved, "settling", s)
         lanes = moved.lanes

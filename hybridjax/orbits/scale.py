@@ -100,14 +100,14 @@ def sizes_on(
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
     """Sizes by name, as users give them.
 
-    **Raises:** `DefinitionError` for a state that does not exist, or a size that is not positive.
+    **Raises:** `DefinitionError` for a state that does not exist.
     """
-    given = {name: float(size) for name, size in (scale or {}).items()}
+    given = dict(scale or {})
     unknown = [name for name in given if name not in s.state_names()]
-    if unknown or not all(np.isfinite(size) and size > 0 for size in given.values()):
+    if unknown:
         raise DefinitionError(
-            "`scale` gives positive sizes of states by name; states are "
-            f"{', '.join(s.state_names())}. Got {scale}."
+            f"`scale` names {unknown[0]!r}, which is no state; states are "
+            f"{', '.join(s.state_names())}."
         )
     return given
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
+
+from .._core.boundary.kinds import Scalar
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
 from ..engine.target import AbstractLevels as AbstractLevels
@@ -94,7 +95,7 @@ def check_n_sections(n_sections: int) -> None:
         )
 
 
-def as_anchor(x: Crossing | ArrayLike) -> Crossing | Array:
+def as_anchor(x: Crossing | Scalar) -> Crossing | Array:
     """A crossing as it is, a number as an array."""
     return x if isinstance(x, Crossing) else number(x)
 

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import SectionCount
 from ..systems.structure import Structure
 from .abstract import (
     AbstractSections,
@@ -13,11 +15,11 @@ from .abstract import (
     CyclePoint,
     as_anchor,
     check_anchor,
-    check_n_sections,
 )
 from .crossing import Crossing
 
 
+@checked
 class ClockPhase(AbstractSections):
     """N equally spaced phases of time: the isochrons of a clocked system (paper Sec. VI-B).
 
@@ -29,11 +31,8 @@ class ClockPhase(AbstractSections):
     """
 
     label: ClassVar[str] = "isochron"
-    n_sections: int = eqx.field(static=True)
+    n_sections: SectionCount = eqx.field(static=True)
     anchor: Crossing | Float[Array, ""] = eqx.field(converter=as_anchor, default=0.0)
-
-    def __check_init__(self):
-        check_n_sections(self.n_sections)
 
     def check(self, s: Structure) -> None:
         check_anchor(self.anchor, s)

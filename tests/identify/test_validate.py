@@ -120,7 +120,7 @@ def test_bad_requests(small, hopper):
         hj.validate(hopper, data)
     with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
         hj.validate(small, record(small, 20))
-    with pytest.raises(hj.DefinitionError, match="level must lie between"):
+    with pytest.raises(hj.DefinitionError, match="`level` must be a number between 0 and 1"):
         hj.validate(small, data, level=5.0)
     with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
         hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))

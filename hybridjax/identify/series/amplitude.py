@@ -11,7 +11,6 @@ from ..._core.arguments import Numbers
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
-from .fit import check_start
 from .simulation import simulate_record
 from .validation import require_same_kind
 
@@ -82,7 +81,7 @@ def amplitude_sweep(
 
     **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
     """
-    free_start = check_start(start) == "free"
+    free_start = start == "free"
     factors = np.sort(np.asarray(amplitudes, float))
     if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
         raise DefinitionError(f"amplitudes must be positive numbers, not {factors}.")

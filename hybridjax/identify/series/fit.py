@@ -5,6 +5,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index, Order, StepCount
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import DefinitionError
@@ -35,16 +37,17 @@ _SMALLEST_REMAINDER = 1e-3
 _SMALLEST_FREEDOM = 0.5
 
 
+@checked
 def fit_series(
     data: RecordedData,
-    order: int | LDTP,
+    order: Order | LDTP,
     *,
-    overhang: int | None = None,
+    overhang: Index | None = None,
     start: Literal["free", "cycle"] = "free",
     errors: Literal["residuals", "white"] = "residuals",
     distortion: bool | None = None,
     check: bool = True,
-    max_steps: int = 50,
+    max_steps: StepCount = 50,
 ) -> SeriesFit:
     r"""Multipliers, HTFs and their uncertainty from series with any input.
 
@@ -71,23 +74,15 @@ def fit_series(
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
-    **Raises:** `DefinitionError` for an order below 1, an unknown `start` or `errors`, records that
-    do not fit together, inputs that are zero, too few cycles (the message says how many are
-    needed), or an order that the data do not carry.
+    **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
+    few cycles (the message says how many are needed), or an order that the data do not carry.
     """
     require_x64()
-    free_start = check_start(start) == "free"
-    if errors not in ("residuals", "white"):
-        raise DefinitionError(f"errors must be 'residuals' or 'white', not {errors!r}.")
+    free_start = start == "free"
     order = order.rank() if isinstance(order, LDTP) else order
     grid = CycleGrid.from_data(data)
     N = grid.n_sections
     overhang = N if overhang is None else overhang
-    if order < 1 or max_steps < 1 or overhang < 0:
-        raise DefinitionError(
-            "a fit needs order >= 1 (the number of non-zero multipliers), max_steps >= 1 and "
-            f"overhang >= 0, not {order}, {max_steps} and {overhang}."
-        )
     _require_signals(grid)
     problem = OutputErrorProblem.from_grid(grid, order, overhang, free_start)
     delayed = delayed_outputs(problem, order)
@@ -116,13 +111,6 @@ def fit_series(
     if second is not None:
         best, found = second, linearize(problem, second.coefficients)
     return assemble(grid, problem, found, best, distortion=second is not None)
-
-
-def check_start(start: str) -> str:
-    """**Raises:** `DefinitionError` unless it is "free" or "cycle"."""
-    if start not in ("free", "cycle"):
-        raise DefinitionError(f"start must be 'free' or 'cycle', not {start!r}.")
-    return start
 
 
 def assemble(

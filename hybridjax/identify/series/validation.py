@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Probability
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.record import Record, RecordedData, uninterrupted_records
 from ...linear.ldtp import LDTP
-from .fit import check_start
 from .series_fit import SeriesFit
 from .simulation import simulate_record
 
@@ -88,13 +89,14 @@ class Validation(eqx.Module):
         return "\n".join(rows)
 
 
+@checked
 def validate(
     model: LDTP | SeriesFit,
     data: RecordedData,
     *,
     start: Literal["free", "cycle"] = "free",
-    lags: int | None = None,
-    level: float = 0.01,
+    lags: Count | None = None,
+    level: Probability = 0.01,
 ) -> Validation:
     r"""Simulate a model on data and test what it leaves.
 
@@ -119,9 +121,7 @@ def validate(
     **Raises:** `DefinitionError` if model and data have different N or names, or there are too few
     cycles for any lag.
     """
-    if not 0 < level < 1:
-        raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
-    free_start = check_start(start) == "free"
+    free_start = start == "free"
     records = uninterrupted_records(data)
     N, outputs = records[0].n_sections, records[0].outputs
     require_same_kind(model, records[0])

@@ -1,0 +1,201 @@
+"""Kinds that are made of others: choices, sequences, tables, objects of a class."""
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from .kind import Kind
+from .misfit import Misfit, listed, show, with_article
+from .scalars import Text
+
+
+class Either(Kind):
+    """What one of several kinds takes, tried in their order."""
+
+    def __init__(self, *kinds: Kind):
+        self.kinds = kinds
+        self.allowed = listed(list(dict.fromkeys(kind.allowed for kind in kinds)))
+
+    def take(self, value):
+        near = None
+        for kind in self.kinds:
+            try:
+                return kind.take(value)
+            except Misfit as misfit:
+                near = misfit if misfit.near else near
+        raise self.refused(value) if near is None else near
+
+
+class Instance(Kind):
+    """An object of a class."""
+
+    def __init__(self, cls: type):
+        self.cls = cls
+        self.allowed = with_article(cls.__name__)
+
+    def take(self, value):
+        if isinstance(value, self.cls):
+            return value
+        if isinstance(value, type) and issubclass(value, self.cls):
+            raise Misfit(
+                f"must be {self.allowed}, not the class itself: write {value.__name__}(...)",
+                near=True,
+            )
+        raise self.refused(value)
+
+
+class Having(Kind):
+    """An object with what a protocol asks for. (Properties are not evaluated, as `isinstance`
+    would do.)"""
+
+    def __init__(self, protocol: type):
+        self.names = [name for name in vars(protocol) if not name.startswith("_")]
+        self.allowed = f"an object with `{'` and `'.join(self.names)}`"
+
+    def take(self, value):
+        for name in self.names:
+            if inspect.getattr_static(value, name, self) is self:
+                raise self.refused(value)
+        return value
+
+
+class Subclass(Kind):
+    """A class derived from another one."""
+
+    def __init__(self, cls: type):
+        self.cls = cls
+        self.allowed = f"a class derived from {cls.__name__}"
+
+    def take(self, value):
+        if isinstance(value, type) and issubclass(value, self.cls):
+            return value
+        raise self.refused(value)
+
+
+class Function(Kind):
+    """Anything that can be called."""
+
+    allowed = "a function"
+
+    def take(self, value):
+        if callable(value):
+            return value
+        raise self.refused(value)
+
+
+class Items(Kind):
+    """A sequence all of whose items are of one kind: a list, a tuple, an array's first axis. With
+    `form`, what any iterable holds is brought to that form."""
+
+    def __init__(self, item: Kind | None, *, form: Callable[[Iterable], Any] | None = None):
+        self.item, self.form = item, form
+        self.allowed = "a sequence" if item is None else f"a sequence of items, each {item.allowed}"
+
+    def take(self, value):
+        if isinstance(value, jax.core.Tracer | str | bytes | Mapping):
+            raise self.refused(value)
+        if isinstance(value, np.ndarray | jax.Array):
+            if value.ndim == 0:
+                raise self.refused(value)
+            value = list(np.asarray(value))
+        elif (
+            isinstance(value, Iterable)
+            and self.form is not None
+            and not isinstance(value, Sequence)
+        ):
+            value = self.form(value)
+        elif not isinstance(value, Sequence):
+            raise self.refused(value)
+        if self.item is None:
+            return value
+        return _rebuilt(value, [_taken(self.item, i, x) for i, x in enumerate(value)])
+
+
+class Tuple(Kind):
+    """So many values, each of its own kind, in a list or a tuple."""
+
+    def __init__(self, *kinds: Kind | None):
+        self.kinds = kinds
+        parts = ", ".join("anything" if kind is None else kind.allowed for kind in kinds)
+        self.allowed = f"a tuple of {len(kinds)} ({parts})"
+
+    def take(self, value):
+        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 1:
+            value = tuple(value)
+        if not isinstance(value, list | tuple) or len(value) != len(self.kinds):
+            raise self.refused(value)
+        pairs = enumerate(zip(self.kinds, value, strict=True))
+        return tuple(x if kind is None else _taken(kind, i, x) for i, (kind, x) in pairs)
+
+
+class Table(Kind):
+    """A mapping all of whose keys and values are of one kind each."""
+
+    def __init__(self, key: Kind | None, value: Kind | None):
+        self.key, self.value = key, value
+        self.allowed = "a mapping such as {name: value}"
+
+    def take(self, value):
+        if not isinstance(value, Mapping):
+            raise self.refused(value)
+        out = {}
+        for name, item in value.items():
+            if self.key is not None:
+                try:
+                    name = self.key.take(name)
+                except Misfit as misfit:
+                    raise Misfit(
+                        f"has the key {show(name)}, but keys {misfit.problem}", near=True
+                    ) from None
+            out[name] = item if self.value is None else _taken(self.value, name, item)
+        return _rebuilt(value, out)
+
+
+class Names(Kind):
+    """One name, or several distinct ones, as a tuple. Objects of the class `other` may stand among
+    them."""
+
+    def __init__(self, other: type | None = None):
+        self.item = Text() if other is None else Either(Text(), Instance(other))
+        self.allowed = "a name, or a sequence of distinct names"
+        if other is not None:
+            self.allowed += f" (or {with_article(other.__name__)} in place of one)"
+
+    def take(self, value):
+        if not isinstance(value, list | tuple | np.ndarray):
+            value = (value,)
+        elif isinstance(value, np.ndarray) and value.ndim != 1:
+            raise self.refused(value)
+        if not all(map(self._fits, value)):
+            raise self.refused(value)
+        given = tuple(str(x) if isinstance(x, str) else x for x in value)
+        names = [x for x in given if isinstance(x, str)]
+        if len(set(names)) < len(names):
+            raise Misfit(f"must name each only once, not {show(given)}", near=True)
+        return given
+
+    def _fits(self, value: Any) -> bool:
+        try:
+            self.item.take(value)
+        except Misfit:
+            return False
+        return True
+
+
+def _taken(kind: Kind, key: Any, value: Any) -> Any:
+    try:
+        return kind.take(value)
+    except Misfit as misfit:
+        raise misfit.inside(key) from None
+
+
+def _rebuilt(given: Any, taken: Any) -> Any:
+    """What was given, where nothing in it changed."""
+    items = taken.values() if isinstance(taken, dict) else taken
+    before = given.values() if isinstance(given, Mapping) else given
+    if all(a is b for a, b in zip(before, items, strict=True)):
+        return given
+    return taken if isinstance(given, list | Mapping) else tuple(taken)

@@ -1,0 +1,361 @@
+"""What does not fit the annotations of a public function is refused with one sentence; what fits
+arrives in one form."""
+
+import dataclasses
+import inspect
+import pickle
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict, Unpack
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import hybridjax as hj
+from hybridjax._core.boundary.annotations import kind_of
+from hybridjax._core.boundary.arrays import Complexes, Integers, Reals
+from hybridjax._core.boundary.checked import checked
+from hybridjax._core.boundary.containers import Names
+from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames
+from hybridjax._core.boundary.misfit import Misfit
+from hybridjax._core.boundary.scalars import Number
+
+
+NAN, INF = float("nan"), float("inf")
+MATRIX = Annotated[Numbers, Reals("N d")]
+GAPS = Annotated[Numbers, Reals("n", missing=True)]
+
+# An annotation, what is given, and what arrives.
+TAKEN = [
+    (int, 3, 3),
+    (int, np.int32(3), 3),
+    (int, np.array(3), 3),
+    (int, jnp.array(3), 3),
+    (Count | None, None, None),
+    (float, 3, 3.0),
+    (float, np.float32(0.5), 0.5),
+    (float, jnp.array(0.5), 0.5),
+    (Annotated[float, Number("no bound or a positive number", above=0, infinite=True)], INF, INF),
+    (complex, 2, 2 + 0j),
+    (bool, np.True_, True),
+    (str, "a", "a"),
+    (Any, 3, 3),
+    (Literal["a", "b"], "b", "b"),
+    (Sequence[int], np.arange(2), [0, 1]),
+    (Sequence[int], range(2), range(2)),
+    (Iterable[str], iter("ab"), ("a", "b")),
+    (tuple[int, ...], [1, np.int64(2)], [1, 2]),
+    (tuple[float, float], [1, 2], (1.0, 2.0)),
+    (Mapping[str, float], {"a": 1}, {"a": 1.0}),
+    (SignalNames, "a", ("a",)),
+    (SignalNames, ["a", "b"], ("a", "b")),
+    (SignalNames, (), ()),
+    (type[hj.HybridSystem], hj.models.VerticalHopper, hj.models.VerticalHopper),
+    (int | str, "a", "a"),
+]
+
+# An annotation, what is given, and what is said of it.
+REFUSED = [
+    (int, 8.5, "must be an integer, not 8.5"),
+    (int, True, "must be an integer, not True"),
+    (int, "8", "must be an integer, not '8'"),
+    (int, None, "must be an integer, not None"),
+    (int, np.array([3]), "must be an integer, not an array of int64 with shape (1,)"),
+    (Count, 0, "must be an integer from 1 to 1000000000, not 0"),
+    (Count, 10**12, "must be an integer from 1 to 1000000000, not 1000000000000"),
+    pytest.param(Count, 10**5000, "not a number with thousands of digits", id="digits"),
+    (float, NAN, "must be a finite number, not nan"),
+    (float, "1", "must be a finite number, not '1'"),
+    (float, 1j, "must be a finite number, not 1j"),
+    (float, True, "must be a finite number, not True"),
+    (float, 10**400, "must be a finite number, not 1000"),
+    (Positive, 0, "must be a positive number, not 0"),
+    (Positive, -INF, "must be a positive number, not -inf"),
+    (bool, 1, "must be True or False, not 1"),
+    (bool, None, "must be True or False, not None"),
+    (complex, INF, "must be a finite number, not inf"),
+    (str, 3, "must be a string, not 3"),
+    (Literal["a", "b"], "c", "must be 'a' or 'b', not 'c'"),
+    (Literal[1, "b"], True, "must be 1 or 'b', not True"),
+    (int | str | None, 0.5, "must be an integer, a string or None, not 0.5"),
+    (Sequence[int], 3, "must be a sequence of items, each an integer, not 3"),
+    (Sequence[str], "ab", "must be a sequence of items, each a string, not 'ab'"),
+    (Sequence[int], [1, "b"], "`x[1]` must be an integer, not 'b'"),
+    (tuple[float, float], (1.0,), "must be a tuple of 2 (a finite number, a finite number)"),
+    (Mapping[str, Positive], {"a": -1}, "`x['a']` must be a positive number, not -1"),
+    (Mapping[str, int], {1: 2}, "has the key 1, but keys must be a string"),
+    (Mapping[str, int], [1], "must be a mapping such as {name: value}, not [1]"),
+    (SignalNames, ["a", "a"], "must name each only once, not ('a', 'a')"),
+    (SignalNames, ["a", 3], "a sequence of distinct names, not ['a', 3]"),
+    (Callable, 3, "must be a function, not 3"),
+    (hj.Output, 3, "must be an Output, not 3"),
+    (hj.LDTP, "x", "must be an LDTP, not 'x'"),
+    (hj.HybridSystem, hj.models.VerticalHopper, "not the class itself: write VerticalHopper(...)"),
+    (type[hj.HybridSystem], int, "must be a class derived from HybridSystem"),
+    (MATRIX, [1.0], "must be of shape (N, d), not of shape (1,)"),
+    (MATRIX, [[1], [1, 2]], "must be a rectangular array, but its rows differ in length"),
+    (MATRIX, [["a"]], "must hold real numbers, not strings"),
+    (MATRIX, [[None]], "must hold real numbers, not other objects"),
+    (MATRIX, [[True]], "must hold real numbers, not bool"),
+    (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
+    (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
+    (MATRIX, None, "must be an array of real numbers with shape (N, d), not None"),
+    (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
+    (MATRIX | None, [[INF]], "must be finite, but is inf at index (0, 0)"),
+    (Scalar, NAN, "must be a finite number, not nan"),
+    (Scalar, [1.0], "must be one number, not of shape (1,)"),
+    (GAPS, [0, INF], "must be finite, but is inf at index 1"),
+    (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
+    (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),
+    (Annotated[Numbers, Reals("N N")], np.zeros((2, 3)), "must be of shape (N, N), not of"),
+    (Annotated[Numbers, Reals("2")], [1, 2, 3], "must be of shape (2,), not of shape (3,)"),
+    (Annotated[Numbers, Reals("... 2 d")], [[1.0]], "must be of shape (..., 2, d), not of"),
+    (Annotated[Numbers, Integers("n")], [0.5], "must hold integers, not float64"),
+]
+
+
+def called(annotation, value):
+    @checked
+    def function(x: annotation):
+        return x
+
+    return function(value)
+
+
+@pytest.mark.parametrize("annotation, given, expected", TAKEN)
+def test_what_fits_arrives_in_one_form(annotation, given, expected):
+    found = called(annotation, given)
+    assert found == expected and type(found) is type(expected)
+
+
+@pytest.mark.parametrize("annotation, given, said", REFUSED)
+def test_what_does_not_fit_is_refused_in_one_sentence(annotation, given, said):
+    with pytest.raises(hj.DefinitionError) as caught:
+        called(annotation, given)
+    text = str(caught.value)
+    assert said in text, text
+    assert "function: `x" in text and text.endswith(".") and "\n" not in text
+
+
+@pytest.mark.parametrize(
+    "kind, given, expected",
+    [
+        (Reals(), [1, 2], np.array([1.0, 2.0])),
+        (Reals(""), 3, np.array(3.0)),
+        (Reals("... 2"), np.ones((3, 4, 2), np.float32), np.ones((3, 4, 2), np.float32)),
+        (Reals("n", missing=True), [1, NAN], np.array([1, NAN])),
+        (Reals("n", missing=True, infinite=True), [INF, NAN], np.array([INF, NAN])),
+        (Reals("n"), jnp.arange(2), jnp.arange(2.0)),
+        (Reals("n"), np.zeros(0), np.zeros(0)),
+        (Complexes("n"), [1, 2j], np.array([1, 2j])),
+        (Integers("n"), [1, 2], np.array([1, 2])),
+        (Integers("n"), np.arange(2, dtype=np.uint8), np.arange(2)),
+    ],
+)
+def test_arrays_arrive_as_arrays(kind, given, expected):
+    found = kind.take(given)
+    assert type(found) is type(expected) and found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_sums_that_overflow_are_no_bad_values():
+    values = np.full(4, 1e308)
+    assert Reals("n").take(values) is values
+
+
+def test_other_objects_may_stand_among_names():
+    output = hj.Output("z", lambda t, q, u: q[0])
+    assert Names(hj.Output).take(["a", output]) == ("a", output)
+    assert Names(hj.Output).take(output) == (output,)
+    with pytest.raises(Misfit, match="or an Output in place of one"):
+        Names(hj.Output).take(["a", 3])
+
+
+@checked
+def several(a: int, /, b: Count = 0, *rest: str, c: Literal["x"] = "x", **options: int):
+    """What it does."""
+    return a, b, rest, c, options
+
+
+def test_every_parameter_is_checked_however_it_is_given():
+    assert several(1, 2, "r", c="x", other=3) == (1, 2, ("r",), "x", {"other": 3})
+    for bad, name in [
+        (lambda: several("1"), "a"),
+        (lambda: several(1, -2), "b"),
+        (lambda: several(1, b=-2), "b"),
+        (lambda: several(1, 2, "r", 3), "rest"),
+        (lambda: several(1, c="y"), "c"),
+    ]:
+        with pytest.raises(hj.DefinitionError, match=f"^several: `{name}` must be "):
+            bad()
+
+
+class Options(TypedDict, total=False):
+    size: Count
+
+
+@checked
+def with_options(**options: Unpack[Options]):
+    return options
+
+
+def test_options_by_name_are_checked():
+    assert with_options(size=np.int64(2)) == {"size": 2}
+    with pytest.raises(hj.DefinitionError, match="^with_options: `size` must be an integer"):
+        with_options(size=0)
+
+
+def test_wrong_numbers_of_arguments_are_left_to_python():
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'x'"):
+        checked(_one)()
+    with pytest.raises(TypeError, match="unexpected keyword argument 'y'"):
+        checked(_one)(1, y=2)
+    with pytest.raises(TypeError, match="takes 1 positional argument but 2 were given"):
+        checked(_one)(1, 2)
+
+
+def _one(x: int):
+    return x
+
+
+def test_a_checked_function_looks_as_before():
+    assert several.__doc__ == "What it does." and several.__name__ == "several"
+    assert list(inspect.signature(several).parameters) == ["a", "b", "rest", "c", "options"]
+    assert pickle.loads(pickle.dumps(several)) is several
+    assert "an integer from 1 to" in str(inspect.signature(several))
+
+
+def test_little_of_this_package_stands_in_the_traceback():
+    try:
+        several("1")
+    except hj.DefinitionError as error:
+        frames = [frame.name for frame in traceback.extract_tb(error.__traceback__)]
+        # (The import hook of these tests adds its own.)
+        own = [name for name in frames if not name.startswith("wrapped_fn")]
+        assert own == ["test_little_of_this_package_stands_in_the_traceback", "call"]
+        assert error.__cause__ is None and error.__suppress_context__
+
+
+@checked
+class Module(eqx.Module):
+    n: Count = eqx.field(static=True)
+    x: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+
+    def method(self, k: Count):
+        return k
+
+    @classmethod
+    def make(cls, n: Count):
+        return cls(n)
+
+    @staticmethod
+    def alone(n: Count):
+        return n
+
+    def __call__(self, k: Count):
+        return k
+
+    def _hidden(self, k: Count):
+        return k
+
+
+class Heir(Module):
+    z: int = eqx.field(static=True, default=0)
+
+
+def test_a_class_is_checked_where_it_is_built_and_used():
+    module = Module(np.int64(3), 1)
+    assert type(module.n) is int and module.make(2).n == 2 and module.alone(1) == module(1) == 1
+    for bad, name in [
+        (lambda: Module(0), "Module: `n`"),
+        (lambda: module.method(0), "Module.method: `k`"),
+        (lambda: Module.make(0), "Module.make: `n`"),
+        (lambda: Module.alone(0), "Module.alone: `n`"),
+        (lambda: module(0), "Module.__call__: `k`"),
+        (lambda: dataclasses.replace(module, n=0), "Module: `n`"),
+    ]:
+        with pytest.raises(hj.DefinitionError, match=f"^{name} must be an integer"):
+            bad()
+    assert module._hidden(0) == 0
+    assert Heir(1, z=2).z == 2
+    assert jax.tree_util.tree_map(lambda x: x, module).n == 3
+
+
+@checked
+class Pair(NamedTuple):
+    first: Positive
+    second: str = "b"
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Data:
+    first: Positive
+    second: str = "b"
+
+
+@pytest.mark.parametrize("cls", [Pair, Data])
+def test_named_tuples_and_dataclasses_are_checked(cls):
+    assert type(cls(1).first) is float
+    assert pickle.loads(pickle.dumps(cls(1))) == cls(1)
+    with pytest.raises(hj.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"):
+        cls(1, second=2)
+
+
+@checked
+def summed(x: Annotated[Numbers, Reals("n")], scale: Scalar = 1.0, *, power: Positive = 1.0):
+    return jnp.sum(jnp.asarray(x) ** power) * scale
+
+
+@checked
+def on_host(x: Annotated[Numbers, Reals("n")]):
+    return float(np.sum(x))
+
+
+@checked
+def around(x: Annotated[Numbers, Reals("n")]):
+    return on_host(x)
+
+
+def test_arrays_may_be_traced():
+    x = jnp.arange(1.0, 4.0)
+    assert jax.jit(summed)(x) == 6
+    assert jax.grad(lambda s: summed(x, s))(2.0) == 6
+    assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
+    np.testing.assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
+    with pytest.raises(hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"):
+        jax.jit(summed)(1.0)
+
+
+TRANSFORMS = {"jit": jax.jit, "vmap": lambda f: lambda x: jax.vmap(f)(x[None]), "grad": jax.grad}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
+def test_where_values_are_needed_a_sentence_says_so(transform):
+    x = jnp.arange(3.0)
+    with pytest.raises(
+        hj.DefinitionError, match="^summed: `power` must be .* traces it: call this"
+    ):
+        transform(lambda x: summed(x, power=x[0]))(x)
+    for function, name in [(on_host, "on_host"), (around, "around")]:
+        with pytest.raises(hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"):
+            transform(function)(x)
+    assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})
+
+
+def test_errors_of_jax_that_are_not_about_arguments_pass():
+    @checked
+    def function(f: Callable):
+        return jax.jit(f)(1.0)
+
+    with pytest.raises(jax.errors.TracerBoolConversionError):
+        function(lambda x: 1 if x > 0 else 2)
+
+
+def test_annotations_without_a_kind_are_an_error():
+    with pytest.raises(TypeError, match="no kind for the annotation"):
+        kind_of(Literal)
