@@ -16,6 +16,10 @@ from ...experiments.design.partition import check_sharing, meets_itself, regular
 from .crest_test import CrestTest, compare_crest_factors
 
 
+Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
+"""Experiments, or parts of them one after the other."""
+
+
 # Largest change of a line of the input from one window to the next, relative to the largest line.
 # Doubled: inputs that repeat half as well pass, and the noise of their estimates is overrated.
 _REPEATS = 1e-2
@@ -106,16 +110,12 @@ class SpectralSums(NamedTuple):
         return out
 
 
-def spectral_sums(
-    data: ExperimentData | Iterable[ExperimentData], options: SumOptions
-) -> SpectralSums:
+def spectral_sums(data: Experiments, options: SumOptions) -> SpectralSums:
     """The sums over all experiments, which may come in parts.
 
     **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
     other, if records are too short, or if parts do not belong together.
     """
-    if not 0 < options.threshold < 1:
-        raise DefinitionError(f"threshold must lie between 0 and 1, not {options.threshold}.")
     if isinstance(data, ExperimentData):
         total, summary = _sums_of_part(data, options, 0), data.summary()
     else:

@@ -1,11 +1,14 @@
 """State-space models from measured responses: minimal, with dimensions that vary."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers, names
+from ..._core.boundary.arrays import Integers, Reals
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Order, SignalNames
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
@@ -27,14 +30,15 @@ _SHORTEST_HORIZON = 8
 _SMALLEST_ERROR = 1e-15
 
 
+@checked
 def realize(
-    source: HTF | SeriesFit | Numbers,
-    dims: int | Sequence[int] | Int[np.ndarray, " N"] | None = None,
+    source: HTF | SeriesFit | Annotated[Numbers, Reals("N lags ny nu")],
+    dims: Order | Annotated[Numbers, Integers("N", sign="positive")] | None = None,
     *,
-    order: int = 1,
-    horizon: int | None = None,
-    outputs: str | Sequence[str] | None = None,
-    inputs: str | Sequence[str] | None = None,
+    order: Order = 1,
+    horizon: Count | None = None,
+    outputs: SignalNames | None = None,
+    inputs: SignalNames | None = None,
 ) -> LDTP:
     r"""A minimal periodic state-space model with the responses given.
 
@@ -79,8 +83,6 @@ def realize(
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
     else:
         markov = np.asarray(source)
-        if not np.isfinite(markov).all():
-            raise DefinitionError("the Markov parameters hold NaN or infinity.")
         N, lags = markov.shape[:2]
         p = _horizon(horizon, N) if horizon is not None else min(_horizon(None, N), (lags - 1) // 2)
         if p < 1 or lags < 2 * p + 1:
@@ -107,8 +109,6 @@ def realize(
 
 
 def _horizon(horizon: int | None, N: int) -> int:
-    if horizon is not None and horizon < 1:
-        raise DefinitionError(f"a horizon is at least 1 section, not {horizon}.")
     return max(_SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
 
 
@@ -120,10 +120,8 @@ def _chosen(dims, N: int) -> list[int] | None:
     if dims is None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
-    if chosen.shape != (N,) or chosen.dtype.kind not in "iu" or (chosen < 1).any():
-        raise DefinitionError(
-            f"dims must be one positive integer, or one for each of {N} sections, not {dims}."
-        )
+    if chosen.shape != (N,):
+        raise DefinitionError(f"`dims` must be one for each of {N} sections, not {len(chosen)}.")
     return [int(d) for d in chosen]
 
 
