@@ -6,6 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
 from ..identify.rational.fit import RationalFit
@@ -19,12 +21,13 @@ _FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")]
 
 
+@checked
 def magnitude(
     *htfs: HTF,
     output: str | int = 0,
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
-    decades: int | float = 5,
+    decades: Positive = 5,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -40,7 +43,7 @@ def magnitude(
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
     if not htfs:
-        raise DefinitionError("there is no HTF to draw.")
+        raise DefinitionError("`htfs` holds no HTF to draw.")
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
@@ -60,12 +63,13 @@ def magnitude(
     return Plot(axes)
 
 
+@checked
 def harmonics(
     families: Mapping[str, HTF | Sequence[HTF]],
     harmonics: Sequence[int] = (0, 1, -1),
     *,
     input: str | int = 0,
-    decades: int | float = 5,
+    decades: Positive = 5,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -95,6 +99,7 @@ def harmonics(
     return Plot(axes)
 
 
+@checked
 def bode(
     *htfs: HTF,
     fits: Fit | Sequence[Fit] = (),
@@ -118,7 +123,7 @@ def bode(
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
     if not htfs:
-        raise DefinitionError("there is no HTF to draw.")
+        raise DefinitionError("`htfs` holds no HTF to draw.")
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
@@ -159,6 +164,7 @@ def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) ->
     _legend(upper, htfs)
 
 
+@checked
 def bodes(
     families: Mapping[str, HTF | Sequence[HTF]],
     *,
@@ -198,7 +204,7 @@ _FIT_NAMES = {RationalFit: "rational fit", StructuredFit: "structured fit"}
 def _columns(families) -> list[tuple[str, tuple[HTF, ...]]]:
     columns = [(k, (v,) if isinstance(v, HTF) else tuple(v)) for k, v in dict(families).items()]
     if not columns or any(not htfs for _, htfs in columns):
-        raise DefinitionError("every family needs at least one HTF.")
+        raise DefinitionError("`families` must hold at least one HTF in each family.")
     if len({htf.outputs for _, htfs in columns for htf in htfs}) > 1:
         raise DefinitionError("the families must have the same outputs to share a figure.")
     return columns
@@ -213,7 +219,7 @@ def _index(names: Sequence[str], which: str | int) -> int:
         return names.index(which)
     if not isinstance(which, str) and -len(names) <= which < len(names):
         return int(which)
-    raise DefinitionError(f"there is no {which!r} among {', '.join(names)}.")
+    raise DefinitionError(f"there is no {which!r} (`output` or `input`) among {', '.join(names)}.")
 
 
 def _sorted(htf: HTF):

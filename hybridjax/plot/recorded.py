@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Complex
 
+from .._core.boundary.checked import checked
 from ..identify.series.series_fit import SeriesFit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
@@ -13,6 +14,7 @@ from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
+@checked
 def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
     """Periods of the cycles, one after the other, and how they are distributed."""
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
@@ -34,6 +36,7 @@ def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
     return Plot(axes)
 
 
+@checked
 def section_data(
     data: SectionData, *, labels: Mapping[str, str] | None = None, ax: AxesLike | None = None
 ) -> Plot:
@@ -84,6 +87,7 @@ def section_data(
     return Plot(axes)
 
 
+@checked
 def impulse_responses(
     found: ImpulseResponses,
     *,
@@ -122,6 +126,7 @@ def impulse_responses(
     return Plot(axes)
 
 
+@checked
 def multiplier_regions(
     fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: AxesLike | None = None
 ) -> Plot:

@@ -4,12 +4,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .._core.boundary.checked import checked
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, label_of, panels
 
 
+@checked
 def experiment(
     data: ExperimentData,
     index: int = 0,
@@ -26,7 +28,7 @@ def experiment(
     """
     S, n, _ = data.u.shape
     if not -S <= index < S:
-        raise DefinitionError(f"there is no experiment {index}; there are {S}.")
+        raise DefinitionError(f"there is no experiment with `index` {index}; there are {S}.")
     index = index % S
     time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]

@@ -1,10 +1,10 @@
 """Slow changes of signals that are no response to the inputs."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive, SignalNames
 from ..errors import DefinitionError
 from .phase.winding import Phase
 from .recording import Recording, Trial
@@ -24,8 +24,9 @@ def check_drift(cycles: int | float) -> None:
         raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles}.")
 
 
+@checked
 def without_drift(
-    recording: Recording, phase: Phase, signals: str | Sequence[str], cycles: int | float
+    recording: Recording, phase: Phase, signals: SignalNames, cycles: Positive
 ) -> Recording:
     """A recording without the slow drift of some signals, such as that of sensors.
 

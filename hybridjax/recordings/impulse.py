@@ -6,6 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
@@ -54,12 +56,13 @@ class ImpulseResponses(eqx.Module):
         )
 
 
+@checked
 def impulse_responses(
     fit: SeriesFit,
     data: SectionData,
-    cycles: int | float = 3,
+    cycles: Positive = 3,
     *,
-    width: int | float | None = None,
+    width: Positive | None = None,
 ) -> ImpulseResponses:
     """The responses of a fit to a push at each phase, with standard errors.
 
@@ -84,8 +87,8 @@ def impulse_responses(
     if width is None:
         edge = min(input_band(data))
         width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
-    if lags < 2 or width < 0:
-        raise DefinitionError(f"cycles and width must be positive, not {cycles} and {width}.")
+    if lags < 2:
+        raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
     reach = int(np.ceil(_PUSH_REACH * width * N))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     responses = _responses(fit, max(fit.lead + lags + reach, R))

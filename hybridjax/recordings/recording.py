@@ -1,16 +1,21 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
 from .smoothing import spline
 
+
+Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
+"""In Hz; infinite: all of it."""
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
 # nothing changes, this is rounding.
@@ -34,6 +39,7 @@ class Trial(eqx.Module):
     name: str = eqx.field(static=True)
 
 
+@checked
 class Recording(eqx.Module):
     """Sampled signals of one or several trials. Nothing is resampled.
 
@@ -166,9 +172,7 @@ class Recording(eqx.Module):
             trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
         return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
 
-    def mark(
-        self, event: str, crossing: Crossing, *, bandwidth: int | float = np.inf
-    ) -> "Recording":
+    def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
         """The same with one more event: a signal crosses a level.
 
         Jumps against the direction (an angle that begins anew) are no events, jumps along it are.

@@ -1,12 +1,13 @@
 """From sampled signals to data at the sections of a cycle."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive, SectionCount, SignalNames
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
@@ -28,18 +29,19 @@ _N_SECTIONS = 32
 _ROUNDING = 1e-9
 
 
+@checked
 def section_data(
     recording: Recording,
     phase: Phase | PhaseDefinition,
     *,
-    inputs: str | Sequence[str],
-    outputs: str | Sequence[str],
-    n_sections: int | None = None,
-    bandwidth: int | float | None = None,
+    inputs: SignalNames,
+    outputs: SignalNames,
+    n_sections: SectionCount | None = None,
+    bandwidth: Positive | None = None,
     sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
-    drift: int | float | None = None,
-    max_gap: int | float | None = None,
+    drift: Positive | None = None,
+    max_gap: Positive | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
 
@@ -151,8 +153,6 @@ def _number_of_sections(given: int | None, phase: Phase) -> int:
             "sections: give it once."
         )
     N = next((n for n in (given, phase.n_sections) if n is not None), _N_SECTIONS)
-    if N < 1:
-        raise DefinitionError(f"there must be one section or more, not {N}.")
     return N
 
 

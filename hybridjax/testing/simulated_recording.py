@@ -1,12 +1,17 @@
 """Recordings of simulated systems, whose truth is known."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive
 from ..engine.settings import EXPERIMENT
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
@@ -15,14 +20,15 @@ from ..sections.clock import ClockPhase
 from ..systems.output import Output
 
 
+@checked
 def simulate_recording(
     cycle: LimitCycle,
-    force: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
+    force: Annotated[Numbers, Reals("S n nu")],
     outputs: Sequence[str | Output] | str | Output,
     *,
-    rate: int | float = 500,
-    steps: int = 4,
-    accuracy: float = EXPERIMENT,
+    rate: Positive = 500,
+    steps: Count = 4,
+    accuracy: Positive = EXPERIMENT,
 ) -> Recording:
     """What instruments would see of a system that is perturbed by a force, given as samples.
 

@@ -80,12 +80,12 @@ def told(error: hj.HybridJaxError, name: str, value) -> str:
     return "" if named else f"UNNAMED {name}: {text}"
 
 
-def rows(things: Things):
+def rows(things: Things, only: list[str]):
     """Name, function, good arguments, argument and its value of each call."""
     for about in (about_models, about_data, about_plots):
         for name, function, good, arguments in about.calls(things):
             for argument, values in arguments.items():
-                for value in values:
+                for value in values if not only or name in only else ():
                     yield name, function, good, argument, value
 
 
@@ -93,17 +93,16 @@ def main() -> None:
     hj.enable_x64()
     matplotlib.use("agg")
     signal.signal(signal.SIGALRM, ring)
-    only = sys.argv[1:]
     found, home = {}, os.getcwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        for name, function, good, argument, value in rows(Things()):
-            if only and name not in only:
-                continue
+        for name, function, good, argument, value in rows(Things(), sys.argv[1:]):
+            wrong = attempt(function, good, argument, value)
             key = f"{name}({argument}={label(value)})"
-            found[key] = attempt(function, good, argument, value)
+            found[key] = found.get(key) or wrong
             pyplot.close("all")
-            print(key, found[key][:60], file=sys.stderr, flush=True)
+            if wrong:
+                print(f"{key}: {wrong}", file=sys.stderr, flush=True)
         left = sorted(path.name for path in pathlib.Path(folder).iterdir())
         os.chdir(home)
     print(json.dumps({"calls": found, "files": left}, indent=1))

@@ -5,11 +5,12 @@ same memory for any number of experiments, and those of two sets of experiments 
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from ..._core.boundary.stream import Stream
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.partition import check_sharing, meets_itself, regular

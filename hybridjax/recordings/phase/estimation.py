@@ -1,5 +1,7 @@
 """From a definition of phase to the phase of a recording."""
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...sections.abstract import AbstractSections
 from ...sections.crossing import AtEvent, Crossing
@@ -14,11 +16,12 @@ PhaseDefinition = KinematicPhase | Crossing | AtEvent | AngleFunction
 """What the phase of a recording may be defined by; see `estimate_phase`."""
 
 
+@checked
 def estimate_phase(
     recording: Recording,
     definition: PhaseDefinition,
     *,
-    bandwidth: int | float | None = None,
+    bandwidth: Positive | None = None,
     causal: bool = False,
 ) -> Phase:
     """The phase of every trial.
@@ -51,7 +54,6 @@ def estimate_phase(
     recording cannot have (functions of a state, charts), a phase that does not wind, or a recording
     of less than two cycles.
     """
-    bandwidth = None if bandwidth is None else float(bandwidth)
     if isinstance(definition, Crossing):
         return from_crossings(recording, definition, bandwidth, causal)
     if isinstance(definition, KinematicPhase):
