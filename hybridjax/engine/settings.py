@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.precision import at_precision
+from .._core.precision import at_precision, real
 from ..errors import DefinitionError
 from .solver.step import Step
 
@@ -41,12 +41,8 @@ ROUNDING = 4e-15, 2e-6
 _TIMES_ROUNDING = 10.0
 
 
-def _number(x) -> Array:
-    return jnp.asarray(x, float)
-
-
 def _numbers(x) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
+    return None if x is None else real(x)
 
 
 class Settings(eqx.Module):
@@ -56,9 +52,9 @@ class Settings(eqx.Module):
     `rtol * |q[k]| + atol * scale[a, k]`.
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    rtol: Float[Array, ""] = eqx.field(converter=real, default=SIMULATION)
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    atol: Float[Array, ""] = eqx.field(converter=real, default=SIMULATION)
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True, default=256)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
