@@ -14,6 +14,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from .._core.writing import replacing
 from ..errors import DefinitionError
 
 
@@ -166,15 +167,16 @@ def save(path: str | os.PathLike, plot: Plot | Figure | Axes, dpi: int = 150) ->
     path = Path(path)
     if path.suffix in (".png", ".pdf"):
         path = path.with_suffix("")
-    paths = tuple(path.with_name(path.name + suffix) for suffix in (".png", ".pdf"))
+    if not path.name:
+        raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
+    paths = path.with_name(path.name + ".png"), path.with_name(path.name + ".pdf")
     layout = figure.get_layout_engine()
     try:
         with matplotlib.rc_context(_FONTS_IN_FILES):
             for one in paths:
-                figure.savefig(one, dpi=dpi)
+                with replacing(one) as new:
+                    figure.savefig(new, format=one.suffix[1:], dpi=dpi)
                 figure.set_layout_engine("none")  # the second file as the first
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
     finally:
         if layout is not None:
             figure.set_layout_engine(layout)

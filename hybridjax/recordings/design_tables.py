@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from .._core.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
 from .phase.winding import Phase
@@ -55,20 +56,12 @@ def write_design(
         time = np.arange(int(n / N * period * rate)) / rate
         u = u[:, np.minimum((time * N / period + _ROUNDING).astype(int), n - 1)]
         place = time[:, None]
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with open(temporary, "w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow([*header, *design.input_names])
-            for s in range(S):
-                for row in np.concatenate([place, u[s]], axis=1):
-                    table.writerow([s, *(f"{x:.10g}" for x in row)])
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow([*header, *design.input_names])
+        for s in range(S):
+            for row in np.concatenate([place, u[s]], axis=1):
+                table.writerow([s, *(f"{x:.10g}" for x in row)])
 
 
 def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
