@@ -10,6 +10,7 @@ import inspect
 import json
 import os
 import reprlib
+import textwrap
 import types
 import typing
 from collections.abc import Mapping
@@ -81,7 +82,8 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
     try:
         thing = _put_together(kind, header["static"], members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise damaged(path, f"its content is no {kind.__name__} ({error})") from error
+        reason = textwrap.shorten(str(error), 200)
+        raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
     if (wrong := _wrong_field(thing)) is not None:
         raise damaged(path, wrong)
     return thing

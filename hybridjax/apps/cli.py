@@ -1,9 +1,11 @@
 """The command line. Nothing heavy is imported before the arguments are known to be good."""
 
+import _thread
 import argparse
+import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from .. import __version__
 from .option_types import (
@@ -38,12 +40,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from ..errors import HybridJaxError
 
     try:
-        return options.run(options)
+        with _interruptible():
+            return options.run(options)
     except HybridJaxError as error:
         sys.exit(f"hybridjax: {error}")
     except KeyboardInterrupt:
         print("hybridjax: interrupted.", file=sys.stderr)
         sys.exit(130)
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """An interruption that Python ignores, since it came in a callback (as JAX has one in the
+    collector of garbage), comes again."""
+    usual = sys.unraisablehook
+
+    def hook(unraisable):
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            _thread.interrupt_main()
+        else:
+            usual(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
 
 
 def _parser() -> argparse.ArgumentParser:
