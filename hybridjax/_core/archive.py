@@ -5,16 +5,14 @@ and the array `header`. Nothing in a file is ever executed: there is no pickle, 
 only the kinds that it asks for, by their own checked constructors.
 """
 
-import contextlib
 import dataclasses
 import inspect
-import io
 import json
 import os
+import reprlib
+import textwrap
 import types
 import typing
-import uuid
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,14 +23,19 @@ from jaxtyping import jaxtyped
 
 from .. import __version__
 from ..errors import DefinitionError, FileFormatError, HybridJaxError
+from . import limits
+from .npz import damaged, read_arrays
+from .writing import replacing
 
 
 _FORMAT, _VERSION = "hybridjax", 2
 _HEADER = "header"
 
 
-def write_module(path: Path, thing: eqx.Module) -> None:
+def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
     """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
+
+    `part`: which part of a larger whole it is.
 
     **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
     written.
@@ -46,40 +49,44 @@ def write_module(path: Path, thing: eqx.Module) -> None:
         "format_version": _VERSION,
         "package_version": __version__,
         "kind": kind,
+        "part": part,
         "static": static,
         "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
         "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
     }
     text = json.dumps(header, indent=1, default=lambda x: x.item())
-    _write(path, {_HEADER: np.array(text), **arrays})
+    with replacing(path) as temporary, open(temporary, "xb") as file:
+        np.savez(file, allow_pickle=False, **{_HEADER: np.array(text)}, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
 
 
-def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
-    """Read a module of one of these kinds.
+def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) -> Any:
+    """Read a module of one of these kinds; `part`: as it was written with, if that matters.
 
     **Raises:** `DefinitionError` if the file cannot be read; `FileFormatError` if it is damaged, of
     another format or version, or holds something else.
     """
     try:
-        content = path.read_bytes()
+        members = read_arrays(path)
     except OSError as error:
         raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
-    members = _unpack(path, content)
     header = _read_header(path, members.pop(_HEADER, None), kinds)
     kind = kinds[header["kind"]]
+    if part is not None and part != header.get("part"):
+        raise FileFormatError(
+            f"'{path}' was replaced by another file: delete it, and make it again."
+        )
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
     try:
         thing = _put_together(kind, header["static"], members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise damaged(path, f"its content is no {kind.__name__} ({error})") from error
+        reason = textwrap.shorten(str(error), 200)
+        raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
     if (wrong := _wrong_field(thing)) is not None:
         raise damaged(path, wrong)
     return thing
-
-
-def damaged(path: Path, reason: str) -> FileFormatError:
-    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}.")
 
 
 def _taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -110,6 +117,8 @@ def _put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> 
         if field.metadata.get("static", False):
             if name in static:
                 values[name] = _tuples(static.pop(name))
+                if not _matches(values[name], field.type) or not _moderate(values[name]):
+                    raise ValueError(f"{name} is {reprlib.repr(values[name])}")
             elif field.default is dataclasses.MISSING:
                 raise other
         elif inner is not None and name in static:
@@ -129,45 +138,11 @@ def _module_in(hint: Any) -> type | None:
     return next((x for x in options if isinstance(x, type) and issubclass(x, eqx.Module)), None)
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """All or nothing: a temporary file in the same folder takes the place of `path`."""
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        with open(temporary, "xb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-
-
-def _unpack(path: Path, content: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an npz file. Whole members are read, so that their checksums are checked."""
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")
-    try:
-        arrays = {}
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            for info in archive.infolist():
-                if info.file_size > len(content):  # files are not compressed
-                    raise ValueError("a member is larger than the file")
-                stream = io.BytesIO(archive.read(info))
-                array = np.lib.format.read_array(stream, allow_pickle=False)
-                if stream.read(1):
-                    raise ValueError("an array ends before its data")
-                arrays[info.filename.removesuffix(".npy")] = array
-        return arrays
-    except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
-        raise damaged(path, str(error) or type(error).__name__) from error
-
-
 def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:
     try:
-        header = json.loads(array.item() if array is not None else "")
+        if array is None or array.nbytes > limits.TEXT:
+            raise ValueError
+        header = json.loads(array.item())
         name, version = header["format"], header["format_version"]
     except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
         name = None
@@ -189,6 +164,13 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
 def _tuples(value: Any) -> Any:
     """JSON's lists as the tuples that they were."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _moderate(value: Any) -> bool:
+    """Whether no whole number in it is larger than a header may declare."""
+    if isinstance(value, tuple):
+        return all(map(_moderate, value))
+    return not isinstance(value, int) or abs(value) <= limits.COUNT
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import DefinitionError
+from .precision import require_x64
 from .tracing import is_traced
 
 
@@ -20,8 +21,10 @@ Numbers = npt.ArrayLike | Sequence | int | float
 def real_array(name: str, value: Any, ndim: int) -> jax.Array:
     """`value` as a real floating-point array with `ndim` axes.
 
-    **Raises:** `DefinitionError` if it is ragged, complex, not a number, or has other axes.
+    **Raises:** `DefinitionError` if it is ragged, complex, not a number, or has other axes;
+    `PrecisionError` in single precision.
     """
+    require_x64()
     if not isinstance(value, jax.Array):
         try:
             value = np.asarray(value)

@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import PrecisionError
+from .tracing import is_inside_program
 
 
 def enable_x64() -> None:
     """Switch JAX to 64-bit floating point for this process.
 
     hybridjax never does this at import, since the switch is global to JAX. Call it once, before
-    any model is built: arrays made earlier stay 32 bit.
+    anything is computed. Models, guesses, sections and settings may be built earlier; arrays of
+    `jax.numpy` that were made earlier stay 32 bit, and are refused.
     """
     jax.config.update("jax_enable_x64", True)
 
@@ -25,21 +27,35 @@ def require_x64(*trees: Any) -> None:
     """Refuse to compute in single precision.
 
     **Raises:** `PrecisionError` if JAX runs in 32-bit mode, or if a floating-point leaf of one
-    of `trees` is 32 bit (a model that was built before `enable_x64()`).
+    of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
-    if not jax.config.read("jax_enable_x64"):
+    if not _is_double():
         raise PrecisionError(
             "JAX is in 32-bit mode, too coarse for limit cycles and their derivatives: call "
-            "`hybridjax.enable_x64()` before building the model."
+            "`hybridjax.enable_x64()` first."
         )
     for path, leaf in jax.tree_util.tree_leaves_with_path(trees):
         dtype = getattr(leaf, "dtype", None)
-        if dtype is not None and jnp.issubdtype(dtype, jnp.floating) and dtype != jnp.float64:
+        if dtype is None or not jnp.issubdtype(dtype, jnp.inexact):
+            continue
+        if dtype not in (jnp.float64, jnp.complex128):
             name = jax.tree_util.keystr(path[1:]).lstrip(".") or "argument"
             raise PrecisionError(
                 f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`. Switch 64-bit "
                 "mode on first, then build it again."
             )
+
+
+def real(x: Any) -> jax.Array:
+    """`x` as an array of floating-point numbers: a converter for fields of definitions.
+
+    Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
+    that a definition may be built before. Arrays of JAX remain what they are.
+    """
+    if isinstance(x, jax.Array) or _is_double() or is_inside_program():
+        return jnp.asarray(x, float)
+    with _precision(double=True):
+        return jnp.asarray(x, float)
 
 
 def at_precision(double: float, single: float) -> float:
@@ -49,11 +65,7 @@ def at_precision(double: float, single: float) -> float:
 
 def single_precision() -> contextlib.AbstractContextManager:
     """A context in which this thread computes in 32 bits, with what `single` returns."""
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(False)
-    from jax.experimental import disable_x64  # before JAX 0.8
-
-    return disable_x64()
+    return _precision(double=False)
 
 
 def single(tree: Any) -> Any:
@@ -67,3 +79,16 @@ def single(tree: Any) -> Any:
         return jnp.asarray(x.astype(narrow.get(x.dtype.kind, x.dtype)))
 
     return jax.tree_util.tree_map(convert, tree)
+
+
+def _is_double() -> bool:
+    return jax.config.read("jax_enable_x64")
+
+
+def _precision(double: bool) -> contextlib.AbstractContextManager:
+    """A context in which this thread computes in 64 bits, or in 32."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(double)
+    from jax.experimental import disable_x64, enable_x64  # before JAX 0.8
+
+    return enable_x64() if double else disable_x64()

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from .. import __version__
+from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 
 
@@ -33,6 +34,10 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
         summary["families"][name] = {
             "experiments": family.data.summary(),
+            "converged": bool(
+                family.structured.result == Result.OK
+                and np.all(family.rational.result == Result.OK)
+            ),
             "multipliers_from_linearization": _complex(family.ldtp.multipliers),
             "multipliers_fit_structured": _complex(family.structured.multipliers),
             "multipliers_fit_structured_error": family.structured.compare(true).max_error,

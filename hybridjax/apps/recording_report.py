@@ -1,13 +1,12 @@
 """The results of a recording in files, and in one page for a colleague."""
 
 import base64
+import contextlib
 import csv
 import html
 import io
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,72 +15,72 @@ import numpy as np
 
 from .. import __version__, plot
 from .._core.boundary.checked import checked
-from ..errors import DefinitionError
+from .._core.results_folder import results_folder
 from ..io import save
 from ..linear.htf import HTF
 from ..plot import look
 from ..recordings.identification import Identification
 
 
-_PAGE = "report.html"
+PAGE = "report.html"
 _POINTS = 240  # frequencies at which transfer functions are written
 
 
 @checked
 def write_report(folder: str | os.PathLike, found: Identification) -> Path:
-    """Write all results of a recording into a folder, which appears complete or not at all.
+    """Write all results of a recording into a folder. They appear when all of them are ready.
 
     - `report.html`: everything in one page that needs no other file.
     - `sections.csv`: deviations of inputs and outputs at the sections. `cycle.csv`: their average.
     - `htf.npz`, `fit.npz`: for `hj.load`. `summary.json`: the numbers.
     - `figures/`: PNG and PDF.
 
+    Other files in the folder stay as they are. Results of an earlier report are replaced, unless
+    they were changed since; a hidden list in the folder says which they are.
+
     **Returns:** the path of the page.
 
-    **Raises:** `DefinitionError` if the folder holds other files, or cannot be written.
+    **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these names,
+    or the folder cannot be written.
     """
-    folder = Path(folder)
-    check_folder(folder)
-    temporary = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}")
-    try:
-        (temporary / "figures").mkdir(parents=True)
-        from matplotlib import pyplot
-
-        htf = _htf(found)
-        images = {}
-        for name, drawn in _figures(found, htf).items():
-            image, _ = look.save(temporary / "figures" / name, drawn)
-            images[name] = base64.b64encode(image.read_bytes()).decode()
-            pyplot.close(drawn.figure)
-        save(temporary / "htf.npz", htf)
-        save(temporary / "fit.npz", found.fit)
-        _write_sections(found, temporary)
-        summary = summarize(found)
-        (temporary / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-        (temporary / _PAGE).write_text(_page(found, images), encoding="utf-8")
-        _take_place(temporary, folder)
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{folder}': {error.strerror}.") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return folder / _PAGE
+    with report_folder(folder, found.data.inputs) as new:
+        write_results(new, found)
+    return Path(folder) / PAGE
 
 
-def check_folder(folder: Path) -> None:
-    """**Raises:** `DefinitionError` unless results may be written there."""
-    if folder.is_dir():
-        if any(folder.iterdir()) and not (folder / _PAGE).exists():
-            raise DefinitionError(f"'{folder}' holds other files: choose a new folder.")
-    elif folder.exists():
-        raise DefinitionError(f"'{folder}' is a file: choose a new folder.")
+def report_folder(
+    folder: str | os.PathLike, inputs: Sequence[str]
+) -> contextlib.AbstractContextManager[Path]:
+    """A new folder for the results, which at the end are put into `folder`."""
+    files = (PAGE, "sections.csv", "cycle.csv", "htf.npz", "fit.npz", "summary.json")
+    figures = ["phase", "sections", "multipliers", "impulse_responses", "validation"]
+    for by_input in _by_input(inputs):
+        figures += [f"bode{by_input}", f"harmonics{by_input}"]
+    images = [f"figures/{name}{suffix}" for name in figures for suffix in (".png", ".pdf")]
+    return results_folder(Path(folder), "report", [*files, *images])
 
 
-def _take_place(temporary: Path, folder: Path) -> None:
-    old = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}")
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(temporary, folder)
-    shutil.rmtree(old, ignore_errors=True)
+def _by_input(inputs: Sequence[str]) -> list[str]:
+    """What names of figures of each input end in."""
+    return [f"_{x.replace('/', '-')}" for x in inputs] if len(inputs) > 1 else [""]
+
+
+def write_results(folder: Path, found: Identification) -> None:
+    """Write all results into a folder that is new."""
+    from matplotlib import pyplot
+
+    (folder / "figures").mkdir()
+    htf = _htf(found)
+    images = {}
+    for name, drawn in _figures(found, htf).items():
+        image, _ = look.save(folder / "figures" / name, drawn)
+        images[name] = base64.b64encode(image.read_bytes()).decode()
+        pyplot.close(drawn.figure)
+    save(folder / "htf.npz", htf)
+    save(folder / "fit.npz", found.fit)
+    _write_sections(found, folder)
+    (folder / "summary.json").write_text(json.dumps(summarize(found), indent=1) + "\n")
+    (folder / PAGE).write_text(_page(found, images), encoding="utf-8")
 
 
 def summarize(found: Identification) -> dict[str, Any]:
@@ -127,8 +126,7 @@ def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
             "impulse_responses": plot.impulse_responses(found.responses),
             "validation": plot.validation(found.held_out.validation),
         }
-        for i, name in enumerate(htf.inputs):
-            suffix = f"_{name}" if len(htf.inputs) > 1 else ""
+        for i, suffix in enumerate(_by_input(htf.inputs)):
             figures[f"bode{suffix}"] = plot.bode(htf, input=i)
             size = {"width": look.COLUMN, "height": 0.3 + 1.6 * len(htf.outputs)}
             with look.panels(None, len(htf.outputs), 1, **size) as axes:

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import numpy as np
 from .. import __version__
 from .._core.compilation.compilation_cache import enable_compilation_cache
 from .._core.precision import enable_x64
+from .._core.results_folder import results_folder
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData
@@ -88,12 +89,28 @@ class _Clock:
 def reproduce(out: str | os.PathLike, protocol: Protocol) -> dict:
     """Run the protocol and write figures, `summary.json` and `results.npz` into the folder `out`.
 
+    They appear when all of them are ready, and replace those of an earlier run. Other files in the
+    folder stay as they are.
+
     **Returns:** what `summary.json` holds.
 
-    **Raises:** `DefinitionError` for a protocol that cannot be carried out or a folder that
-    cannot be written; `ComputationError` if a step of it fails.
+    **Raises:** `DefinitionError` for a protocol that cannot be carried out, a folder that cannot be
+    written, or one in which another file has the name of a result; `ComputationError` if a step
+    fails.
     """
-    out = _folder(out)
+    with results_folder(Path(out), "reproduce", _names(protocol.families)) as folder:
+        return _reproduce(folder, protocol)
+
+
+def _names(families: Sequence[str]) -> list[str]:
+    """Of all that is written."""
+    cycles = [f"fig1_cycle_{family}" for family in families]
+    figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
+    files = [f"{figure}{suffix}" for figure in figures for suffix in (".png", ".pdf")]
+    return ["summary.json", "results.npz", *files]
+
+
+def _reproduce(out: Path, protocol: Protocol) -> dict:
     enable_x64()
     enable_compilation_cache()
     clock = _Clock()
@@ -117,20 +134,6 @@ def reproduce(out: str | os.PathLike, protocol: Protocol) -> dict:
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))
     return summary
-
-
-def _folder(out) -> Path:
-    out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".write-test"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise DefinitionError(
-            f"the folder '{out}' cannot be written ({error.strerror}); choose another with --out."
-        ) from None
-    return out
 
 
 def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:

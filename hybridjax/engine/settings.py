@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
-from .._core.precision import at_precision
+from .._core.precision import at_precision, real
 from ..errors import DefinitionError
 from .solver.step import Step
 
@@ -46,11 +46,11 @@ _TIMES_ROUNDING = 10.0
 
 
 def _number(x: PositiveScalar) -> Array:
-    return jnp.asarray(x, float)
+    return real(x)
 
 
 def _numbers(x: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
+    return None if x is None else real(x)
 
 
 @checked

@@ -129,7 +129,7 @@ def simulate(
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
     and the step limit, if `throw`.
     """
-    require_x64(system)
+    require_x64(system, settings)
     check_system(system)
     s = Structure(system)
     a = s.chart_index(chart)
@@ -239,6 +239,7 @@ def _fields(system, t, chart, q, u):
 
 def _evaluate(system, names, t, chart, q):
     """Outputs (p,) each at points of trajectories, NaN where not defined."""
+    require_x64()
     s = Structure(system)
     outputs = s.resolve_outputs(names)
     values = np.full((len(names), t.shape[0]), np.nan)

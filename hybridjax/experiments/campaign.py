@@ -13,7 +13,6 @@ from tqdm import tqdm
 from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.memo import Memory
-from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
@@ -177,7 +176,6 @@ def prepare(
     `chunk`: how many of them are run together; by default all.
     """
     placed = as_placed(cycle, sections)
-    require_x64(cycle)
     z = placed.structure().resolve_outputs(outputs)
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy

@@ -51,6 +51,7 @@ class ResponseFunction(eqx.Module):
 
         **Raises:** `DefinitionError` for inputs of another shape.
         """
+        require_x64(system)
         u = jnp.asarray(u, float)
         N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
         if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
@@ -96,7 +97,6 @@ def response_function(
     **Raises:** `DefinitionError` for outputs, sections or an accuracy that do not exist.
     """
     placed = as_placed(cycle, sections)
-    require_x64(cycle)
     z = placed.structure().resolve_outputs(outputs)
     stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS_PER_PERIOD // placed.n_sections)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from .._core.precision import require_x64
 from ..engine.settings import STEADY_START, Settings
 from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
@@ -133,6 +134,7 @@ def steady_start(
 
     **Raises:** `DefinitionError` for inputs of another shape.
     """
+    require_x64(system)
     u = jnp.asarray(u, float)
     N, lanes = response.placed.n_sections, response.placed.lanes
     if u.ndim != 3 or u.shape[1] % N or 0 in u.shape:

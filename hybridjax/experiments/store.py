@@ -9,7 +9,7 @@ import hashlib
 import json
 import operator
 import os
-import uuid
+import reprlib
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,7 +20,10 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from .._core import limits
 from .._core.archive import read_module, write_module
+from .._core.npz import damaged
+from .._core.writing import made_folder, replacing
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
@@ -34,7 +37,8 @@ from .run import CHUNK
 
 
 _MANIFEST = "experiments.json"
-_FORMAT = "hybridjax experiments 3"
+_FORMAT = "hybridjax experiments 4"
+_DIGITS = 9  # more than numbers of chunks have
 # Cycles found on different machines are the same up to this: their times relative to the period,
 # their states relative to the states' sizes. Twice as much takes cycles for the same that differ
 # twice as much.
@@ -77,15 +81,21 @@ def store_experiments(
     rank, size = share
     if not 0 <= rank < size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
-    chosen = options_of(store_experiments, options)
-    campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
-    parts = chunks(len(campaign.inputs), chunk)
-    folder = Path(folder)
-    _open(folder, _describe(campaign, chunk))
+    chosen, folder = options_of(store_experiments, options), Path(folder)
+    with made_folder(folder):
+        campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
+        parts = chunks(len(campaign.inputs), chunk)
+        if len(parts) > limits.COUNT:
+            raise DefinitionError(
+                f"{len(campaign.inputs)} experiments in chunks of {chunk} are more than "
+                f"{limits.COUNT} files: take a larger `chunk`."
+            )
+        _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
     missing = [k for k in stored.missing() if k % size == rank]
     for k in tqdm(missing, "chunks", disable=not campaign.execution.progress):
-        write_module(stored.path(k), campaign.run(parts[k]))
+        path = stored.path(k)
+        write_module(path, campaign.run(parts[k]), path.stem)
     return stored
 
 
@@ -99,23 +109,27 @@ class StoredExperiments:
     def __init__(self, folder: str | os.PathLike):
         """**Arguments:** `folder`.
 
-        **Raises:** `DefinitionError` if `folder` holds no experiments, or chunks of others.
+        **Raises:** `DefinitionError` if `folder` holds no experiments, or chunks of others;
+        `FileFormatError` for an `experiments.json` that is damaged.
         """
         self.folder = Path(folder)
         about = _read(self.folder)
         if about is None:
             raise DefinitionError(f"'{folder}' holds no experiments: there is no {_MANIFEST}.")
         self._id = _identity(about)
-        self.experiments: int = about["experiments"]
-        self.chunk: int = about["chunk"]
-        self.n_sections: int = about["n_sections"]
-        known = {self.path(k).name for k in range(len(self))}
-        other = sorted(p.name for p in self.folder.glob("[!.]*.npz") if p.name not in known)
-        if other:
-            raise DefinitionError(
-                f"'{self.folder / other[0]}' does not belong to the experiments that "
-                f"'{_MANIFEST}' describes: take it out of the folder."
-            )
+        self.experiments, self.chunk, self.n_sections = (
+            _count(self.folder, about, name) for name in ("experiments", "chunk", "n_sections")
+        )
+        if len(self) > limits.COUNT:
+            raise damaged(self.folder / _MANIFEST, f"it declares {len(self)} chunks")
+        for name in sorted(p.name for p in self.folder.glob("[!.]*.npz")):
+            number = name.partition("-")[0]
+            k = int(number) if number.isdecimal() and len(number) < _DIGITS else len(self)
+            if k >= len(self) or name != self.path(k).name:
+                raise DefinitionError(
+                    f"'{self.folder / name}' does not belong to the experiments that "
+                    f"'{_MANIFEST}' describes: take it out of the folder."
+                )
 
     def __len__(self) -> int:
         """The number of chunks, whether they are there or not."""
@@ -131,29 +145,25 @@ class StoredExperiments:
         **Raises:** `FileFormatError` for a chunk that is damaged.
         """
         gone = []
+        there = {path.name for path in self.folder.iterdir()}
         for k in range(len(self)):
-            if not self.path(k).exists():
+            if self.path(k).name not in there:
                 gone.append(k)
             elif not zipfile.is_zipfile(self.path(k)):
-                raise FileFormatError(
-                    f"'{self.path(k)}' is damaged: delete it, and it will be run again."
-                )
+                raise damaged(self.path(k), "delete it, and it will be run again")
         return gone
 
     def __iter__(self) -> Iterator[ExperimentData]:
-        """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing."""
+        """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
+        `FileFormatError` if one is damaged, or is not the one that was written there."""
         self._complete()
         for k in range(len(self)):
-            yield read_module(self.path(k), {"ExperimentData": ExperimentData})
+            path = self.path(k)
+            yield read_module(path, {"ExperimentData": ExperimentData}, path.stem)
 
     def summary(self, limit: int = 5) -> str:
         """As `ExperimentData.summary`, of all experiments."""
-        self._complete()
-        result, failed_at = [], []
-        for k in range(len(self)):
-            with np.load(self.path(k)) as file:
-                result.append(file["result"])
-                failed_at.append(file["simulated.failed_at"])
+        result, failed_at = zip(*((part.result, part.failed_at) for part in self), strict=True)
         return summary(np.concatenate(result), np.concatenate(failed_at), self.n_sections, limit)
 
     def _complete(self) -> None:
@@ -173,16 +183,11 @@ class StoredExperiments:
 
 
 def _open(folder: Path, about: dict[str, Any]) -> None:
-    """Make the folder, or check that it was made for the same experiments."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (there := _read(folder)) is None:
-            temporary = folder / f".{_MANIFEST}.{uuid.uuid4().hex}"
-            temporary.write_text(json.dumps(about, indent=1))
-            os.replace(temporary, folder / _MANIFEST)
-            there = _read(folder)
-    except OSError as error:
-        raise DefinitionError(f"cannot write to '{folder}': {error.strerror}.") from error
+    """Describe the experiments in the folder, or check that it was made for the same ones."""
+    if (there := _read(folder)) is None:
+        with replacing(folder / _MANIFEST) as path:
+            path.write_text(json.dumps(about, indent=1))
+        there = _read(folder)
     assert there is not None
     for name, value in about.items():
         same = _same_cycle if name == "cycle" else operator.eq
@@ -196,14 +201,24 @@ def _open(folder: Path, about: dict[str, Any]) -> None:
 def _read(folder: Path) -> dict[str, Any] | None:
     path = folder / _MANIFEST
     try:
+        if path.stat().st_size > limits.TEXT:
+            raise ValueError
         about = json.loads(path.read_text())
         if about["format"] != _FORMAT:
             raise KeyError
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         raise FileFormatError(f"'{path}' is damaged, or of another version.") from error
     return about
+
+
+def _count(folder: Path, about: dict[str, Any], name: str) -> int:
+    """A whole number above zero in the manifest."""
+    value = about.get(name)
+    if type(value) is not int or value < 1:
+        raise damaged(folder / _MANIFEST, f"`{name}` is {reprlib.repr(value)}")
+    return value
 
 
 def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
@@ -244,10 +259,14 @@ def _same_cycle(mine: dict[str, Any], theirs: dict[str, Any]) -> bool:
     """Whether the sections lie on the same cycle; each is described by its points (t, q) at the
     sections and by the scales of these, of which that of time is the period."""
     points, scales = np.array(mine["points"]), np.array(mine["scales"])
-    if points.shape != np.shape(theirs["points"]):
+    try:
+        others, other_scales = (np.array(theirs[x], float) for x in ("points", "scales"))
+    except (TypeError, ValueError, KeyError):
         return False
-    apart = np.abs(points - theirs["points"]) / scales
-    ratio = np.array(theirs["scales"]) / scales
+    if (points.shape, scales.shape) != (others.shape, other_scales.shape):
+        return False
+    apart = np.abs(points - others) / scales
+    ratio = other_scales / scales
     period, sizes = ratio[:, 0], ratio[:, 1:]
     return bool(
         max(np.max(apart), np.max(np.abs(period - 1))) <= _SAME_CYCLE

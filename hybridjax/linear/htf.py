@@ -10,6 +10,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 from .._core.arguments import Numbers, names, real_array, require_finite
+from .._core.precision import require_x64
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .frequency_response import Harmonics, check_harmonics
@@ -295,6 +296,7 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if the two differ in frequencies, harmonics, sections, inputs
         or outputs, or have no `H_0`.
         """
+        require_x64()
         for name in ("n_sections", "harmonics", "inputs", "outputs"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:

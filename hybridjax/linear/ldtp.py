@@ -194,6 +194,7 @@ class LDTP(eqx.Module):
         """
         if n_lags < 1:
             raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
+        require_x64()
         return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
     def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
@@ -220,6 +221,7 @@ class LDTP(eqx.Module):
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""
+        require_x64()
         return time_response.monodromy(jnp.roll(self.A, -section, axis=0))
 
     def characteristic_polynomial(self) -> Float[Array, " coefficients"]:

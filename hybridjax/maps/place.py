@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compilation.compile import quick_jit
 from .._core.lanes.per_lane import by_lane
+from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes, only
@@ -49,6 +50,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     tangentially, or meets out of order.
     """
     family = as_family(sections)
+    require_x64(cycle, family)
     family.check(Structure(cycle.system))
     placed, first = _place(cycle, family)
     if not is_traced((cycle, family)):
@@ -68,6 +70,7 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
         )
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
+    require_x64(cycle)
     other = sections.cycle
     if other is cycle:
         return sections

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.compilation.compile import quick_jit
+from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..engine.tape import Tape
@@ -75,6 +76,7 @@ class PlacedSections(eqx.Module):
 
         **Raises:** `DefinitionError` for a name that is no output.
         """
+        require_x64()
         return _observe(self, tuple(self.structure().resolve_outputs(outputs).items))
 
     @property

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from .._core.compilation.compile import quick_jit
+from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.tracing import is_traced
 from ..engine.move import move
@@ -57,6 +58,7 @@ class SectionMap(eqx.Module):
     def __call__(
         self, q: ArrayLike, u: ArrayLike | None = None, t: ArrayLike | None = None
     ) -> Arrival:
+        require_x64()
         q = jnp.asarray(q, float)
         if q.shape != self.fixed_point.shape:
             raise DefinitionError(

@@ -109,7 +109,7 @@ def find_limit_cycle(
     """
     traced = is_traced((system, conserved))
     if not traced:
-        require_x64(system)
+        require_x64(system, guess, section, settings)
         check_system(system)
     s = Structure(system)
     settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from .._core.boundary.checked import checked
 from .._core.boundary.scalars import Whole
+from .._core.writing import replacing
 from ..errors import DefinitionError
 
 
@@ -175,15 +176,16 @@ def save(
     path = Path(path)
     if path.suffix in (".png", ".pdf"):
         path = path.with_suffix("")
-    paths = tuple(path.with_name(path.name + suffix) for suffix in (".png", ".pdf"))
+    if not path.name:
+        raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
+    paths = path.with_name(path.name + ".png"), path.with_name(path.name + ".pdf")
     layout = figure.get_layout_engine()
     try:
         with matplotlib.rc_context(_FONTS_IN_FILES):
             for one in paths:
-                figure.savefig(one, dpi=dpi)
+                with replacing(one) as new:
+                    figure.savefig(new, format=one.suffix[1:], dpi=dpi)
                 figure.set_layout_engine("none")  # the second file as the first
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
     finally:
         if layout is not None:
             figure.set_layout_engine(layout)

@@ -13,6 +13,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Positive, SectionCount
+from .._core.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
 from .phase.winding import Phase
@@ -60,20 +61,12 @@ def write_design(
         time = np.arange(int(n / N * period * rate)) / rate
         u = u[:, np.minimum((time * N / period + _ROUNDING).astype(int), n - 1)]
         place = time[:, None]
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with open(temporary, "w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file)
-            table.writerow([*header, *design.input_names])
-            for s in range(S):
-                for row in np.concatenate([place, u[s]], axis=1):
-                    table.writerow([s, *(f"{x:.10g}" for x in row)])
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(Path(path)) as new, open(new, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow([*header, *design.input_names])
+        for s in range(S):
+            for row in np.concatenate([place, u[s]], axis=1):
+                table.writerow([s, *(f"{x:.10g}" for x in row)])
 
 
 @checked

@@ -4,13 +4,14 @@ import csv
 import os
 import re
 import warnings
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from .._core import limits
 from .._core.boundary.checked import checked
+from .._core.npz import damaged, read_arrays
 from ..errors import DefinitionError, FileFormatError
 from .recording import Recording
 
@@ -53,7 +54,7 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
 
     **Raises:** as `read_recording`.
     """
-    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".npz": _npz, ".parquet": _parquet}
+    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".npz": read_arrays, ".parquet": _parquet}
     if path.suffix.lower() not in readers:
         raise DefinitionError(
             f"'{path}' ends in '{path.suffix}'; tables are read from .csv, .npz and .parquet files."
@@ -155,14 +156,6 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise FileFormatError(f"'{path}' is not an NPZ file of numbers, or damaged.") from error
-
-
 def _parquet(path: Path) -> dict[str, np.ndarray]:
     try:
         from pyarrow import ArrowInvalid, parquet
@@ -172,7 +165,12 @@ def _parquet(path: Path) -> dict[str, np.ndarray]:
             "`pip install pyarrow`."
         ) from error
     try:
-        table = parquet.read_table(path)
+        with parquet.ParquetFile(path) as file:
+            about = file.metadata
+            size = 8 * about.num_rows * about.num_columns
+            if size > limits.unpacked(path.stat().st_size):
+                raise damaged(path, f"it declares {about.num_rows} rows, and is not that large")
+            table = file.read()
     except (ArrowInvalid, OSError) as error:
         raise FileFormatError(f"'{path}' is not a Parquet file, or damaged.") from error
     return {name: table[name].to_numpy() for name in table.column_names}

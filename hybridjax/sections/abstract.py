@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.boundary.kinds import Scalar
+from .._core.precision import real
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
 from ..systems.structure import Structure as Structure
-from .crossing import Crossing, number
+from .crossing import Crossing
 
 
 class CyclePoint(NamedTuple):
@@ -97,7 +98,7 @@ def check_n_sections(n_sections: int) -> None:
 
 def as_anchor(x: Crossing | Scalar) -> Crossing | Array:
     """A crossing as it is, a number as an array."""
-    return x if isinstance(x, Crossing) else number(x)
+    return x if isinstance(x, Crossing) else real(x)
 
 
 def check_anchor(anchor: Crossing | Array | None, s: Structure) -> None:

@@ -5,20 +5,15 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.precision import real
 from ..errors import DefinitionError
 from ..systems.output import Output
 from ..systems.structure import Structure
 
 
 Direction = Literal["falling", "rising"]
-
-
-def number(x: ArrayLike) -> Array:
-    """`x` as a floating-point array, so that families can be differentiated in their numbers."""
-    return jnp.asarray(x, float)
 
 
 class Crossing(eqx.Module):
@@ -37,7 +32,7 @@ class Crossing(eqx.Module):
 
     function: str | Output | Callable[..., Any]
     direction: Direction = eqx.field(static=True)
-    value: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     charts: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

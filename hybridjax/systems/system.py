@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.precision import real
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -28,15 +28,15 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
-    return eqx.field(converter=lambda x: jnp.asarray(x, float), metadata=metadata, **options)
+    return eqx.field(converter=real, metadata=metadata, **options)
 
 
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    time: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    state: Float[Array, " n"] = eqx.field(converter=real)
+    time: Float[Array, ""] = eqx.field(converter=real, default=0.0)
 
 
 class HybridSystem(eqx.Module):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.precision import real
 from ..errors import DefinitionError
 
 
@@ -17,11 +18,11 @@ Direction = Literal["falling", "rising"]
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
 
-    period: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    offset: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    period: Float[Array, ""] = eqx.field(converter=real)
+    offset: Float[Array, ""] = eqx.field(converter=real, default=0.0)
 
     def __check_init__(self):
-        if not isinstance(self.period, jax.core.Tracer) and not 0 < self.period < jnp.inf:
+        if not isinstance(self.period, jax.core.Tracer) and not 0 < float(self.period) < jnp.inf:
             raise DefinitionError(
                 f"the period of a schedule must be positive and finite; it is {self.period}."
             )

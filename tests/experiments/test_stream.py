@@ -132,10 +132,10 @@ def test_an_interruption_leaves_whole_chunks_only(arguments, tmp_path, monkeypat
 
     write = hybridjax.experiments.store.write_module
 
-    def interrupted(path, thing):
+    def interrupted(path, thing, part):
         if "000001" in path.name:
             raise KeyboardInterrupt
-        write(path, thing)
+        write(path, thing, part)
 
     monkeypatch.setattr(hybridjax.experiments.store, "write_module", interrupted)
     with pytest.raises(KeyboardInterrupt):

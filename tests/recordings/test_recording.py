@@ -140,7 +140,7 @@ def test_other_bad_files(tmp_path):
     with pytest.raises(hj.DefinitionError, match="ends in '.xls'"):
         hj.read_recording(tmp_path / "x.xls")
     (tmp_path / "x.npz").write_text("not")
-    with pytest.raises(hj.errors.FileFormatError, match="not an NPZ file"):
+    with pytest.raises(hj.errors.FileFormatError, match="not an npz file"):
         hj.read_recording(tmp_path / "x.npz")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(hj.errors.FileFormatError, match="not a text file"):

@@ -148,12 +148,3 @@ def test_states_that_a_chart_does_not_carry_have_values_there():
     z = s.resolve_outputs(("yM", "ym"))
     np.testing.assert_array_equal(z(stance, 0.0, jnp.array([2.0, 1.0]), jnp.zeros(1)), [2.0, 0.0])
     assert s.state_names() == ("yM", "vM", "ym", "vm")
-
-
-def test_single_precision_is_refused():
-    with jax.enable_x64(False):
-        early = hj.models.VerticalHopper()
-        with pytest.raises(hj.errors.PrecisionError, match="enable_x64"):
-            hj.simulate(early, "stance", (2.0, 1.9), 1.0)
-    with pytest.raises(hj.errors.PrecisionError, match="`m` is float32"):
-        hj.find_limit_cycle(early)

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..._core import limits
 from ..._core.arguments import names
 from ...errors import DefinitionError
 from .partition import check_sharing, is_real, meets_itself, regular
@@ -130,10 +131,10 @@ class Design(eqx.Module):
         **Raises:** `DefinitionError` that names the experiment and the frequencies.
         """
         P, N = self.periods, self.n_sections
-        if N < 1 or P < 1:
-            raise DefinitionError(f"n_sections ({N}) and periods ({P}) must be at least 1.")
-        empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
-        if len(empty) or len(self.experiment) == 0:
+        check_window(N, P)
+        found = np.unique(self.experiment)
+        count = max(len(found), 1)
+        if self.experiments != count or not np.array_equal(found, np.arange(count)):
             raise DefinitionError("every experiment of a design needs at least one frequency.")
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
@@ -332,6 +333,19 @@ def _span(values: np.ndarray) -> str:
 
 def _count(number: int | str, noun: str) -> str:
     return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
+
+
+def check_window(n_sections: int, periods: int) -> None:
+    """**Raises:** `DefinitionError` for numbers below one, and windows that no memory holds."""
+    if n_sections < 1 or periods < 1:
+        raise DefinitionError(
+            f"n_sections ({n_sections}) and periods ({periods}) must be at least 1."
+        )
+    if n_sections * periods > limits.WINDOW:
+        raise DefinitionError(
+            f"{n_sections} sections in {periods} periods are more samples than an experiment may "
+            f"have ({limits.WINDOW}): take fewer."
+        )
 
 
 def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ...errors import DefinitionError
-from .design import Design, Number, Numbers, input_names, to_lines
+from .design import Design, Number, Numbers, check_window, input_names, to_lines
 from .partition import (
     assign,
     assign_apart,
@@ -81,6 +81,7 @@ def multisine(
     few experiments (the message says the minimum), and for choices that exclude each other.
     """
     names = input_names(inputs)
+    check_window(n_sections, periods)
     _check_choices(lines, division, periods, experiments, highest_harmonic)
     band = (0.0, min(10.0, n_sections / 2)) if band is None else band
     j = _lines(n_sections, periods, band, lines)
@@ -176,10 +177,6 @@ def _check_choices(lines, division, periods, experiments, highest_harmonic) -> N
 
 def _lines(n_sections: int, periods: int, band: tuple[Number, Number], lines: Lines) -> np.ndarray:
     """The lines j of a band."""
-    if n_sections < 1 or periods < 1:
-        raise DefinitionError(
-            f"n_sections ({n_sections}) and periods ({periods}) must be at least 1."
-        )
     f_min, f_max = band
     if not 0 <= f_min <= f_max <= n_sections / 2:
         raise DefinitionError(

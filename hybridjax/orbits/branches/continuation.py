@@ -119,7 +119,7 @@ def _check(cycle, values, step) -> np.ndarray:
             "a branch is followed where values are known: call `continuation` outside of "
             "JAX transformations, and differentiate `find_limit_cycle` at its points."
         )
-    require_x64(cycle.system)
+    require_x64(cycle)
     if int(cycle.result) != Result.OK:
         raise DefinitionError(
             f"the cycle to follow was not found: {Result(int(cycle.result)).message}."

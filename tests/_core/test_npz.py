@@ -1,0 +1,151 @@
+"""Hostile files: each is refused in a sentence, and before memory is taken for what it declares."""
+
+import io
+import json
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core import limits
+
+
+def npy(shape, data=b"", dtype="<f8"):
+    """An array file with this header, whatever its data are."""
+    file = io.BytesIO()
+    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + data
+
+
+def pack(path, members, **options):
+    with zipfile.ZipFile(path, "w", **options) as archive:
+        for name, content in members:
+            archive.writestr(name, content)
+
+
+def saved(path, static, **arrays):
+    """A design, with other static fields than it was saved with."""
+    hj.save(path, hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5)))
+    with np.load(path) as file:
+        content = dict(file) | arrays
+    header = json.loads(str(content.pop("header")))
+    header["static"] |= static
+    np.savez(path, header=np.array(json.dumps(header)), **content)
+
+
+def bomb(path):
+    zeros = npy((2**24,), bytes(2**27))
+    pack(path, [("time.npy", zeros)], compression=zipfile.ZIP_DEFLATED, compresslevel=9)
+
+
+def overlapping(path):
+    """Many entries of the archive's directory that stand for the same data."""
+    pack(path, [("time.npy", npy((2**19,), bytes(2**22)))])
+    with zipfile.ZipFile(path, "a") as archive:
+        entry = archive.infolist()[0]
+        for k in range(200):
+            twin = zipfile.ZipInfo(f"x{k}.npy")
+            for name in ("header_offset", "file_size", "compress_size", "CRC", "compress_type"):
+                setattr(twin, name, getattr(entry, name))
+            archive.filelist.append(twin)
+        archive._didModify = True
+
+
+HOSTILE = {
+    "a bomb": (bomb, "declares arrays of 134217856 bytes"),
+    "overlapping members": (overlapping, "declares arrays of"),
+    "a huge shape": (lambda p: pack(p, [("time.npy", npy((10**12,)))]), "not that large"),
+    "huge and empty": (lambda p: pack(p, [("time.npy", npy((10**12,), dtype="V0"))]), "not that"),
+    "a shape that is too small": (
+        lambda p: pack(p, [("time.npy", npy((1,), bytes(80)))]),
+        "not that large",
+    ),
+    "a negative shape": (lambda p: pack(p, [("time.npy", npy((-1,), bytes(8)))]), "is damaged"),
+    "a truncated header": (lambda p: pack(p, [("time.npy", npy((1,))[:20])]), "is damaged"),
+    "two of one name": (
+        lambda p: pack(p, [("time.npy", npy((0,))), ("time.npy", npy((0,)))]),
+        "two of its arrays have one name",
+    ),
+    "objects": (lambda p: np.savez(p, time=np.array([{}])), "holds Python objects"),
+    "a renamed npy": (lambda p: p.write_bytes(npy((1,), bytes(8))), "not an npz file"),
+    "text": (lambda p: p.write_text("time,x\n"), "not an npz file"),
+    "no array": (lambda p: pack(p, [("a.txt", "hello")]), "is damaged"),
+}
+DECLARED = {
+    "sections": (dict(n_sections=10**12), "n_sections is 1000000000000"),
+    "periods": (dict(periods=10**12), "periods is 1000000000000"),
+    "experiments": (dict(experiments=10**12), "experiments is 1000000000000"),
+    "experiments that are not there": (dict(experiments=10**6), "at least one frequency"),
+    "a window": (dict(n_sections=10**6, periods=10**6), "more samples than an experiment"),
+    "a fraction": (dict(n_sections=4.5), "n_sections is 4.5"),
+    "a text": (dict(n_sections="4"), "n_sections is '4'"),
+    "nothing": (dict(periods=None), "periods is None"),
+    "infinity": (dict(periods=float("inf")), "periods is inf"),
+    "a name that is none": (dict(input_names=[["u"]]), "input_names is"),
+}
+
+
+def refused(call, path, says):
+    """The call raises one short sentence, and takes less than 32 MiB for it."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(hj.errors.FileFormatError, match=says) as error:
+            call(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**25
+    assert str(path) in str(error.value) and len(str(error.value)) < 400 + len(str(path))
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("read", [hj.load, hj.read_recording], ids=["load", "read_recording"])
+@pytest.mark.parametrize(("make", "says"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_archives(tmp_path, read, make, says):
+    path = tmp_path / "hostile.npz"
+    make(path)
+    refused(read, path, says)
+
+
+@pytest.mark.parametrize(("static", "says"), DECLARED.values(), ids=DECLARED)
+def test_hostile_headers(tmp_path, static, says):
+    path = tmp_path / "hostile.npz"
+    saved(path, static)
+    refused(hj.load, path, says)
+
+
+def test_entries_of_experiments_that_do_not_exist(tmp_path):
+    path = tmp_path / "hostile.npz"
+    saved(path, {}, experiment=np.array([10**12]))
+    refused(hj.load, path, "at least one frequency")
+
+
+def test_headers_are_nested_and_long(tmp_path, monkeypatch):
+    path = tmp_path / "hostile.npz"
+    np.savez(path, header=np.array("[" * 100_000))
+    refused(hj.load, path, "not written by hybridjax.save")
+    monkeypatch.setattr(limits, "TEXT", 100)
+    saved(path, {})
+    refused(hj.load, path, "not written by hybridjax.save")
+
+
+def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "hostile.parquet"
+    values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
+    parquet.write_table(pyarrow.table({"time": values}), path)
+    assert path.stat().st_size < 2**20
+    refused(hj.read_recording, path, "declares 16777216 rows")
+
+
+def test_compressed_recordings_are_read(tmp_path):
+    path = tmp_path / "x.npz"
+    time = np.arange(2000.0)
+    np.savez_compressed(path, time=time, x=np.sin(time), still=np.zeros(2000))
+    (trial,) = hj.read_recording(path).trials
+    np.testing.assert_array_equal(trial.values[:, 0], np.sin(time))
