@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.precision import at_precision
+from .._core.text import fields
 from ..errors import DefinitionError
 from .solver.step import Step
 
@@ -66,6 +67,9 @@ class Settings(eqx.Module):
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""
+
+    def __repr__(self):
+        return fields(self)
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
 

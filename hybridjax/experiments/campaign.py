@@ -97,7 +97,7 @@ class Campaign:
             y,
             n_sections=self.placed.n_sections,
             periods=self.inputs.periods,
-            inputs=self.placed.cycle.system.inputs,
+            inputs=self.placed.structure().inputs,
             outputs=self.outputs.names,
             result=result,
             simulated=Simulated(failed_at, error, self._events(log, cycle_log)),

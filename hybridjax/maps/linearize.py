@@ -73,12 +73,13 @@ def _inputs(
     s: Structure, inputs: Sequence[str] | str | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs, all by default, and their indices."""
-    known = s.system.inputs
+    known = s.inputs
     names = known if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
     for name in names:
         if name not in known:
             raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
-    return names, np.array([known.index(n) for n in names], int)
+    columns = np.array([known.index(n) for n in names], int)
+    return tuple(known[k] for k in columns), columns
 
 
 @quick_jit

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
@@ -97,9 +98,11 @@ def section_data(
         trials += [number] * len(parts)
     if not found:
         raise DefinitionError("the recording holds no whole cycle to sample.")
-    units = [recording.unit(name) for name in (*inputs, *outputs)]
+    inputs, outputs = (
+        tuple(Signal(name, recording.unit(name)) for name in names) for names in (inputs, outputs)
+    )
     if timing is not None:
-        outputs, units = (*outputs, _TIME[timing]), [*units, "s"]
+        outputs = (*outputs, Signal(_TIME[timing], "s"))
     # A smoothing spline averages over neighbors to both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
     records = [
@@ -125,7 +128,6 @@ def section_data(
         cycle_outputs=cycle[:, len(inputs) :],
         period=phase.period,
         bandwidth=bandwidth,
-        units=tuple(units),
     )
 
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
+from .._core.text import fields
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
 from ..systems.structure import Structure as Structure
@@ -84,6 +85,9 @@ class AbstractSections(eqx.Module):
     @abc.abstractmethod
     def describe(self, i: int) -> str:
         """Section i in a few words, for errors."""
+
+    def __repr__(self):
+        return fields(self)
 
 
 def check_n_sections(n_sections: int) -> None:

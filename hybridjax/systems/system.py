@@ -1,6 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -38,6 +40,9 @@ class Guess(eqx.Module):
     state: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.asarray(x, float))
     time: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
 
+    def __repr__(self):
+        return fields(self)
+
 
 class HybridSystem(eqx.Module):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
@@ -59,10 +64,13 @@ class HybridSystem(eqx.Module):
 
     `charts` (and where there are events, `transitions`) are written by every system; `period`,
     `outputs` and `guess` where they apply. The class attribute `inputs` names the exogenous
-    inputs û; `inputs = ()` for a system without.
+    inputs û; `inputs = ()` for a system without. `input_units` gives their units in the same order
+    (none, or one for each), and `time_unit` that of time.
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("u",)
+    input_units: ClassVar[tuple[str, ...]] = ()
+    time_unit: ClassVar[str] = ""
 
     @abc.abstractmethod
     def charts(self) -> dict[str, Chart]:
@@ -87,6 +95,13 @@ class HybridSystem(eqx.Module):
         """A start for the search of the limit cycle, if the model knows one."""
         return None
 
+    def __repr__(self):
+        rows = []
+        for field in dataclasses.fields(self):
+            unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
+            rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
+        return type(self).__name__ + columns(rows)
+
 
 class Driven(HybridSystem):
     """`system` with an input that is a function of time, added to the piecewise constant one."""
@@ -97,6 +112,14 @@ class Driven(HybridSystem):
     @property
     def inputs(self) -> tuple[str, ...]:
         return self.system.inputs
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        return self.system.input_units
+
+    @property
+    def time_unit(self) -> str:
+        return self.system.time_unit
 
     def charts(self):
         return self.system.charts()
