@@ -12,7 +12,7 @@ from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
-from .look import COLORS, AxesLike, Plot, label_of, panels
+from .look import COLORS, AxesLike, Plot, axis_of, panels
 
 
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
@@ -43,7 +43,7 @@ def cycle(
     - `sections`: from `place_sections`, drawn as bars and numbered.
     - `numbers`: number every so manyth section (0: none); by default about 8 of them.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
-    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$ (m)"}`.
+    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
 
     **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
@@ -79,8 +79,8 @@ def cycle(
             _sections(panel, s, sections, (x, y), center, step)
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
-        panel.set_xlabel(label_of(x, labels))
-        panel.set_ylabel(label_of(y, labels))
+        panel.set_xlabel(axis_of(x, labels))
+        panel.set_ylabel(axis_of(y, labels))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 
@@ -97,7 +97,7 @@ def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
         )
     x = everywhere[0] if x is None else x
     y = next(n for n in everywhere if n != x) if y is None else y
-    s.resolve_outputs((x, y))
+    x, y = s.resolve_outputs((x, y)).names
     return x, y
 
 

@@ -33,6 +33,14 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     return eqx.field(converter=lambda x: jnp.asarray(x, float), metadata=metadata, **options)
 
 
+def unit_of_parameter(system: Any, path: str) -> str:
+    """The unit of a parameter, that of a part of a part by a path with dots; "" if it has none."""
+    *parts, name = path.split(".")
+    for part in parts:
+        system = getattr(system, part)
+    return type(system).__dataclass_fields__[name].metadata.get("unit", "")
+
+
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
