@@ -86,8 +86,9 @@ with hj.plot.style():
 #
 # `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number
 # $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$.
-# Its slopes and those of the height of the apex go through the limit cycle and its events; forwards,
-# since there are only two parameters. The optimizer is one of scipy, for losses with constraints.
+# Its slopes and those of the height of the apex go through the limit cycle and its events;
+# forwards, since there are only two parameters. The optimizer is one of scipy, for losses with
+# constraints.
 
 # %%
 WANTED = 2.3  # height of the body at the apex, in meters

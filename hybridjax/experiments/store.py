@@ -18,9 +18,9 @@ from typing import Any, Unpack
 import equinox as eqx
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from .._core.archive import read_module, write_module
+from .._core.progress import counted, working
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
@@ -45,6 +45,7 @@ _SAME_CYCLE = 1e-7
 _SAME_SIZES = 4.0
 
 
+@working("store_experiments")
 def store_experiments(
     folder: str | os.PathLike,
     cycle: LimitCycle,
@@ -84,7 +85,7 @@ def store_experiments(
     _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
     missing = [k for k in stored.missing() if k % size == rank]
-    for k in tqdm(missing, "chunks", disable=not campaign.execution.progress):
+    for k in counted(missing, "chunks", len(missing)):
         write_module(stored.path(k), campaign.run(parts[k]))
     return stored
 

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from tqdm import tqdm
 
+from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -30,6 +30,7 @@ _PERFECT = 1e-12
 _LIKELY = 4.0
 
 
+@working("fit_model")
 def fit_model(
     system: HybridSystem,
     data: AbstractObservation | Sequence[AbstractObservation],
@@ -40,7 +41,6 @@ def fit_model(
     spread: float = 0.2,
     seed: int = 0,
     max_steps: int = MAX_STEPS,
-    progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
 
@@ -69,7 +69,6 @@ def fit_model(
     - `spread`: the other guesses have coordinates uniformly drawn within this distance: 0.2 means
         factors between exp(-0.2) and exp(0.2). `seed` of the draw.
     - `max_steps`: evaluations of the model from each guess.
-    - `progress`: show a bar over the guesses.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: nothing
     is raised where a fit does not converge.
@@ -90,7 +89,7 @@ def fit_model(
     x0 = np.asarray(parameters.encode(parameters.read(system)))
     around = spread * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
     tried, best = [], None
-    for x in tqdm([x0, *(x0 + around)], "guesses", disable=not progress):
+    for x in counted([x0, *(x0 + around)], "guesses", guesses):
         found = _from(problem, jnp.asarray(x), system, near, max_steps)
         tried.append(found)
         best = found if best is None or found.cost < best.cost else best

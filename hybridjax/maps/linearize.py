@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compilation.compile import quick_jit
 from .._core.lanes.per_lane import by_lane
+from .._core.progress import working
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.jacobian import tape_jacobian
@@ -22,6 +23,7 @@ from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 
 
+@working("linearize")
 def linearize(
     cycle: LimitCycle,
     sections: SectionsLike,

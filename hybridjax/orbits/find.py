@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
+from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
@@ -51,6 +52,7 @@ _SAME_FIELD, _SAME_REST = 1e-6, 1e-9
 _DUE = 1e-9
 
 
+@working("find_limit_cycle")
 def find_limit_cycle(
     system: HybridSystem,
     guess: Guess | LimitCycle | None = None,
@@ -172,6 +174,7 @@ def _in_sizes(
 
 def _solve(map: ReturnMap) -> Solution:
     """Newton's method, with smaller steps or another period where it fails."""
+    say("Newton's method")
     solution = solve(map)
     if int(solution.result) == Result.EXTRA_TURNS:
         turn = solution.turn
@@ -179,6 +182,7 @@ def _solve(map: ReturnMap) -> Solution:
         solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
     if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
+        say("steps of Levenberg and Marquardt")
         second = solve(map, True, False, _DAMPED_STEPS)
         solution = second if int(second.result) == Result.OK else solution
     return solution
@@ -200,6 +204,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
         size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
         distance = jnp.asarray(np.max(np.abs(solution.turn.residual) / size))
         return own, solution._replace(turn=solution.turn._replace(distance=distance))
+    say("Newton's method, in the sizes of the cycle")
     again = solve(own)
     if int(again.result) not in (Result.OK, Result.SINGULAR):
         return map, solution

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.compilation.compile import quick_jit
+from .._core.progress import say
 from .._core.results import Result
 from ..engine.events import start_lanes
 from ..engine.lanes import Lanes
@@ -142,6 +143,7 @@ def begin(
     """
     s, period = Structure(system), system.period()
     if settle:
+        say("settling")
         wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
         _require(moved, "settling", s)
@@ -167,6 +169,7 @@ def begin(
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
 
     def next_meeting(lanes, doing):
+        say(doing)
         target = toward(jnp.full(1, jnp.inf), event, lanes.t + max_period)
         moved = _go(system, lanes, section, target, settings)
         _require(moved, f"{doing} ({section})", s)

@@ -5,6 +5,7 @@ from typing import Literal
 
 import equinox as eqx
 
+from .._core.progress import say, working
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
@@ -38,6 +39,7 @@ class Identification(eqx.Module):
         return "\n".join(map(repr, parts))
 
 
+@working("identify_recording")
 def identify_recording(
     recording: Recording,
     phase: Phase | PhaseDefinition,
@@ -63,6 +65,7 @@ def identify_recording(
 
     **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
     """
+    say("phase")
     definition = None if isinstance(phase, Phase) else phase
     found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
@@ -70,6 +73,7 @@ def identify_recording(
         moved |= set() if definition is None else signals_of(definition)
         recording = without_drift(recording, found, sorted(moved), drift)
         found = found if definition is None else estimate_phase(recording, definition)
+    say("data at the sections")
     data = section_data(
         recording,
         found,
@@ -81,11 +85,14 @@ def identify_recording(
         timing=timing,
         drift=drift,
     )
+    say("order")
     order = choose_order(data) if order is None else order
+    say("fit to the first three quarters")
     held = hold_out(data, order)
     # Where the held-out fit saw only the beginning of a long recording and found no part of second
     # order that pays, the whole is not asked again.
     known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
+    say("fit to all")
     fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
         recording=recording,
