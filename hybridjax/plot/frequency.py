@@ -49,7 +49,7 @@ def magnitude(
             f, order = _sorted(htf)
             for m in harmonics:
                 size = np.abs(np.asarray(htf.harmonic(m))[order, i, j])
-                line = _line(htf, _harmonic_style(m, harmonics), _name(m))
+                line = _line(htf, htfs, _harmonic_style(m, harmonics), _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
         unit = ratio(htf.outputs[i], htf.inputs[j])
@@ -143,7 +143,7 @@ def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) ->
             i, j = _index(htf.outputs, name), _index(htf.inputs, input)
             values = np.asarray(htf.harmonic(harmonic))[order, i, j]
             label = with_unit(label_of(name, labels), "" if same else unit)
-            line = _line(htf, {"color": color}, label)
+            line = _line(htf, htfs, {"color": color}, label)
             size, radius = np.abs(values), _radius(htf, harmonic, order, i, j)
             known = np.full(len(f), True) if radius is None else radius < size
             reference = _curve(upper, lower, f, values, reference, known, **line)
@@ -252,10 +252,11 @@ def _harmonic_style(m: int, shown: Sequence[int]) -> dict:
     }
 
 
-def _line(htf: HTF, line: dict, label: str) -> dict:
+def _line(htf: HTF, htfs: Sequence[HTF], line: dict, label: str) -> dict:
     """Exact HTFs broad and pale, without a label where an estimate of the same curve has one."""
     if htf.source == "exact":
-        return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1}
+        label = "" if any(map(_estimates_last, htfs)) else label
+        return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
     return {**line, "lw": 0.9, "zorder": 3, "label": label}
 
 

@@ -101,5 +101,5 @@ def identify_recording(
         fit=fit,
         held_out=held,
         responses=impulse_responses(fit, data),
-        advice=advise(data, fit),
+        advice=advise(data, fit, held.validation),
     )
