@@ -18,6 +18,7 @@ from ._core.compilation.compilation_cache import (
 from ._core.compilation.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.execution import Execution as Execution
 from ._core.precision import enable_x64 as enable_x64
+from ._core.progress import enable_progress as enable_progress
 from ._core.results import Result as Result
 from ._core.vector_math.rewrite import enable_vector_math as enable_vector_math
 from .apps.recording_report import write_report as write_report

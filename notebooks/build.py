@@ -29,6 +29,7 @@ def build(source: pathlib.Path, target: pathlib.Path) -> None:
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
     for count, cell in enumerate(codes, 1):
         cell.execution_count = count
+        cell.outputs = [output for output in cell.outputs if output.get("data", True)]
         for output in cell.outputs:
             if "execution_count" in output:
                 output.execution_count = count

@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib import pyplot
-from matplotlib.colors import hsv_to_rgb
 from scipy.optimize import minimize
 
 import hybridjax as hj
@@ -50,17 +49,14 @@ print(cycles.summary(limit=2))
 
 # %% [markdown]
 # Each hopper has four multipliers, two of which are zero: touchdown forgets the foot. The
-# largest modulus says how fast disturbances die out; below one the hopper is stable. As a picture,
-# the color is the angle of the first multiplier (red for positive, cyan for negative real ones)
-# and the brightness its modulus. White: no cycle with one flight and one stance per period.
+# largest modulus says how fast disturbances die out; below one the hopper is stable. The angle of
+# the first multiplier says how the rest of a disturbance changes from period to period: at 0 it
+# keeps its sign, at pi it changes it, and in between it oscillates. White: no cycle with one flight
+# and one stance per period.
 
 # %%
 first = cycles.multipliers[:, 0].reshape(POINTS, POINTS)
-modulus = np.abs(first)
-hue = np.abs(np.angle(first)) / (2 * np.pi)
-colors = hsv_to_rgb(np.stack([np.nan_to_num(hue), np.ones_like(hue), np.nan_to_num(modulus)], -1))
-colors[np.isnan(modulus)] = 1.0
-extent = (k_axis[0], k_axis[-1], b_axis[0], b_axis[-1])
+modulus, angle = np.abs(first), np.abs(np.angle(first))
 
 
 def label(axes, title):
@@ -76,20 +72,23 @@ with hj.plot.style():
     left.clabel(lines, fontsize=6)
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     label(left, "contraction in one period")
-    right.imshow(colors, extent=extent, origin="lower", aspect="auto", interpolation="nearest")
-    label(right, "the first multiplier: angle and modulus")
+    image = right.pcolormesh(k_axis, b_axis, angle, cmap="cividis", vmax=np.pi, rasterized=True)
+    key = figure.colorbar(image, ax=right, label="angle of the first multiplier (rad)")
+    key.set_ticks([0, np.pi / 2, np.pi], labels=["0", "π/2", "π"])
+    label(right, "oscillation from period to period")
     right.set_ylabel("")
 
 # %% [markdown]
-# Multipliers meet on the real axis where the picture changes from colors to plain red or cyan.
+# Multipliers meet on the real axis where the angle reaches 0 or pi.
 # The modulus of the largest has a kink there, and its derivative grows without bound on one side.
 #
 # ## The best hopper of a given height
 #
-# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
-# $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its slopes
-# and those of the height of the apex go through the limit cycle and its events; forwards, since
-# there are only two parameters. The optimizer is one of scipy, for losses with constraints.
+# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number
+# $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$.
+# Its slopes and those of the height of the apex go through the limit cycle and its events;
+# forwards, since there are only two parameters. The optimizer is one of scipy, for losses with
+# constraints.
 
 # %%
 WANTED = 2.3  # height of the body at the apex, in meters

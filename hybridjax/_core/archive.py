@@ -14,6 +14,9 @@ import textwrap
 import types
 import typing
 from collections.abc import Mapping
+import uuid
+import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from ..errors import DefinitionError, FileFormatError, HybridJaxError
 from . import limits
 from .npz import damaged, read_arrays
 from .writing import replacing
+from .signal import Signal
 
 
 _FORMAT, _VERSION = "hybridjax", 2
@@ -51,6 +55,7 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         "kind": kind,
         "part": part,
         "static": static,
+        "units": {str(name): name.unit for name in _signals(static)},
         "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
         "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
     }
@@ -77,10 +82,11 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
         raise FileFormatError(
             f"'{path}' was replaced by another file: delete it, and make it again."
         )
+    static = _restored(header["static"], header["units"])
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
     try:
-        thing = _put_together(kind, header["static"], members)
+        thing = _put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
@@ -116,7 +122,7 @@ def _put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> 
         name, inner = field.name, _module_in(field.type)
         if field.metadata.get("static", False):
             if name in static:
-                values[name] = _tuples(static.pop(name))
+                values[name] = static.pop(name)
                 if not _matches(values[name], field.type) or not _moderate(values[name]):
                     raise ValueError(f"{name} is {reprlib.repr(values[name])}")
             elif field.default is dataclasses.MISSING:
@@ -156,14 +162,28 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(f"'{path}' holds a {kind!r}; load knows {', '.join(kinds)}.")
-    if not all(isinstance(header.get(part), dict) for part in ("static", "arrays")):
+    header.setdefault("units", {})  # (files written before units were kept)
+    if not all(isinstance(header.get(part), dict) for part in ("static", "arrays", "units")):
         raise damaged(path, "its header is incomplete")
     return header
 
 
-def _tuples(value: Any) -> Any:
-    """JSON's lists as the tuples that they were."""
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _signals(value: Any) -> Iterator[Signal]:
+    """All names with a unit."""
+    if isinstance(value, Signal) and value.unit:
+        yield value
+    elif isinstance(value, dict | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _signals(part)
+
+
+def _restored(value: Any, units: Mapping[str, str]) -> Any:
+    """JSON's lists as the tuples that they were, and names with their units."""
+    if isinstance(value, dict):
+        return {key: _restored(part, units) for key, part in value.items()}
+    if isinstance(value, list):
+        return tuple(_restored(part, units) for part in value)
+    return Signal(value, str(units[value])) if isinstance(value, str) and value in units else value
 
 
 def _moderate(value: Any) -> bool:

@@ -1,6 +1,6 @@
 """Arguments made into arrays and names, with one clear sentence where that cannot be done."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..errors import DefinitionError
 from .precision import require_x64
+from .signal import Names, Signal
 from .tracing import is_traced
 
 
@@ -49,14 +50,17 @@ def require_finite(name: str, value: jax.Array) -> None:
         raise DefinitionError(f"`{name}` is not finite at index {tuple(map(int, bad[0]))}.")
 
 
-def names(kind: str, given: str | Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """`count` distinct names; by default `u` or `y` for one, `u0, u1, ...` for several.
+def names(kind: str, given: Names | None, count: int) -> tuple[str, ...]:
+    """`count` distinct names, with units where these are given; by default `u` or `y` for one,
+    `u0, u1, ...` for several.
 
     **Raises:** `DefinitionError` if `given` has another length or repeats a name.
     """
     if given is None:
         letter = {"inputs": "u", "outputs": "y"}[kind]
         return (letter,) if count == 1 else tuple(f"{letter}{i}" for i in range(count))
+    if isinstance(given, Mapping):
+        given = tuple(Signal(name, unit) for name, unit in given.items())
     given = (given,) if isinstance(given, str) else tuple(given)
     if len(given) != count:
         raise DefinitionError(f"{count} {kind} need {count} names, but `{kind}` is {given}.")

@@ -23,7 +23,6 @@ class Execution:
     - `precision`: "double" or "single". Single precision computes experiments in 32 bits, while the
       cycle, the sections and the plan remain in 64. What rounding costs is measured on the cycle
       and is part of `ExperimentData.error`.
-    - `progress`: show a progress bar.
 
     **Raises:** `DefinitionError` for numbers below one, or another precision.
     """
@@ -31,7 +30,6 @@ class Execution:
     batch: int | None = None
     workers: int | None = None
     precision: Precision = "double"
-    progress: bool = False
 
     def __post_init__(self):
         if self.batch is not None and self.batch < 1:

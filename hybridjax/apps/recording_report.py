@@ -16,6 +16,7 @@ import numpy as np
 from .. import __version__, plot
 from .._core.boundary.checked import checked
 from .._core.results_folder import results_folder
+from .._core.text import p_value
 from ..io import save
 from ..linear.htf import HTF
 from ..plot import look
@@ -222,14 +223,14 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         "look for what it leaves unexplained; small p-values say that there is something "
         "(process noise, nonlinearity, smoothing), not that the multipliers are wrong.</p>",
         _table(
-            ("output", "explained", "rms left", "p: white", "p: independent of the input"),
+            ("output", "explained", "rms left", "white", "independent of the input"),
             [
                 (
                     name,
                     f"{held.fit[i]:.1f} %",
                     f"{held.noise[i]:.2e}",
-                    f"{held.whiteness[i]:.2g}",
-                    f"{held.independence[i]:.2g}",
+                    p_value(held.whiteness[i]),
+                    p_value(held.independence[i]),
                 )
                 for i, name in enumerate(held.outputs)
             ],

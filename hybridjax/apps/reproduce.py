@@ -40,9 +40,8 @@ from ..sections.kinematic import KinematicPhase
 from .paper_report import OUTPUTS, summarize, table
 
 
-STATES = {"yM": r"$y_M$ (m)", "vM": r"$\dot y_M$ (m/s)"}
 SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
-DEVIATIONS = {"yM": r"$\delta y_M$ (m)", "vM": r"$\delta \dot y_M$ (m/s)"}
+DEVIATIONS = {"yM": r"$\delta y_M$", "vM": r"$\delta \dot y_M$"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,7 +295,7 @@ def _figures(out, cycle, families: Mapping[str, Family], perturbed):
         estimates[f"structured, {name}"] = family.structured
     drawings = {
         f"fig1_cycle_{name}": lambda family=family: plot.cycle(
-            cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed, labels=STATES
+            cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed, labels=SYMBOLS
         )
         for name, family in families.items()
     }

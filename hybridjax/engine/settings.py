@@ -11,6 +11,7 @@ from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
 from .._core.precision import at_precision, real
+from .._core.text import fields
 from ..errors import DefinitionError
 from .solver.step import Step
 
@@ -71,6 +72,9 @@ class Settings(eqx.Module):
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""
+
+    def __repr__(self):
+        return fields(self)
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
 

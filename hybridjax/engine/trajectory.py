@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.text import number
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
@@ -100,6 +101,16 @@ class Trajectory(eqx.Module):
         """
         t, chart, q = self.dense(per_step)
         return (t, *_evaluate(self.system, names, t, chart, q))
+
+    def __repr__(self):
+        s, fired = Structure(self.system), self.event[self.event >= 0]
+        counts = ((int(np.sum(fired == g)), tr.name) for g, tr in enumerate(s.transitions))
+        events = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
+        span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=self.system.time_unit)}"
+        return (
+            f"Trajectory({type(self.system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
+            f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
+        )
 
 
 def simulate(

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
 
 from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.memo import Memory
+from .._core.progress import counted
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
 from ..errors import ComputationError, DefinitionError
@@ -69,10 +69,10 @@ class Campaign:
     record_events: bool
     execution: Execution
 
-    def run(self, rows: slice | None = None, progress: bool = False) -> ExperimentData:
+    def run(self, rows: slice | None = None) -> ExperimentData:
         """Run some of the experiments, by default all.
 
-        **Arguments:** `rows`, consecutive ones; `progress`, whether to show a bar over batches.
+        **Arguments:** `rows`, consecutive ones.
 
         **Raises:** `DefinitionError` for an output that is not defined where experiments go;
         `ComputationError` if a steady start is not found.
@@ -86,7 +86,7 @@ class Campaign:
         cycle_log = self._cycle_log() if self.record_events else None
         capacity = 0 if cycle_log is None else 1 + int(np.asarray(cycle_log.count).max())
         while True:
-            y, result, failed_at, error, log = self._respond(applied, start, capacity, progress)
+            y, result, failed_at, error, log = self._respond(applied, start, capacity)
             if log is None or (most := int(log.count.max(initial=0))) <= capacity:
                 break
             capacity = 2 ** (most - 1).bit_length()  # as few sizes, and so programs, as possible
@@ -96,7 +96,7 @@ class Campaign:
             y,
             n_sections=self.placed.n_sections,
             periods=self.inputs.periods,
-            inputs=self.placed.cycle.system.inputs,
+            inputs=self.placed.structure().inputs,
             outputs=self.outputs.names,
             result=result,
             simulated=Simulated(failed_at, error, self._events(log, cycle_log)),
@@ -104,7 +104,7 @@ class Campaign:
             label=self.placed.family.label,
         )
 
-    def _respond(self, u, start, capacity: int, progress: bool):
+    def _respond(self, u, start, capacity: int):
         """Deviations of outputs from the cycle (S, n, ny), codes, samples of failures, errors, and
         the first `capacity` events between any two sections."""
         placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
@@ -118,7 +118,7 @@ class Campaign:
         y, others = np.empty((S, n // N, *base.shape)), []
         parts = in_batches(self.program, arguments, S, self.execution)
         batches = -(-S // self.execution.batch) if self.execution.batch else None
-        for some, part in tqdm(parts, "experiments", batches, disable=not progress):
+        for some, part in counted(parts, "batches of experiments", batches):
             np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[some])
             others.append((part.result, part.failed_at, part.error, part.log))
         *each, logs = zip(*others, strict=True)

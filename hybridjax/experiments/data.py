@@ -1,6 +1,5 @@
 """What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +9,8 @@ from numpy.typing import ArrayLike
 
 from .._core.arguments import names
 from .._core.results import Result
+from .._core.signal import Names
+from .._core.text import fields, listed
 from ..errors import DefinitionError
 from .events import EventTimes
 from .record import Record
@@ -30,6 +31,9 @@ class Simulated(eqx.Module):
     error: Float[np.ndarray, " S"] | None = None
     events: EventTimes | None = None
 
+    def __repr__(self) -> str:
+        return fields(self)
+
 
 class ExperimentData(eqx.Module):
     """Inputs and outputs of S experiments, sampled at the sections of a limit cycle.
@@ -45,7 +49,7 @@ class ExperimentData(eqx.Module):
       and `events`.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
-    - `inputs`, `outputs`: names. `label`: whose sections these are, for labels.
+    - `inputs`, `outputs`: names, or units by name. `label`: whose sections these are, for labels.
     """
 
     u: Float[np.ndarray, "S n nu"]
@@ -66,8 +70,8 @@ class ExperimentData(eqx.Module):
         *,
         n_sections: int,
         periods: int,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        inputs: Names | None = None,
+        outputs: Names | None = None,
         result: ArrayLike | None = None,
         simulated: Simulated | None = None,
         cycle_outputs: ArrayLike | None = None,
@@ -194,7 +198,7 @@ class ExperimentData(eqx.Module):
         return (
             f"ExperimentData({label}{self.summary()}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
-            f"{', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+            f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
 

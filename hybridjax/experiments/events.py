@@ -47,6 +47,11 @@ class EventTimes(eqx.Module):
     n_sections: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        counts = ((int(np.sum(self.event == k)), name) for k, name in enumerate(self.names))
+        found = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
+        return f"EventTimes({len(self.time)} experiments: {found})"
+
     @property
     def count(self) -> Int[np.ndarray, " S"]:
         """The number of events of each experiment."""

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers, names
+from .._core.signal import Names
+from .._core.text import listed
 from ..errors import DefinitionError
 
 
@@ -20,7 +22,8 @@ class Record(eqx.Module):
       cut there, and the state after it is unknown.
     - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
       sample is missing or bad.
-    - `n_sections`: N. `first_section`: the section of sample 0. `inputs`, `outputs`: names.
+    - `n_sections`: N. `first_section`: the section of sample 0. `inputs`, `outputs`: names, or
+      units by name.
     - `lead`: y[i] may depend on inputs up to `u[i + lead]`: smoothing, or sections that were placed
       by what came later.
     - `drift`: the outputs at each section also hold an unknown part that changes more slowly than
@@ -44,8 +47,8 @@ class Record(eqx.Module):
         *,
         n_sections: int,
         first_section: int = 0,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        inputs: Names | None = None,
+        outputs: Names | None = None,
         lead: int = 0,
         drift: int | float | None = None,
     ):
@@ -96,7 +99,7 @@ class Record(eqx.Module):
         gaps = f", {missing} with gaps" if missing else ""
         return (
             f"Record({len(self.u)} samples from section {self.first_section}{gaps}; "
-            f"N = {self.n_sections}; {', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+            f"N = {self.n_sections}; {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
 

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.precision import require_x64
+from .._core.text import listed
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..maps.place import as_placed
@@ -34,6 +35,14 @@ class ResponseFunction(eqx.Module):
     placed: PlacedSections
     stepping: Stepping
     outputs: tuple[str | Output, ...]
+
+    def __repr__(self):
+        s = self.placed.structure()
+        names = s.resolve_outputs(self.outputs).names
+        return (
+            f"ResponseFunction({type(s.system).__name__}: {listed(s.inputs)} -> {listed(names)}; "
+            f"{self.placed.n_sections} sections; accuracy {self.stepping.accuracy:g})"
+        )
 
     def __call__(
         self,

@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import Unpack
 
-from tqdm import tqdm
-
 from .._core.execution import Execution
+from .._core.progress import working
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
@@ -20,6 +19,7 @@ from .options import Options, OptionsByName, StartName, options_of
 CHUNK = 640
 
 
+@working("run_experiments")
 def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
@@ -56,7 +56,7 @@ def run_experiments(
         every section, relative to their sizes (`LimitCycle.scale`). By default 1e-9, and 1e-4 in
         single precision. `data.error` is each experiment's own estimate.
     - `record_events`: whether to record when events happen, as `data.events`.
-    - `execution`: batches, threads, precision, and whether to show a progress bar.
+    - `execution`: batches, threads, precision.
 
     **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
 
@@ -66,7 +66,7 @@ def run_experiments(
     """
     options = Options(start, discard, process_noise, accuracy, record_events, execution)
     campaign = prepare(cycle, sections, design, outputs, options)
-    return campaign.run(progress=campaign.execution.progress)
+    return campaign.run()
 
 
 def stream_experiments(
@@ -96,4 +96,4 @@ def stream_experiments(
     chosen = options_of(stream_experiments, options)
     campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
     parts = chunks(len(campaign.inputs), chunk)
-    return map(campaign.run, tqdm(parts, "chunks", disable=not campaign.execution.progress))
+    return map(campaign.run, parts)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
 from .._core.memo import Memory
+from .._core.progress import counted
 from ..errors import ComputationError
 from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
@@ -86,7 +87,9 @@ class SteadyStart:
             start, u = jnp.asarray(predicted[:, some]), jnp.asarray(window[some])
             return placed, stepping.plan, start, u, stepping.settings, prediction
 
-        parts = [part for _, part in in_batches(self.program, arguments, len(u), self.execution)]
+        parts = in_batches(self.program, arguments, len(u), self.execution)
+        batches = -(-len(u) // self.execution.batch) if self.execution.batch else None
+        parts = [part for _, part in counted(parts, "batches of steady starts", batches)]
         start, change = (np.concatenate(x).astype(float) for x in zip(*parts, strict=True))
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))

@@ -18,12 +18,12 @@ from typing import Any, Unpack
 import equinox as eqx
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from .._core import limits
 from .._core.archive import read_module, write_module
 from .._core.npz import damaged
 from .._core.writing import made_folder, replacing
+from .._core.progress import counted, working
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
@@ -49,6 +49,7 @@ _SAME_CYCLE = 1e-7
 _SAME_SIZES = 4.0
 
 
+@working("store_experiments")
 def store_experiments(
     folder: str | os.PathLike,
     cycle: LimitCycle,
@@ -93,7 +94,7 @@ def store_experiments(
         _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
     missing = [k for k in stored.missing() if k % size == rank]
-    for k in tqdm(missing, "chunks", disable=not campaign.execution.progress):
+    for k in counted(missing, "chunks", len(missing)):
         path = stored.path(k)
         write_module(path, campaign.run(parts[k]), path.stem)
     return stored

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from tqdm import tqdm
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, Seed, StepCount
+from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -33,6 +33,7 @@ _LIKELY = 4.0
 
 
 @checked
+@working("fit_model")
 def fit_model(
     system: HybridSystem,
     data: AbstractObservation | Sequence[AbstractObservation],
@@ -43,7 +44,6 @@ def fit_model(
     spread: Positive = 0.2,
     seed: Seed = 0,
     max_steps: StepCount = MAX_STEPS,
-    progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
 
@@ -72,7 +72,6 @@ def fit_model(
     - `spread`: the other guesses have coordinates uniformly drawn within this distance: 0.2 means
         factors between exp(-0.2) and exp(0.2). `seed` of the draw.
     - `max_steps`: evaluations of the model from each guess.
-    - `progress`: show a bar over the guesses.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: nothing
     is raised where a fit does not converge.
@@ -88,7 +87,7 @@ def fit_model(
     x0 = np.asarray(parameters.encode(parameters.read(system)))
     around = spread * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
     tried, best = [], None
-    for x in tqdm([x0, *(x0 + around)], "guesses", disable=not progress):
+    for x in counted([x0, *(x0 + around)], "guesses", guesses):
         found = _from(problem, jnp.asarray(x), system, near, max_steps)
         tried.append(found)
         best = found if best is None or found.cost < best.cost else best

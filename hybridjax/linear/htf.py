@@ -1,7 +1,5 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +9,8 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 
 from .._core.arguments import Numbers, names, real_array, require_finite
 from .._core.precision import require_x64
+from .._core.signal import Names
+from .._core.text import listed
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .frequency_response import Harmonics, check_harmonics
@@ -42,7 +42,7 @@ class HTF(eqx.Module):
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
     - `n_sections`: `N`, the number of sections (samples) in one period.
-    - `inputs`, `outputs`: names.
+    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
     - `variance` (M, F, ny, nu): of estimates, E|dH|^2 of the complex error dH, which is circular
       (real and imaginary part each have half of it). Everything random that the experiments let
@@ -72,8 +72,8 @@ class HTF(eqx.Module):
         H: Numbers,
         harmonics: Harmonics,
         n_sections: int,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        inputs: Names | None = None,
+        outputs: Names | None = None,
         source: str = "estimate",
         *,
         variance: Numbers | None = None,
@@ -116,8 +116,7 @@ class HTF(eqx.Module):
         shown = f"{low} to {high}" if dense and number > 3 else ", ".join(map(str, self.harmonics))
         return (
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
-            f"inputs ({', '.join(self.inputs)}); outputs ({', '.join(self.outputs)}); "
-            f"{self.n_sections} sections)"
+            f"{self.n_sections} sections: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
     def harmonic(self, m: int) -> Complex[Array, "F ny nu"]:

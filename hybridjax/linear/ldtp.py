@@ -11,6 +11,8 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.arguments import Numbers, names, real_array, require_finite
 from .._core.memo import remembered
 from .._core.precision import require_x64
+from .._core.signal import Names
+from .._core.text import listed
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from . import time_response
@@ -42,7 +44,8 @@ class LDTP(eqx.Module):
     - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
     - `D` (N, ny, nu): feed-through; `None` means zero.
     - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
-    - `inputs`, `outputs`: names; by default `u`, `y`, or `u0, u1, ...` where there are several.
+    - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`; by default `u`, `y`, or
+      `u0, u1, ...` where there are several.
     - `coordinates`: names of the coordinates at each section, for documentation.
 
     **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
@@ -65,8 +68,8 @@ class LDTP(eqx.Module):
         C: Numbers,
         D: Numbers | None = None,
         dims: Numbers | None = None,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        inputs: Names | None = None,
+        outputs: Names | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
     ):
         A, B, C = (real_array(*pair, ndim=3) for pair in (("A", A), ("B", B), ("C", C)))
@@ -107,8 +110,8 @@ class LDTP(eqx.Module):
         B: Sequence[Numbers],
         C: Sequence[Numbers],
         D: Sequence[Numbers] | None = None,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        inputs: Names | None = None,
+        outputs: Names | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
     ) -> "LDTP":
         """An LDTP from matrices that each have their own dimensions.
@@ -159,8 +162,8 @@ class LDTP(eqx.Module):
     def __repr__(self) -> str:
         dims = "traced" if is_traced(self.dims) else _summary(np.asarray(self.dims))
         return (
-            f"LDTP({self.n_sections} sections, dimension {dims}, inputs "
-            f"({', '.join(self.inputs)}), outputs ({', '.join(self.outputs)}))"
+            f"LDTP({self.n_sections} sections, dimension {dims}: {listed(self.inputs)} -> "
+            f"{listed(self.outputs)})"
         )
 
     def states(

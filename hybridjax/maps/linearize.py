@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.compilation.compile import quick_jit
 from .._core.lanes.per_lane import by_lane
+from .._core.progress import working
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.jacobian import tape_jacobian
@@ -22,6 +23,7 @@ from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 
 
+@working("linearize")
 def linearize(
     cycle: LimitCycle,
     sections: SectionsLike,
@@ -73,12 +75,13 @@ def _inputs(
     s: Structure, inputs: Sequence[str] | str | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs, all by default, and their indices."""
-    known = s.system.inputs
+    known = s.inputs
     names = known if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
     for name in names:
         if name not in known:
             raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
-    return names, np.array([known.index(n) for n in names], int)
+    columns = np.array([known.index(n) for n in names], int)
+    return tuple(known[k] for k in columns), columns
 
 
 @quick_jit

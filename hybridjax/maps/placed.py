@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.text import number
+from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.tape import Tape
 from ..engine.target import Target
@@ -63,6 +65,18 @@ class PlacedSections(eqx.Module):
     def section_zero(self) -> Float[Array, " n"]:
         """Time and padded state at which the cycle meets section 0."""
         return jnp.append(self.lanes.t[0], self.lanes.q[:, 0])
+
+    def __repr__(self):
+        system, family = type(self.cycle.system).__name__, type(self.family).__name__
+        head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
+        if is_traced(self):
+            return f"{head}, traced)"
+        names, charts = self.structure().names, np.asarray(self.lanes.chart)
+        inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
+        start = number(self.lanes.t[0], unit=self.cycle.system.time_unit)
+        low, high = np.min(self.dims), np.max(self.dims)
+        dimension = f"{low}" if low == high else f"{low} to {high}"
+        return f"{head}: {', '.join(inside)}; dimension {dimension}; section 0 at t = {start})"
 
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions, made anew: where the sections

@@ -50,6 +50,12 @@ class SectionMap(eqx.Module):
     dims: tuple[int, int] = eqx.field(static=True)
     """Dimensions n_i and n_j."""
 
+    def __repr__(self):
+        (n, m), family = self.dims, self.placed.family
+        system = type(self.placed.cycle.system).__name__
+        ends = f"{family.describe(self.i)} to {family.describe(self.j)}"
+        return f"SectionMap({system}: from {ends}; {n} states to {m})"
+
     @property
     def fixed_point(self) -> Float[Array, " n"]:
         """The cycle's state at section i."""

@@ -7,6 +7,7 @@ from ..systems.transition import Transition
 
 class Fall(Chart):
     states = ("y", "v")
+    units = ("m", "m/s")
     ball: "BouncingBall"
 
     def field(self, t, q, u):
@@ -19,6 +20,9 @@ class BouncingBall(HybridSystem):
     Input `u` is an acceleration. With a restitution below 1 the bounces accumulate in finite time
     (Zeno), and the ball has no cycle but rest.
     """
+
+    input_units = ("m/s^2",)
+    time_unit = "s"
 
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
     restitution: Parameter = parameter(0.7, doc="speed kept at a bounce")

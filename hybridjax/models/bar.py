@@ -21,6 +21,7 @@ _CHARTS = {(): "air", ("hind",): "hind", ("front",): "front", ("hind", "front"):
 
 class _Standing(Chart):
     states = ("y", "v", "q", "p")
+    units = ("m", "m/s", "rad", "rad/s")
     bar: "TwoLeggedBar"
     legs: tuple[str, ...] = eqx.field(static=True)
 
@@ -40,6 +41,9 @@ class TwoLeggedBar(HybridSystem):
     1 - rho of its speed relative to the table in an impulse; it lets go when its leg has its rest
     length again.
     """
+
+    input_units = ("N",)
+    time_unit = "s"
 
     m: Parameter = parameter(1.0, unit="kg", doc="mass of the bar")
     J: Parameter = parameter(0.2, unit="kg m^2", doc="moment of inertia of the bar")

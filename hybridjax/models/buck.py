@@ -15,6 +15,7 @@ from ..systems.transition import Scheduled, Transition
 
 class Circuit(Chart):
     states = ("v", "i", "ramp")
+    units = ("V", "A", "V")
     buck: "BuckConverter"
     closed: bool = eqx.field(static=True)
 
@@ -32,6 +33,9 @@ class BuckConverter(HybridSystem):
     conduction), and the voltage `ramp` with which the amplified error is compared. The ramp starts
     anew once a period; that is a scheduled event. Input `u` is added to the reference voltage.
     """
+
+    input_units = ("V",)
+    time_unit = "s"
 
     R: Parameter = parameter(22.0, unit="ohm", doc="load")
     C: Parameter = parameter(47e-6, unit="F", doc="capacitor")

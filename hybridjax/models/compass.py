@@ -15,6 +15,7 @@ from ..systems.transition import Transition
 
 class Step(Chart):
     states = ("n", "s", "vn", "vs")
+    units = ("rad", "rad", "rad/s", "rad/s")
     walker: "CompassGait"
 
     def field(self, t, q, u):
@@ -39,6 +40,9 @@ class CompassGait(HybridSystem):
     names. The guard is zero right after that and moves down, away from its event: only when it has
     been positive, past the scuff, may it fire.
     """
+
+    input_units = ("N m",)
+    time_unit = "s"
 
     mH: Parameter = parameter(10.0, unit="kg", doc="mass of the hip")
     m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")

@@ -12,6 +12,7 @@ from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 class Line(Chart):
     states = ("x", "v")
+    units = ("m", "m/s")
     duffing: "Duffing"
 
     def field(self, t, q, u):
@@ -27,6 +28,9 @@ class Duffing(HybridSystem):
     With a hardening spring (beta > 0) the resonance leans over to higher frequencies: between two
     folds there are three responses to one `rate`, the middle one unstable.
     """
+
+    input_units = ("m/s^2",)
+    time_unit = "s"
 
     alpha: Parameter = parameter(1.0, unit="1/s^2", doc="linear stiffness")
     beta: Parameter = parameter(0.05, unit="1/(m^2 s^2)", doc="cubic stiffness")

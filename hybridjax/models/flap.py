@@ -12,6 +12,7 @@ from ..systems.system import Guess, HybridSystem, Parameter, parameter
 
 class Blade(Chart):
     states = ("b", "vb")
+    units = ("rad", "")
     rotor: "RotorFlap"
 
     def field(self, t, q, u):

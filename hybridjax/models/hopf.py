@@ -27,6 +27,8 @@ class HopfOscillator(HybridSystem):
     Input `u` is added to the rate of x.
     """
 
+    time_unit = "s"
+
     mu: Parameter = parameter(0.1, unit="1/s", doc="growth rate at the origin")
     T: Parameter = parameter(1.0, unit="s", doc="period")
 

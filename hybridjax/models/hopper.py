@@ -17,6 +17,7 @@ from ..systems.transition import Transition
 
 class Flight(Chart):
     states = ("yM", "vM", "ym", "vm")
+    units = ("m", "m/s", "m", "m/s")
     hopper: "VerticalHopper"
 
     def field(self, t, q, u):
@@ -28,6 +29,7 @@ class Flight(Chart):
 
 class Stance(Chart):
     states = ("yM", "vM")
+    units = ("m", "m/s")
     absent = {"ym": 0.0, "vm": 0.0}
     hopper: "VerticalHopper"
 
@@ -43,6 +45,9 @@ class VerticalHopper(HybridSystem):
     Input `u` is a force on the upper mass. With `retention` = r < 1 a touchdown multiplies the
     speed of the upper mass by r.
     """
+
+    input_units = ("N",)
+    time_unit = "s"
 
     m: Parameter = parameter(1.0, unit="kg", doc="mass of the foot")
     M: Parameter = parameter(2.0, unit="kg", doc="mass of the body")

@@ -15,6 +15,7 @@ from ..systems.transition import Transition
 
 class Fall(Chart):
     states = ("y", "v")
+    units = ("m", "m/s")
     juggler: "PaddleJuggler"
 
     def field(self, t, q, u):
@@ -27,6 +28,9 @@ class PaddleJuggler(HybridSystem):
     Input `u` is added to the speed of the paddle at the impact. Between impacts the ball falls
     freely, so that everything is known in closed form (`exact`).
     """
+
+    input_units = ("m/s",)
+    time_unit = "s"
 
     A: Parameter = parameter(0.15, unit="m", doc="amplitude of the paddle")
     T: Parameter = parameter(1.0, unit="s", doc="period of the paddle")

@@ -19,6 +19,7 @@ from ..systems.transition import Transition
 
 class Flight(Chart):
     states = ("y", "vx", "vy")
+    units = ("m", "m/s", "m/s")
     runner: "SLIPRunner"
 
     def field(self, t, q, u):
@@ -27,6 +28,7 @@ class Flight(Chart):
 
 class Stance(Chart):
     states = ("x", "y", "vx", "vy")
+    units = ("m", "m", "m/s", "m/s")
     runner: "SLIPRunner"
 
     def field(self, t, q, u):
@@ -47,6 +49,9 @@ class SLIPRunner(HybridSystem):
     `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.
     """
 
+    input_units = ("rad",)
+    time_unit = "s"
+
     m: Parameter = parameter(80.0, unit="kg", doc="mass")
     k: Parameter = parameter(20000.0, unit="N/m", doc="stiffness of the leg")
     l0: Parameter = parameter(1.0, unit="m", doc="rest length of the leg")
@@ -60,7 +65,7 @@ class SLIPRunner(HybridSystem):
         return self.m * (self.g * y + (vx**2 + vy**2) / 2) + spring
 
     def outputs(self):
-        return (Output("energy", self.energy),)
+        return (Output("energy", self.energy, "J"),)
 
     def charts(self):
         return {"flight": Flight(self), "stance": Stance(self)}

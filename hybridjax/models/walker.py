@@ -13,6 +13,7 @@ from ..systems.transition import Transition
 
 class Step(Chart):
     states = ("th", "phi", "w", "p")
+    units = ("rad", "rad", "", "")
     walker: "SimplestWalker"
 
     def field(self, t, q, u):

@@ -13,6 +13,7 @@ from ..systems.transition import Transition
 
 class Swing(Chart):
     states = ("th", "w")
+    units = ("rad", "rad/s")
     wheel: "RimlessWheel"
 
     def field(self, t, q, u):
@@ -27,6 +28,9 @@ class RimlessWheel(HybridSystem):
     `u` is a hip torque over the moment of inertia. The return map is linear in w^2, so that the
     cycle and its multiplier cos^2(2 alpha) are known in closed form (`exact`).
     """
+
+    input_units = ("1/s^2",)
+    time_unit = "s"
 
     rate: Parameter = parameter(1.0, unit="1/s^2", doc="g / l")
     spokes: Parameter = parameter(8.0, doc="number of spokes")
@@ -62,4 +66,4 @@ class RimlessWheel(HybridSystem):
         )
 
     def guess(self):
-        return Guess("swing", (self.slope - self.alpha, 0.45))
+        return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))

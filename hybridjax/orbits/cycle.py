@@ -6,6 +6,8 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.memo import remembered
 from .._core.results import Result
+from .._core.signal import unit_of
+from .._core.text import number
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.settings import Settings
@@ -136,16 +138,21 @@ class LimitCycle(eqx.Module):
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
-        names = [tr.name for tr in Structure(self.system).transitions]
+        s, time = Structure(self.system), self.system.time_unit
+        names = [tr.name for tr in s.transitions]
         events = ", ".join(names[g] for g in self.event_sequence) or "none"
-        state = ", ".join(f"{k} = {v:.9g}" for k, v in self.state.items())
+        units = map(unit_of, s.states(int(self.anchor.chart[0])))
+        state = ", ".join(
+            f"{name} = {number(x, 9, unit)}"
+            for (name, x), unit in zip(self.state.items(), units, strict=True)
+        )
         multipliers = ", ".join(_format(z) for z in self.multipliers) or "none but zero"
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
         return (
             f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
-            f"  period       {float(self.period):.12g}\n"
-            f"  at t = {float(self.anchor.t[0]):.6g}   {state}\n"
+            f"  period       {number(self.period, 12, time)}\n"
+            f"  at t = {number(self.anchor.t[0], 6, time)}   {state}\n"
             f"  events       {events}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"

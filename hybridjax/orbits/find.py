@@ -12,6 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
+from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
@@ -53,6 +54,7 @@ _DUE = 1e-9
 
 
 @checked
+@working("find_limit_cycle")
 def find_limit_cycle(
     system: HybridSystem,
     guess: Guess | LimitCycle | None = None,
@@ -174,6 +176,7 @@ def _in_sizes(
 
 def _solve(map: ReturnMap) -> Solution:
     """Newton's method, with smaller steps or another period where it fails."""
+    say("Newton's method")
     solution = solve(map)
     if int(solution.result) == Result.EXTRA_TURNS:
         turn = solution.turn
@@ -181,6 +184,7 @@ def _solve(map: ReturnMap) -> Solution:
         solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
     if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
+        say("steps of Levenberg and Marquardt")
         second = solve(map, True, False, _DAMPED_STEPS)
         solution = second if int(second.result) == Result.OK else solution
     return solution
@@ -202,6 +206,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
         size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
         distance = jnp.asarray(np.max(np.abs(solution.turn.residual) / size))
         return own, solution._replace(turn=solution.turn._replace(distance=distance))
+    say("Newton's method, in the sizes of the cycle")
     again = solve(own)
     if int(again.result) not in (Result.OK, Result.SINGULAR):
         return map, solution
@@ -245,22 +250,29 @@ def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, A
 
 
 def _check_conserved(cycle: LimitCycle) -> None:
-    """Raise where a quantity that should be conserved is not: its gradient is then no left
-    eigenvector of the monodromy."""
+    """Raise where a quantity that should be conserved is not."""
+    lost = [name for name in cycle.conserved if name not in _kept(cycle, tuple(cycle.conserved))]
+    if lost:
+        raise DefinitionError(
+            f"'{lost[0]}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
+            "cycle change it in one turn. Leave it out of `conserved`."
+        )
+
+
+def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
+    """Those outputs that are conserved near the cycle, with their values: their gradients are left
+    eigenvectors of the monodromy."""
     s = Structure(cycle.system)
     a, t = int(cycle.anchor.chart[0]), cycle.anchor.t[0]
     q, u = cycle.anchor.q[: s.dims[a], 0], jnp.zeros(s.nu)
     returned = np.asarray(monodromy(cycle.factors))[: s.dims[a], : s.dims[a]]
     sizes = np.asarray(cycle.return_map.sizes)[: s.dims[a]]
-    outputs = s.resolve_outputs(tuple(cycle.conserved))
+    outputs = s.resolve_outputs(names)
     gradients = np.asarray(jax.jacfwd(lambda q: outputs(a, t, q, u))(q))
-    for name, gradient in zip(outputs.names, gradients, strict=True):
-        change = (gradient @ returned - gradient) * sizes
-        if np.max(np.abs(change)) > _CONSERVED * np.max(np.abs(gradient * sizes)):
-            raise DefinitionError(
-                f"'{name}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
-                "cycle change it in one turn. Leave it out of `conserved`."
-            )
+    changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
+    kept = changes <= _CONSERVED * np.abs(gradients * sizes).max(axis=1)
+    values = np.asarray(outputs(a, t, q, u))
+    return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
 def _check_clock(cycle: LimitCycle) -> None:
@@ -297,11 +309,14 @@ def _at_anchor(cycle: LimitCycle):
 def _explain(cycle: LimitCycle, code: Result) -> str:
     name = type(cycle.system).__name__
     if code == Result.SINGULAR:
+        kept = _kept(cycle, tuple(output.name for output in cycle.system.outputs()))
+        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {"energy": 1.0}
         return (
             f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
             "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
             "is wanted by the value of the quantity (an output of the system), e.g. "
-            "`conserved={'energy': 1.0}`, or take the one nearest to the guess with `throw=False`."
+            f"`conserved={example}`, or take the one nearest to the guess with "
+            "`throw=False`."
         )
     reason = code.message
     if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):

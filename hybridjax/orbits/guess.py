@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.compilation.compile import quick_jit
+from .._core.progress import say
 from .._core.results import Result
 from ..engine.events import start_lanes
 from ..engine.lanes import Lanes
@@ -124,7 +125,8 @@ def begin(
     """
     s, period = Structure(system), system.period()
     if settle:
-        wait = settle if period is None else np.ceil(settle / period) * float(period)
+        say("settling")
+        wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
         moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
         _require(moved, "settling", s)
         lanes = moved.lanes
@@ -142,6 +144,7 @@ def begin(
             "moves: start elsewhere."
         )
     on_section = rate < 0 and abs(level) <= -_ON_SECTION * time * rate
+    by_default = section is None
     if section is None:
         sizes = np.asarray(settings.scale)[a, : s.dims[a]]
         plane = _Plane(jnp.asarray(q), jnp.asarray(f / sizes**2 / np.linalg.norm(f / sizes)))
@@ -149,9 +152,11 @@ def begin(
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
 
     def next_meeting(lanes, doing):
+        say(doing)
         target = toward(jnp.full(1, jnp.inf), event, lanes.t + max_period)
         moved = _go(system, lanes, section, target, settings)
-        _require(moved, f"{doing} ({section})", s)
+        where = "through the guess, across the flow" if by_default else str(section)
+        _require(moved, f"{doing} ({where})", s, _other_section(s) if by_default else "")
         return moved.lanes
 
     if not on_section:
@@ -172,14 +177,21 @@ def _at_start(system, lanes, section):
     return f, seen.value[-1, 0], seen.rate[-1, 0]
 
 
-def _require(moved, doing: str, s: Structure) -> None:
+def _other_section(s: Structure) -> str:
+    """What to try where the flow does not come back to a section that was chosen by default."""
+    events = [transition.name for transition in s.transitions]
+    example = f"AtEvent({events[0]!r})" if events else f"Crossing({s.state_names()[0]!r}, 'rising')"
+    return f"Say where the cycle is met once in each turn, e.g. `section={example}`. "
+
+
+def _require(moved, doing: str, s: Structure, advice: str = "") -> None:
     result = Result(int(moved.result[0]))
     if result != Result.OK:
         lanes = moved.lanes
         raise ComputationError(
             f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
-            f"'{s.names[int(lanes.chart[0])]}': {result.message}. Check the guess and the guards "
-            "with `simulate(..., throw=False)`."
+            f"'{s.names[int(lanes.chart[0])]}': {result.message}. {advice}Check the guess and "
+            "the guards with `simulate(..., throw=False)`."
         )
 
 

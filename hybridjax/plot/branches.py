@@ -6,10 +6,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from .._core.boundary.checked import checked
+from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..orbits.branches.branch import KINDS, Branch
 from ..systems.structure import Structure
-from .look import COLORS, CYCLE, AxesLike, Plot, label_of, panels
+from ..systems.system import unit_of_parameter
+from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
 
 
 _MARKS = dict(
@@ -33,7 +35,7 @@ def branch(
     - `branches`: from `continuation`, all along the same parameter.
     - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
         default the first state of the chart in which the cycle begins.
-    - `labels`: texts for the axes by name, e.g. `{"Vin": "supply (V)"}`.
+    - `labels`: texts for the axes by name, e.g. `{"Vin": "supply"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
 
     **Raises:** `DefinitionError` for branches along different parameters, or a name that does not
@@ -62,7 +64,12 @@ def branch(
         gray = COLORS["gray"]
         panel.plot([], [], "-", color=gray, label="stable")
         panel.plot([], [], "--", color=gray, label="unstable")
-        panel.set(xlabel=label_of(b.parameter, labels), ylabel=f"largest {label_of(name, labels)}")
+        system = branches[0][0].system
+        parameter = Signal(b.parameter, unit_of_parameter(system, b.parameter))
+        (output_name,) = Structure(system).resolve_outputs(name).names
+        panel.set(
+            xlabel=axis_of(parameter, labels), ylabel=f"largest {axis_of(output_name, labels)}"
+        )
         panel.locator_params(axis="x", nbins=6)
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)

@@ -9,9 +9,10 @@ from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Positive
+from .._core.text import p_value
 from ..identify.series.amplitude import AmplitudeSweep
 from ..identify.series.validation import Validation
-from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
+from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, axis_of, label_of, letters, panels
 
 
 @checked
@@ -40,17 +41,17 @@ def validation(
             signal.plot(time, found.simulated[shown, i], color=CYCLE[0], label="simulated")
             measured = dict(ls="", marker=".", ms=3, color="black", label="measured")
             signal.plot(time, found.measured[shown, i], **measured)
-            signal.set_ylabel(rf"$\delta$ {label_of(name, labels)}")
+            signal.set_ylabel(axis_of(name, labels, deviation=True))
             signal.set_title(f"fit {found.fit[i]:.2f} %")
             signal.margins(x=0.02)
             after = np.arange(1, 1 + found.autocorrelation.shape[1])
             _stems(auto, after, found.autocorrelation[:, :, i], CYCLE[0], 0.0, limit)
-            auto.set_title(f"residuals: p = {found.whiteness[i]:.2g}")
+            auto.set_title(f"residuals: {p_value(found.whiteness[i])}")
             for j, _ in enumerate(found.inputs):
                 lags = np.arange(found.cross_correlation.shape[1])
                 values = found.cross_correlation[:, :, i, j]
                 _stems(cross, lags, values, CYCLE[(1 + j) % len(CYCLE)], 0.2 * j, limit)
-            cross.set_title(f"with the input: p = {found.independence[i]:.2g}")
+            cross.set_title(f"with the input: {p_value(found.independence[i])}")
         axes[0, 0].legend(loc="best")
         axes[-1, 0].set_xlabel("time (cycles)")
         for lags in axes[-1, 1:]:
@@ -94,7 +95,7 @@ def amplitude(
         if misfit is not None:
             panel.axhline(misfit, color="0.5", lw=0.6)
             panel.axvline(sweep.limit(misfit), color="0.5", lw=0.6)
-        panel.set_xlabel("amplitude of the input")
+        panel.set_xlabel("factor of the input")
         panel.set_ylabel("misfit / output (rms)")
         panel.legend()
     return Plot(axes)

@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
+from .._core.signal import ratio, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
 from ..identify.rational.fit import RationalFit
@@ -51,11 +52,12 @@ def magnitude(
             f, order = _sorted(htf)
             for m in harmonics:
                 size = np.abs(np.asarray(htf.harmonic(m))[order, i, j])
-                line = _line(htf, _harmonic_style(m, harmonics), _name(m))
+                line = _line(htf, htfs, _harmonic_style(m, harmonics), _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, _radius(htf, m, order, i, j), line, 0.3 * np.min(size))
-        name = label_of(htf.outputs[i], labels)
-        panel.set(yscale="log", xlabel=_FREQUENCY, ylabel=f"$|H_m|$, {name}")
+        unit = ratio(htf.outputs[i], htf.inputs[j])
+        size = with_unit(f"$|H_m|$, {label_of(htf.outputs[i], labels)}", unit)
+        panel.set(yscale="log", xlabel=_FREQUENCY, ylabel=size)
         _frequency_limits(panel, f)
         top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
         panel.set_ylim(top * 10.0**-decades, top * 2)
@@ -134,14 +136,19 @@ def bode(
 
 def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
     upper, lower = axes
-    names = htfs[0].outputs if outputs is None else np.atleast_1d(outputs)
-    for number, name in enumerate(names):
+    first = htfs[0]
+    names = first.outputs if outputs is None else np.atleast_1d(outputs)
+    pushed = first.inputs[_index(first.inputs, input)]
+    units = [ratio(first.outputs[_index(first.outputs, name)], pushed) for name in names]
+    same = units[0] if len(set(units)) == 1 else ""  # else each curve says its own
+    for number, (name, unit) in enumerate(zip(names, units, strict=True)):
         color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
         for htf in sorted(htfs, key=_estimates_last):
             f, order = _sorted(htf)
             i, j = _index(htf.outputs, name), _index(htf.inputs, input)
             values = np.asarray(htf.harmonic(harmonic))[order, i, j]
-            line = _line(htf, {"color": color}, label_of(name, labels))
+            label = with_unit(label_of(name, labels), "" if same else unit)
+            line = _line(htf, htfs, {"color": color}, label)
             size, radius = np.abs(values), _radius(htf, harmonic, order, i, j)
             known = np.full(len(f), True) if radius is None else radius < size
             reference = _curve(upper, lower, f, values, reference, known, **line)
@@ -156,7 +163,8 @@ def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) ->
             reference = _curve(upper, lower, f, values, reference, **line)
     for fit in dict.fromkeys(type(fit) for fit in fits):
         upper.plot([], [], color="black", lw=0.8, ls=(0, (4, 1.5)), label=_FIT_NAMES[fit])
-    upper.set(yscale="log", xlabel=_FREQUENCY, ylabel=f"$|{_name(harmonic)[1:-1]}|$")
+    size = with_unit(f"$|{_name(harmonic)[1:-1]}|$", same)
+    upper.set(yscale="log", xlabel=_FREQUENCY, ylabel=size)
     lower.set(xlabel=_FREQUENCY, ylabel=f"$\\angle {_name(harmonic)[1:-1]}$ (degrees)")
     _frequency_limits(upper, f)
     _frequency_limits(lower, f)
@@ -250,10 +258,11 @@ def _harmonic_style(m: int, shown: Sequence[int]) -> dict:
     }
 
 
-def _line(htf: HTF, line: dict, label: str) -> dict:
+def _line(htf: HTF, htfs: Sequence[HTF], line: dict, label: str) -> dict:
     """Exact HTFs broad and pale, without a label where an estimate of the same curve has one."""
     if htf.source == "exact":
-        return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1}
+        label = "" if any(map(_estimates_last, htfs)) else label
+        return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
     return {**line, "lw": 0.9, "zorder": 3, "label": label}
 
 

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from .._core.boundary.checked import checked
 from .._core.boundary.scalars import Whole
+from .._core.signal import unit_of, with_unit
 from .._core.writing import replacing
 from ..errors import DefinitionError
 
@@ -150,6 +151,12 @@ def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
 def label_of(name: str, labels: Mapping[str, str] | None) -> str:
     """The text for a state, input or output: the user's, or its name."""
     return (labels or {}).get(name, name)
+
+
+def axis_of(name: str, labels: Mapping[str, str] | None, deviation: bool = False) -> str:
+    """The label of an axis for a signal, or for its deviation from the cycle, with the unit."""
+    text = label_of(name, labels)
+    return with_unit(rf"$\delta$ {text}" if deviation else text, unit_of(name))
 
 
 def letters(axes: Any) -> None:

@@ -14,11 +14,16 @@ from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
-from .look import COLORS, AxesLike, Plot, label_of, panels
+from .look import COLORS, AxesLike, Plot, axis_of, panels
 
 
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
-_BAR = 0.035  # half of a section's bar, as a part of the width of the picture
+# Half of a section's bar, and from its end to its number, as parts of the width of the picture.
+_BAR, _ROOM = 0.035, 0.03
+_NUMBER = {
+    "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
+    "path_effects": [withStroke(linewidth=2, foreground="white")],
+}  # fmt: skip
 _TURN = 1 + 1e-6  # so that an event at the very end of a turn is seen
 
 
@@ -44,9 +49,10 @@ def cycle(
 
     - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
     - `sections`: from `place_sections`, drawn as bars and numbered.
-    - `numbers`: number every so manyth section (0: none); by default about 8 of them.
+    - `numbers`: number every so manyth section (0: none); by default about 8 of them, where there
+      is room beside the orbit.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
-    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$ (m)"}`.
+    - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
 
     **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
@@ -79,11 +85,11 @@ def cycle(
         panel.locator_params(axis="x", nbins=6)
         if sections is not None:
             step = max(1, round(sections.n_sections / 8)) if numbers is None else numbers
-            _sections(panel, s, sections, (x, y), center, step)
+            _sections(panel, s, sections, (x, y), np.stack([px, py], axis=1), step)
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
-        panel.set_xlabel(label_of(x, labels))
-        panel.set_ylabel(label_of(y, labels))
+        panel.set_xlabel(axis_of(x, labels))
+        panel.set_ylabel(axis_of(y, labels))
         panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
     return Plot(axes)
 
@@ -100,7 +106,7 @@ def _plane(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
         )
     x = everywhere[0] if x is None else x
     y = next(n for n in everywhere if n != x) if y is None else y
-    s.resolve_outputs((x, y))
+    x, y = s.resolve_outputs((x, y)).names
     return x, y
 
 
@@ -153,9 +159,10 @@ def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
     )  # fmt: skip
 
 
-def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center, step: int) -> None:
+def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit, step: int) -> None:
     width, height = ax.get_position().size * ax.get_figure(root=True).get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
+    taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
     lanes = placed.lanes
     charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     bars = []
@@ -165,7 +172,12 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center, ste
         along = _along(s, placed, i, a, t, q, names, unit)
         bars.append(np.stack([here - _BAR * along, here + _BAR * along]))
         if step and i % step == 0:
-            _text(ax, str(i), here, center, distance=12, fontsize="x-small", color="0.35")
+            beside = np.stack([here + side * (_BAR + _ROOM) * along for side in (-1, 1)]) / unit
+            room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
+            if room.max() > _ROOM:
+                at = beside[np.argmax(room)]
+                ax.text(*(unit * at), str(i), **_NUMBER)
+                taken = np.concatenate([taken, at[None]])
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
     flat = [np.hstack([bars[..., k], gaps]).ravel() for k in (0, 1)]

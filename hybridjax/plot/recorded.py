@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Complex
 
 from .._core.boundary.checked import checked
+from .._core.signal import Signal, ratio, unit_of, with_unit
 from ..identify.series.series_fit import SeriesFit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase.winding import Phase
 from ..recordings.spectra import input_spectrum
-from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
+from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, axis_of, label_of, letters, panels
 
 
 @checked
@@ -54,10 +55,9 @@ def section_data(
     with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
         for i, name in enumerate(names):
             average, spread, last = axes[i]
-            unit = f" ({data.units[i]})" if data.units[i] else ""
-            label = label_of(name, labels)
+            deviation = axis_of(name, labels, deviation=True)
             average.plot(at_phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
-            average.set_ylabel(label + unit)
+            average.set_ylabel(axis_of(name, labels))
             values = np.concatenate(
                 [np.concatenate([r.u, r.y], axis=1)[:, i] for r in data.records]
             )
@@ -67,10 +67,11 @@ def section_data(
             std = np.array([np.nanstd(values[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(at_phase, sign * std, color=CYCLE[0])
-            spread.set_ylabel(rf"$\delta$ {label}{unit}")
+            spread.set_ylabel(deviation)
             if i < len(data.inputs):
                 last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
-                last.set(xlabel="frequency (cycles/period)", ylabel="power")
+                unit = unit_of(name) and f"({unit_of(name)})²"
+                last.set(xlabel="frequency (cycles/period)", ylabel=with_unit("power", unit))
             else:
                 most = int(np.argmax(std))
                 each = [
@@ -79,7 +80,7 @@ def section_data(
                 ]
                 y = [r.y[k, i - len(data.inputs)] for r, k in zip(data.records, each, strict=True)]
                 last.plot(np.concatenate(y), lw=0.5, color=CYCLE[1])
-                last.set(xlabel="cycle", ylabel=rf"$\delta$ {label}{unit}")
+                last.set(xlabel="cycle", ylabel=deviation)
         for panel in axes[-1, :2]:
             panel.set_xlabel("phase (cycles)")
         axes[0, 0].get_figure(root=True).align_ylabels(axes)
@@ -108,7 +109,10 @@ def impulse_responses(
                 found.lag, found.phase, values, cmap="RdBu_r", vmin=-top, vmax=top,
                 rasterized=True, shading="nearest",
             )  # fmt: skip
-            plane.get_figure().colorbar(image, ax=plane, label=label_of(name, labels))
+            pushed = found.inputs[input]
+            impulse = Signal(pushed, unit_of(pushed) and f"{unit_of(pushed)} s")
+            label = with_unit(f"{label_of(name, labels)} / impulse", ratio(name, impulse))
+            plane.get_figure().colorbar(image, ax=plane, label=label)
             plane.set_ylabel("phase of the push")
             for k, m in enumerate(dict.fromkeys(chosen)):
                 band = 1.96 * found.errors[m, :, i, input]
@@ -118,7 +122,7 @@ def impulse_responses(
                     found.lag, values[m] - band, values[m] + band, alpha=0.25, lw=0, **line
                 )
             curves.axhline(0, color="black", lw=0.4)
-            curves.set_ylabel(f"{label_of(name, labels)} / impulse")
+            curves.set_ylabel(label)
         axes[0, 1].legend(loc="upper right")
         for panel in axes[-1]:
             panel.set_xlabel("time since the push (cycles)")

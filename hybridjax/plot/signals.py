@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, label_of, panels
+from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, axis_of, panels
 
 
 @checked
@@ -40,8 +40,7 @@ def experiment(
                 panel.step(time, values, where="post", lw=0.5, color=COLORS["black"])
             else:
                 panel.plot(time, values, lw=0.5, color=CYCLE[0])
-            text = label_of(name, labels)
-            panel.set_ylabel(text if is_input else rf"$\delta$ {text}")
+            panel.set_ylabel(axis_of(name, labels, deviation=not is_input))
             if data.window.start:
                 panel.axvspan(0, data.window.start / data.n_sections, color="0.92", zorder=0)
             if not data.ok[index] and data.failed_at[index] >= 0:

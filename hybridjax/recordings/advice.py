@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
 from .._core.results import Result
+from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import RecordedData
 from ..identify.multipliers.compare import compare_multipliers
@@ -17,6 +18,7 @@ from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refus
 from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.series_fit import SeriesFit
+from ..identify.series.validation import Validation
 from .data import SectionData
 from .spectra import input_band, input_spectrum
 
@@ -80,12 +82,13 @@ class Advice(eqx.Module):
 
 
 @checked
-def advise(data: SectionData, fit: SeriesFit) -> Advice:
+def advise(data: SectionData, fit: SeriesFit, validation: Validation | None = None) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
     Too few strides for the unknowns, more multipliers than the data carry, inputs without power
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
-    intervals that reach the unit circle, an iteration that did not end.
+    intervals that reach the unit circle, an iteration that did not end; and with a `validation` on
+    strides that were held out, what it finds left over.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
@@ -119,6 +122,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
             "use it here."
         )
     warnings += _about_the_fit(fit)
+    warnings += [] if validation is None else _about_what_is_left(validation)
     if data.missing > _MANY_MISSING:
         warnings.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
     # Variances go down with the number of strides that the unknowns leave over.
@@ -175,6 +179,24 @@ def _about_the_fit(fit: SeriesFit) -> Iterator[str]:
             yield f"Stability: the interval of the multiplier {z:.3g} reaches the unit circle."
     if fit.result != Result.OK:
         yield f"The fit did not end: {Result(fit.result).message}."
+
+
+def _about_what_is_left(validation: Validation) -> Iterator[str]:
+    """Whether a model leaves more than noise of strides that it was not fitted to."""
+    if not validation.white:
+        yield (
+            "Left over: what the fit leaves of strides held out is correlated in time "
+            f"({p_value(validation.whiteness.min())}). Smoothing does that, and so do disturbances "
+            "of the state, and standard errors allow for both; if the multipliers change with "
+            "another `bandwidth` or `order`, the model lacks something."
+        )
+    if not validation.independent:
+        yield (
+            "Left over: what the fit leaves of strides held out depends on the input "
+            f"({p_value(validation.independence.min())}). Few strides for many coefficients do "
+            "that, and so do pushes beyond the linear range: record more, or push less; if it "
+            "remains, raise the `order`."
+        )
 
 
 def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:

@@ -6,6 +6,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
+from .._core.signal import unit_of
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record
 
@@ -20,7 +21,7 @@ class SectionData(eqx.Module):
     - `times`: for each record, when it crossed its sections. `trials`: the index of its trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: of the splines through the outputs, in Hz.
-    - `n_sections`, `inputs`, `outputs`, `units` (of inputs, then outputs).
+    - `n_sections`, `inputs`, `outputs`; `units` (of inputs, then outputs).
     """
 
     records: tuple[Record, ...]
@@ -30,7 +31,10 @@ class SectionData(eqx.Module):
     cycle_outputs: Float[np.ndarray, "N ny"]
     period: float = eqx.field(static=True)
     bandwidth: float = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(map(unit_of, self.inputs + self.outputs))
 
     @property
     def n_sections(self) -> int:

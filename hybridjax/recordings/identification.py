@@ -6,6 +6,7 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Positive, SectionCount, SignalNames
+from .._core.progress import say, working
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
@@ -40,6 +41,7 @@ class Identification(eqx.Module):
 
 
 @checked
+@working("identify_recording")
 def identify_recording(
     recording: Recording,
     phase: Phase | PhaseDefinition,
@@ -65,6 +67,7 @@ def identify_recording(
 
     **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
     """
+    say("phase")
     definition = None if isinstance(phase, Phase) else phase
     found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
@@ -72,6 +75,7 @@ def identify_recording(
         moved |= set() if definition is None else signals_of(definition)
         recording = without_drift(recording, found, sorted(moved), drift)
         found = found if definition is None else estimate_phase(recording, definition)
+    say("data at the sections")
     data = section_data(
         recording,
         found,
@@ -83,11 +87,14 @@ def identify_recording(
         timing=timing,
         drift=drift,
     )
+    say("order")
     order = choose_order(data) if order is None else order
+    say("fit to the first three quarters")
     held = hold_out(data, order)
     # Where the held-out fit saw only the beginning of a long recording and found no part of second
     # order that pays, the whole is not asked again.
     known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
+    say("fit to all")
     fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
         recording=recording,
@@ -96,5 +103,5 @@ def identify_recording(
         fit=fit,
         held_out=held,
         responses=impulse_responses(fit, data),
-        advice=advise(data, fit),
+        advice=advise(data, fit, held.validation),
     )

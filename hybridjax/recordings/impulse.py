@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
+from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
@@ -52,7 +53,7 @@ class ImpulseResponses(eqx.Module):
     def __repr__(self) -> str:
         return (
             f"ImpulseResponses({len(self.phase)} phases, {self.lag[-1]:.3g} cycles, width "
-            f"{self.width:.2g}; {', '.join(self.inputs)} -> {', '.join(self.outputs)})"
+            f"{self.width:.2g}; {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
 

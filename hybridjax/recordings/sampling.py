@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SectionCount, SignalNames
+from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
@@ -96,9 +97,11 @@ def section_data(
         trials += [number] * len(parts)
     if not found:
         raise DefinitionError("the recording holds no whole cycle to sample.")
-    units = [recording.unit(name) for name in (*inputs, *outputs)]
+    inputs, outputs = (
+        tuple(Signal(name, recording.unit(name)) for name in names) for names in (inputs, outputs)
+    )
     if timing is not None:
-        outputs, units = (*outputs, _TIME[timing]), [*units, "s"]
+        outputs = (*outputs, Signal(_TIME[timing], "s"))
     # A smoothing spline averages over neighbors to both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
     records = [
@@ -124,7 +127,6 @@ def section_data(
         cycle_outputs=cycle[:, len(inputs) :],
         period=phase.period,
         bandwidth=bandwidth,
-        units=tuple(units),
     )
 
 

@@ -12,6 +12,7 @@ from .._core.boundary.kinds import Scalar
 from .._core.precision import real
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
+from .._core.text import fields
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
 from ..systems.structure import Structure as Structure
@@ -86,6 +87,9 @@ class AbstractSections(eqx.Module):
     @abc.abstractmethod
     def describe(self, i: int) -> str:
         """Section i in a few words, for errors."""
+
+    def __repr__(self):
+        return fields(self)
 
 
 def check_n_sections(n_sections: int) -> None:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.precision import real
+from .._core.text import fields
 from ..errors import DefinitionError
 from ..systems.output import Output
 from ..systems.structure import Structure
@@ -47,6 +48,9 @@ class Crossing(eqx.Module):
             name = getattr(name, "name", getattr(name, "__name__", "function"))
         return f"{name} {self.direction}"
 
+    def __repr__(self):
+        return fields(self)
+
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for charts or outputs that the system does not have."""
         for name in self.charts or ():
@@ -84,6 +88,9 @@ class AtEvent(eqx.Module):
 
     def __str__(self):
         return f"after {self.name}"
+
+    def __repr__(self):
+        return fields(self)
 
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for an event that the system does not have."""

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from .._core.signal import signals
+from .._core.text import listed
+
 
 if TYPE_CHECKING:
     # Type checkers take equinox's own form for a field of the constructor.
@@ -24,6 +27,7 @@ class Chart(eqx.Module):
     ```python
     class Flight(hj.Chart):
         states = ("y", "v")
+        units = ("m", "m/s")
         ball: "Ball"
 
         def field(self, t, q, u):
@@ -34,6 +38,7 @@ class Chart(eqx.Module):
     Class attributes:
 
     - `states`: the names of the states, in the order in which they stand in `q`.
+    - `units`: their units, in the same order, for figures and prints; none, or one for each.
     - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
         stand in `u` (the map g_a of the paper: the others are thrown away). `None` means all.
     - `absent`: values of states that this chart does not carry although outputs and sections may
@@ -41,6 +46,7 @@ class Chart(eqx.Module):
     """
 
     states: AbstractClassVar[tuple[str, ...]]
+    units: ClassVar[tuple[str, ...]] = ()
     inputs: ClassVar[tuple[str, ...] | None] = None
     absent: ClassVar[Mapping[str, float]] = {}
 
@@ -53,3 +59,6 @@ class Chart(eqx.Module):
 
         **Returns:** n numbers, as an array or a tuple.
         """
+
+    def __repr__(self):
+        return f"{type(self).__name__}({listed(signals(self.states, self.units))})"

@@ -5,6 +5,8 @@ from typing import Any
 
 import equinox as eqx
 
+from .._core.text import fields
+
 
 class Output(eqx.Module):
     """A named scalar output z = h(t, q, u).
@@ -14,7 +16,12 @@ class Output(eqx.Module):
     - `name`: its name in data and plots.
     - `function`: one function (t, q, u) -> number for all charts, or a mapping from chart names to
         such functions. What a missing chart means is an error when the output is needed there.
+    - `unit`: its unit, for figures and prints.
     """
 
     name: str = eqx.field(static=True)
     function: Callable[..., Any] | Mapping[str, Callable[..., Any]]
+    unit: str = eqx.field(static=True, default="")
+
+    def __repr__(self):
+        return fields(self)

@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from .._core.lanes.per_lane import PerLane, by_lane, shared
+from .._core.signal import Signal, signals
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
@@ -45,7 +46,8 @@ class Structure:
         self.transitions: list[Transition] = list(system.transitions())
         self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
         self.d = max(self.dims)
-        self.nu = len(system.inputs)
+        self.inputs: tuple[Signal, ...] = signals(system.inputs, system.input_units)
+        self.nu = len(self.inputs)
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
@@ -132,7 +134,11 @@ class Structure:
 
     def state_names(self) -> tuple[str, ...]:
         """All state names, in order of first appearance."""
-        return tuple(dict.fromkeys(n for c in self.charts for n in c.states))
+        return tuple(dict.fromkeys(n for a in range(len(self.charts)) for n in self.states(a)))
+
+    def states(self, a: int) -> tuple[Signal, ...]:
+        """The names of chart a's states, with their units."""
+        return signals(self.charts[a].states, self.charts[a].units)
 
     def resolve_outputs(self, outputs: Sequence[str | Output] | str | Output) -> "Outputs":
         """Outputs by name or by `Output`, checked and ready to evaluate in any chart."""
@@ -153,9 +159,12 @@ class Outputs:
                 item = defined[item]
             if isinstance(item, str) and item not in structure.state_names():
                 known = (*structure.state_names(), *defined)
-                raise DefinitionError(f"there is no output '{item}'; outputs are {_list(known)}.")
+                raise DefinitionError(f"there is no output {item!r}; outputs are {_list(known)}.")
             self.items.append(item)
-        self.names = tuple(o if isinstance(o, str) else o.name for o in self.items)
+        states = {str(name): name for name in structure.state_names()}
+        self.names = tuple(
+            states[o] if isinstance(o, str) else Signal(o.name, o.unit) for o in self.items
+        )
 
     def __call__(self, a: int, t, q, u) -> jax.Array:
         """All outputs in chart a, shape (ny,); NaN where a chart does not define one."""
@@ -213,6 +222,7 @@ def check_system(system: Any) -> None:
             )
     if not system.charts():
         raise DefinitionError(f"{type(system).__name__} has no charts.")
+    _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
     s = Structure(system)
     t, u = jnp.zeros(()), jnp.zeros(s.nu)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
@@ -223,12 +233,18 @@ def check_system(system: Any) -> None:
             )
         if len(set(chart.states)) < len(chart.states):
             raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
+        _check_units(f"chart '{name}'", "states", chart.states, chart.units)
         shape = _shape(f"field of chart '{name}'", lambda q, a=a: s.field(a, t, q, u), s.dims[a])
         if shape != (s.dims[a],):
             raise DefinitionError(
                 f"the field of chart '{name}' returns shape {shape}, but the chart has the "
                 f"{s.dims[a]} states {_list(chart.states)}."
             )
+    if len(set(map(str, s.state_names()))) < len(s.state_names()):
+        raise DefinitionError(
+            f"charts of {type(system).__name__} give a state different units: "
+            f"{_list(s.state_names())}."
+        )
     seen: set[str] = set()
     for g, tr in enumerate(s.transitions):
         if tr.name in seen:
@@ -259,5 +275,13 @@ def _shape(what: str, function: Callable, n: int) -> tuple[int, ...]:
         raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
 
 
+def _check_units(what: str, kind: str, names: Sequence[str], units: Sequence[str]) -> None:
+    if len(units) not in (0, len(names)):
+        raise DefinitionError(
+            f"{what} has the {kind} {_list(names)}, but {len(units)} units: give one for each, "
+            "or none."
+        )
+
+
 def _list(names) -> str:
-    return ", ".join(f"'{n}'" for n in names) or "none"
+    return ", ".join(map(repr, names)) or "none"

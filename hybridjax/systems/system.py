@@ -1,6 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -8,6 +9,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._core.precision import real
+from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -31,12 +33,23 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     return eqx.field(converter=real, metadata=metadata, **options)
 
 
+def unit_of_parameter(system: Any, path: str) -> str:
+    """The unit of a parameter, that of a part of a part by a path with dots; "" if it has none."""
+    *parts, name = path.split(".")
+    for part in parts:
+        system = getattr(system, part)
+    return type(system).__dataclass_fields__[name].metadata.get("unit", "")
+
+
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
     state: Float[Array, " n"] = eqx.field(converter=real)
     time: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+
+    def __repr__(self):
+        return fields(self)
 
 
 class HybridSystem(eqx.Module):
@@ -59,10 +72,13 @@ class HybridSystem(eqx.Module):
 
     `charts` (and where there are events, `transitions`) are written by every system; `period`,
     `outputs` and `guess` where they apply. The class attribute `inputs` names the exogenous
-    inputs û; `inputs = ()` for a system without.
+    inputs û; `inputs = ()` for a system without. `input_units` gives their units in the same order
+    (none, or one for each), and `time_unit` that of time.
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("u",)
+    input_units: ClassVar[tuple[str, ...]] = ()
+    time_unit: ClassVar[str] = ""
 
     @abc.abstractmethod
     def charts(self) -> dict[str, Chart]:
@@ -87,6 +103,13 @@ class HybridSystem(eqx.Module):
         """A start for the search of the limit cycle, if the model knows one."""
         return None
 
+    def __repr__(self):
+        rows = []
+        for field in dataclasses.fields(self):
+            unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
+            rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
+        return type(self).__name__ + columns(rows)
+
 
 class Driven(HybridSystem):
     """`system` with an input that is a function of time, added to the piecewise constant one."""
@@ -97,6 +120,14 @@ class Driven(HybridSystem):
     @property
     def inputs(self) -> tuple[str, ...]:
         return self.system.inputs
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        return self.system.input_units
+
+    @property
+    def time_unit(self) -> str:
+        return self.system.time_unit
 
     def charts(self):
         return self.system.charts()

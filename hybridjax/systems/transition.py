@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.precision import real
+from .._core.text import fields
 from ..errors import DefinitionError
 
 
@@ -26,6 +27,9 @@ class Scheduled(eqx.Module):
             raise DefinitionError(
                 f"the period of a schedule must be positive and finite; it is {self.period}."
             )
+
+    def __repr__(self):
+        return fields(self)
 
 
 def _identity(t, q, u):
@@ -69,3 +73,7 @@ class Transition(eqx.Module):
     def sign(self) -> float:
         """+1 or -1, so that sign * guard falls through zero at the event."""
         return 1.0 if self.direction == "falling" else -1.0
+
+    def __repr__(self):
+        how = "scheduled" if isinstance(self.guard, Scheduled) else self.direction
+        return f"Transition({self.name!r}: {self.source} -> {self.target}, {how})"

@@ -162,3 +162,35 @@ def test_energy_is_conserved_in_running():
     # Every cycle of the family has one multiplier 1; this one has the energy that Newton led to.
     assert np.min(np.abs(cycle.multipliers - 1)) < 1e-7
     assert np.isfinite(runner.energy(0.0, jnp.array([y, vx, 0.0]), 0.0))
+
+
+# What `find_limit_cycle` says of the models that have no cycle that it could find by itself.
+SAYS_WHAT_TO_GIVE = {"BouncingBall": "pass `guess=Guess", "SLIPRunner": "conserved={'energy': 1"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=() if name in ("RimlessWheel", "BouncingBall") else pytest.mark.slow
+        )
+        for name in m.__all__
+    ],
+)
+def test_a_model_alone_is_enough(name):
+    model = getattr(m, name)()
+    if name in SAYS_WHAT_TO_GIVE:
+        with pytest.raises(hj.HybridJaxError) as error:
+            hj.find_limit_cycle(model)
+        assert SAYS_WHAT_TO_GIVE[name] in str(error.value)
+    else:
+        assert hj.find_limit_cycle(model).stable
+
+
+def test_where_no_section_is_met_again_one_is_asked_for():
+    wheel = m.RimlessWheel()
+    after_impact = hj.Guess("swing", (float(wheel.slope - wheel.alpha), 0.45))
+    with pytest.raises(hj.ComputationError, match=r"section=AtEvent\('impact'\)"):
+        hj.find_limit_cycle(wheel, after_impact)
+    cycle = hj.find_limit_cycle(wheel, after_impact, section=hj.AtEvent("impact"))
+    np.testing.assert_allclose(cycle.multipliers, [wheel.exact()[1]], rtol=1e-9)

@@ -1,7 +1,14 @@
-"""In a notebook every figure is shown once, also the user's own."""
+"""What a notebook shows, in a real kernel: every figure once, also the user's own, with enough
+points; and nothing in the end of what long calls say."""
+
+import base64
+import struct
 
 import nbclient
 import nbformat
+import pytest
+
+import hybridjax as hj
 
 
 CELLS = [
@@ -9,16 +16,36 @@ CELLS = [
     "hj.plot.multipliers([0.5, 0.2j])",
     "plot = hj.plot.multipliers([0.5, 0.2j])",
     "from matplotlib import pyplot\nlines = pyplot.plot([1, 2])",
+    "import time\nfrom hybridjax._core import progress\nprogress._DELAY = 0.0",
+    "with progress.working('long call'):\n    time.sleep(0.3)\nprint('result')",
 ]
 
 
-def test_every_figure_is_shown_once(monkeypatch):
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel sets its own
+@pytest.fixture(scope="module")
+def outputs():
+    """Of each cell."""
     notebook = nbformat.v4.new_notebook()
     notebook.cells = [nbformat.v4.new_code_cell(cell) for cell in CELLS]
-    nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
-    images = [
-        sum("image/png" in output.get("data", {}) for output in cell.outputs)
-        for cell in notebook.cells
-    ]
-    assert images == [0, 1, 1, 1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MPLBACKEND", raising=False)  # the kernel sets its own
+        nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+    return [cell.outputs for cell in notebook.cells]
+
+
+def images(cell):
+    return [x.data["image/png"] for x in cell if "image/png" in x.get("data", {})]
+
+
+def test_every_figure_is_shown_once(outputs):
+    assert [len(images(cell)) for cell in outputs[:4]] == [0, 1, 1, 1]
+
+
+def test_a_column_has_150_points_per_inch(outputs):
+    head = base64.b64decode(images(outputs[1])[0])[16:20]  # of a PNG: where its width is
+    assert struct.unpack(">I", head)[0] > 0.9 * 150 * hj.plot.COLUMN
+
+
+def test_what_a_long_call_says_is_gone_when_it_ends(outputs):
+    line, text = outputs[5]
+    assert line.output_type == "display_data" and line.data == {}
+    assert (text.name, text.text) == ("stdout", "result\n")

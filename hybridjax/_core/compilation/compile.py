@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 
 from ..device import on_cpu
+from ..progress import say_compiling
 from ..tracing import is_inside_program, is_traced
 from .garbage_collector import uncollected
 
@@ -23,18 +24,26 @@ def quick_jit(function: Callable) -> Callable:
     seconds. Inside of another jit, or under any other transformation of JAX, this is
     `filter_jit`: there the outer program decides.
     """
-    plain = eqx.filter_jit(function)
+
+    @ft.wraps(function)
+    def traced(*arguments):
+        say_compiling(True)
+        return function(*arguments)
+
+    plain = eqx.filter_jit(traced)
 
     @ft.cache
     def quick():
-        return eqx.filter_jit(function, compiler_options=_options())
+        return eqx.filter_jit(traced, compiler_options=_options())
 
     def run(*arguments):
         # JAX allows options of the compiler at the top level only, and refuses them elsewhere after
         # it has traced the function.
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return plain(*arguments)
-        return quick()(*arguments)
+        result = quick()(*arguments)
+        say_compiling(False)
+        return result
 
     @ft.wraps(function)
     def call(*arguments):

@@ -7,6 +7,8 @@ from jaxtyping import Complex, Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import PeriodCount, Scalar, Vector
 from ..._core.results import Result
+from ..._core.signal import unit_of
+from ..._core.text import number
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ..multipliers.denominator import chi
@@ -94,7 +96,10 @@ class SeriesFit(MultiplierEstimate):
 
     def __repr__(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        noise = ", ".join(f"{n} {x:.2e}" for n, x in zip(self.outputs, self.noise, strict=True))
+        noise = ", ".join(
+            f"{name} {number(x, 3, unit_of(name))}"
+            for name, x in zip(self.outputs, self.noise, strict=True)
+        )
         return (
             f"SeriesFit(multipliers {self.show_multipliers()}; noise {noise}; "
             f"{self.n_sections} sections, {self.numerators.shape[1]} lags{state})"

@@ -10,6 +10,8 @@ from scipy import stats
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Probability
+from ..._core.signal import unit_of, with_unit
+from ..._core.text import p_value
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.record import Record, RecordedData, uninterrupted_records
@@ -77,17 +79,17 @@ class Validation(eqx.Module):
         return bool(np.min(self.independence) >= self.level / len(self.outputs))
 
     def __repr__(self) -> str:
-        rows = [f"{'output':>12}  {'fit':>9}  {'rms left':>9}  {'p white':>8}  {'p input':>8}"]
+        head = f"{'output':>12}  {'fit':>9}  {'rms left':>9}"
+        rows = [f"{head}  {'white':>11}  {'independent':>11}"]
         for i, name in enumerate(self.outputs):
+            tests = p_value(self.whiteness[i]), p_value(self.independence[i])
             rows.append(
-                f"{name:>12}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  "
-                f"{self.whiteness[i]:8.2g}  {self.independence[i]:8.2g}"
+                f"{with_unit(name, unit_of(name)):>12}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}"
+                f"  {tests[0]:>11}  {tests[1]:>11}"
             )
-        verdict = {True: "no sign of it", False: "yes"}
-        rows.append(
-            f"correlated in time: {verdict[self.white]}; with the input: "
-            f"{verdict[self.independent]} (level {self.level:g})"
-        )
+        time = "no sign of correlation in time" if self.white else "correlated in time"
+        cause = "no sign of the input" if self.independent else "dependent on the input"
+        rows.append(f"what is left: {time}, {cause} (level {self.level:g})")
         if self.left_out:
             rows.append(f"records too short to be compared, left out: {self.left_out}")
         return "\n".join(rows)

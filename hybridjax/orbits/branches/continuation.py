@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from scipy.optimize import brentq
 
 from ..._core.precision import require_x64
+from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.tracing import is_traced
 from ...errors import DefinitionError
@@ -40,6 +41,7 @@ _FIRST = 0.2
 _SHORTEST = 1e-5
 
 
+@working("continuation")
 def continuation(
     cycle: LimitCycle,
     parameter: str,
@@ -160,6 +162,7 @@ class _Trace:
             return points, marks, BranchEnd(start.value, Result.OK, "the values end")
         while len(points) < self.max_points:
             here = points[-1]
+            say(f"{self.curve.parameter} = {here.value:.5g}, {len(points)} cycles")
             there = self.curve.step(here, length)
             over = not isinstance(there, Failure) and not low <= there.value <= high
             if over:

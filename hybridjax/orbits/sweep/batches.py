@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from ..._core.compilation.compile import quick_jit
 from ..._core.compilation.garbage_collector import uncollected
+from ..._core.progress import working
 from ..._core.results import Result
 from ..._core.threads import in_threads
 from ...engine.lanes import Lanes
@@ -90,25 +90,23 @@ class Tiles(NamedTuple):
             return flat[:, :1]
         return flat[:, spread > 0] / spread[spread > 0]
 
-    def solve(self, S: int, progress: bool) -> Rounds:
+    def solve(self, S: int) -> Rounds:
         """Newton for all systems: first for some, spread over all, from the one guess there is,
         then for as many again from where their neighbors' cycles are, and so on."""
         parameters = self.parameters
         order = np.random.default_rng(0).permutation(S)
-        bar = tqdm(total=S, disable=not progress, desc="cycles")
         rows = order[: self.size]
-        with uncollected:  # here the programs are compiled
-            out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
-        bar.update(len(rows))
-        while (done := len(out.result)) < S:
-            rows = order[done : 2 * done]
-            rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
-            order[done : 2 * done] = rows
-            guesses = self._by_neighbors(parameters[order[:done]], out, parameters[rows])
-            part = self._newton(rows, *self._first_step(rows, *guesses), _USUAL)
-            out = _join(out, part._replace(steps=part.steps + 1))
-            bar.update(len(rows))
-        bar.close()
+        with working("cycles", S) as call:
+            with uncollected:  # here the programs are compiled
+                out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
+            while (done := len(out.result)) < S:
+                call.done = done
+                rows = order[done : 2 * done]
+                rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
+                order[done : 2 * done] = rows
+                guesses = self._by_neighbors(parameters[order[:done]], out, parameters[rows])
+                part = self._newton(rows, *self._first_step(rows, *guesses), _USUAL)
+                out = _join(out, part._replace(steps=part.steps + 1))
         late = np.flatnonzero(out.excess > 1)
         if len(late):
             anchor, period = _pick((out.anchor, out.period), late)

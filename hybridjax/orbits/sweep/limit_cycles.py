@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ..._core.execution import Execution
 from ..._core.memo import remembered
 from ..._core.precision import require_x64
+from ..._core.progress import working
 from ..._core.results import Result
 from ...engine.lanes import Lanes
 from ...engine.settings import SWEEP, Settings
@@ -114,6 +115,7 @@ class LimitCycles(eqx.Module):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
 
 
+@working("find_limit_cycles")
 def find_limit_cycles(
     systems: HybridSystem | Sequence[HybridSystem],
     guess: LimitCycle,
@@ -137,7 +139,7 @@ def find_limit_cycles(
     - `scale`: sizes of states by name, by default those of the guess.
     - `settings`: accuracy of the flow; by default 1e-9 per step.
     - `execution`: how it is run: systems per compiled call (`batch`, by default 250), threads
-        (`workers`), a progress bar over the systems. Always in double precision.
+        (`workers`). Always in double precision.
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
@@ -164,7 +166,7 @@ def find_limit_cycles(
     map = dataclasses.replace(guess.return_map, settings=settings)
     programs = QUICK if S <= _SMALL else FULL
     tiles = Tiles(systems, map, min(execution.batch or _BATCH, S), execution.threads, programs)
-    found = tiles.solve(S, execution.progress)
+    found = tiles.solve(S)
     turn = found.turn
     return LimitCycles(
         systems, guess.base, found.period, found.anchor, turn.legs, turn.factors,

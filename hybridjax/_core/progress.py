@@ -1,0 +1,158 @@
+"""What long calls say of themselves while they run: one line, which appears after a second and
+vanishes at the end.
+
+It is shown in terminals and in Jupyter. Where nobody watches (logs, pipes, tests) there is none,
+and to say something costs next to nothing.
+"""
+
+import contextlib
+import contextvars
+import dataclasses
+import io
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+
+Item = TypeVar("Item")
+
+# Seconds until the line appears, and from one look at what to show to the next.
+_DELAY, _PERIOD = 1.0, 0.25
+_LINE = "{desc}, {elapsed}"
+_COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"
+
+
+@dataclasses.dataclass(eq=False)
+class Call:
+    """A call that is running, or a part of one."""
+
+    name: str
+    total: int | None = None
+    done: int = 0
+    step: str = ""
+    compiling: bool = False
+
+    def __str__(self) -> str:
+        """What it does at the moment."""
+        step = self.step if self.total is None else f"{self.done} of {self.total} {self.name}"
+        return " ".join(filter(None, (step, "(compiling)" if self.compiling else "")))
+
+
+# The calls that are running, each inside of the one before.
+_running: list[Call] = []
+_enabled: bool | None = None
+
+
+def enable_progress(enabled: bool = True) -> None:
+    """Let long calls say what they are doing, wherever standard error goes; with `False`, nowhere.
+
+    Unless this is called, they do so in terminals and in Jupyter.
+    """
+    global _enabled
+    _enabled = enabled
+
+
+@contextlib.contextmanager
+def working(name: str, total: int | None = None) -> Iterator[Call]:
+    """While this is open a call is running, or a part of one where another is open.
+
+    **Arguments:** `name` of the function; or of the things of which there are `total`, whose number
+    `done` is for the caller to raise.
+    """
+    call, outermost = Call(name, total), not _running
+    _running.append(call)
+    try:
+        with _line() if outermost and _is_watched() else contextlib.nullcontext():
+            yield call
+    finally:
+        _running.remove(call)
+
+
+def counted(items: Iterable[Item], name: str, total: int | None) -> Iterator[Item]:
+    """Items one after the other, of which so many are done."""
+    with working(name, total) as call:
+        for item in items:
+            yield item
+            call.done += 1
+
+
+def say(step: str) -> None:
+    """What the innermost call does now."""
+    if _running:
+        _running[-1].step = step
+
+
+def say_compiling(compiling: bool) -> None:
+    """Whether the innermost call waits for a program."""
+    if _running:
+        _running[-1].compiling = compiling
+
+
+def _is_watched() -> bool:
+    if _enabled is not None:
+        return _enabled
+    return _display() is not None or sys.stderr.isatty()
+
+
+def _display() -> Callable[..., Any] | None:
+    """What shows something in a cell of a notebook; `None` outside of Jupyter."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return None if ipython is None or not hasattr(shell, "kernel") else ipython.display.display
+
+
+@contextlib.contextmanager
+def _line() -> Iterator[None]:
+    """The line, kept by a thread of its own: compiled programs let it run."""
+    ended = threading.Event()
+    # (In its context a kernel finds the cell to which output belongs.)
+    thread = threading.Thread(
+        target=contextvars.copy_context().run, args=(_keep, ended), daemon=True
+    )
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _keep(ended: threading.Event) -> None:
+    if ended.wait(_DELAY):
+        return
+    display = _display()
+    file = sys.stderr if display is None else _Cell(display)
+    about = {"desc": "", "bar_format": "{desc}", "leave": False, "dynamic_ncols": True}
+    with tqdm(file=file, **about) as bar:
+        bar.start_t -= _DELAY
+        while True:
+            running = list(_running)
+            counted = next((call for call in running if call.total), None)
+            bar.n, bar.total = (counted.done, counted.total) if counted else (0, None)
+            bar.bar_format = _COUNTED if counted else _LINE
+            name, *steps = [running[0].name, *filter(None, map(str, running))]
+            bar.set_description_str(f"{name}: {', '.join(steps)}" if steps else name)
+            if ended.wait(_PERIOD):
+                return
+
+
+class _Cell(io.StringIO):
+    """A line of a cell's output that is written over; what it leaves in the end is empty, and
+    nothing is drawn for it."""
+
+    def __init__(self, display: Callable[..., Any]):
+        super().__init__()
+        self._display, self._handle, self._shown = display, None, ""
+
+    def write(self, text: str) -> int:
+        shown = text.strip()
+        data = {"text/plain": shown} if shown else {}
+        if self._handle is not None and shown != self._shown:
+            self._handle.update(data, raw=True)
+        elif self._handle is None and shown:
+            self._handle = self._display(data, raw=True, display_id=True)
+        self._shown = shown
+        return len(text)

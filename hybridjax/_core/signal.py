@@ -1,0 +1,64 @@
+"""Names of signals that know their units, from where these are declared to the axes of figures."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+
+class Signal(str):
+    """The name of a state, input or output, with its unit ("" where nobody said it).
+
+    It is a string like any other, so that whatever hands names on hands units on. Equal names with
+    different units are not equal, lest meters be taken for millimeters; a name without a unit
+    equals all of that name.
+    """
+
+    __slots__ = ("unit",)
+    unit: str
+
+    def __new__(cls, name: str, unit: str = "") -> "Signal":
+        self = super().__new__(cls, name)
+        self.unit = unit
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, str):
+            return NotImplemented
+        return str.__eq__(self, other) and len({self.unit, unit_of(other)} - {""}) < 2
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    __hash__ = str.__hash__
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()} ({self.unit})" if self.unit else super().__repr__()
+
+    def __getnewargs__(self) -> tuple[str, str]:
+        return str(self), self.unit
+
+
+Names = str | Sequence[str] | Mapping[str, str]
+"""One name or several; or units by name, as in `{"yM": "m", "force": "N"}`."""
+
+
+def signals(names: Iterable[str], units: Iterable[str]) -> tuple[Signal, ...]:
+    """Names with the units that stand beside them, in the same order: none, or one for each."""
+    names, units = tuple(names), tuple(units)
+    return tuple(map(Signal, names, units or ("",) * len(names)))
+
+
+def unit_of(name: str) -> str:
+    """The unit of a signal, "" where it is not known."""
+    return getattr(name, "unit", "")
+
+
+def ratio(output: str, input: str) -> str:
+    """The unit of an output per input, as in m/N; "" unless both are known."""
+    units = unit_of(output), unit_of(input)
+    if not all(units):
+        return ""
+    return "/".join(f"({unit})" if set(unit) & set(" */") else unit for unit in units)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A text for the axis of a figure, with a unit in brackets."""
+    return f"{text} ({unit})" if unit else text

@@ -1,0 +1,84 @@
+"""What objects print: numbers with units, arrays by shape and range, modules by their fields."""
+
+import dataclasses
+import textwrap
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .signal import unit_of, with_unit
+from .tracing import is_traced
+
+
+# A module stands on one line if it is no wider than that, else each field on a line of its own.
+_WIDTH = 88
+# So many numbers of an array are printed; of more, only shape and range.
+_FEW = 4
+
+
+def p_value(p: float) -> str:
+    """`p = 0.012`; below 0.001 a test says no more than that."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names with their units."""
+    return ", ".join(with_unit(name, unit_of(name)) for name in names) or "none"
+
+
+def columns(rows: Iterable[tuple[str, ...]]) -> str:
+    """Lines with aligned columns, indented."""
+    rows = list(rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.ljust, row, widths)) for row in rows)
+    return "".join(f"\n  {line.rstrip()}" for line in lines)
+
+
+def value(x: Any) -> str:
+    """A number, array, module or whatever else a field holds, on one line: of a module that needs
+    more (a network, a system) how many numbers it holds."""
+    if isinstance(x, jax.core.Tracer):
+        return f"traced {x.dtype}{list(x.shape)}"
+    if isinstance(x, jax.Array | np.ndarray | np.generic):
+        return _array(np.asarray(x))
+    if isinstance(x, float):
+        return f"{x:.6g}"
+    if isinstance(x, tuple | list):
+        inside = ", ".join(map(value, x))
+        return f"({inside},)" if len(x) == 1 else f"({inside})"
+    text = getattr(x, "__name__", None) or repr(x)
+    if isinstance(x, eqx.Module) and ("\n" in text or type(x).__repr__ is eqx.Module.__repr__):
+        leaves = jax.tree_util.tree_leaves(eqx.filter(x, eqx.is_array))
+        return f"{type(x).__name__}({sum(leaf.size for leaf in leaves)} numbers)"
+    return text
+
+
+def number(x: Any, digits: int = 6, unit: str = "") -> str:
+    """One number with its unit; what JAX traces by its kind."""
+    return f"{value(x) if is_traced(x) else f'{float(x):.{digits}g}'} {unit}".rstrip()
+
+
+def fields(module: Any) -> str:
+    """A module by its fields, without those that are None."""
+    named = ((field.name, getattr(module, field.name)) for field in dataclasses.fields(module))
+    shown = [f"{name}={value(x)}" for name, x in named if x is not None]
+    kind, line = type(module).__name__, ", ".join(shown)
+    if len(kind) + len(line) + 2 <= _WIDTH:
+        return f"{kind}({line})"
+    inside = textwrap.indent(",\n".join(shown), "  ")
+    return f"{kind}(\n{inside},\n)"
+
+
+def _array(x: np.ndarray) -> str:
+    if x.ndim == 0:
+        return f"{x.item():.6g}" if x.dtype.kind in "fc" else str(x.item())
+    if x.ndim == 1 and x.size <= _FEW:
+        return value(tuple(x))
+    shape = " x ".join(map(str, x.shape)) + (" numbers" if x.ndim == 1 else "")
+    if x.dtype.kind not in "iuf" or not np.isfinite(x).any():
+        return f"{shape} ({x.dtype})"
+    low, high = np.nanmin(x), np.nanmax(x)
+    return f"{shape}, all {low:.6g}" if low == high else f"{shape}, {low:.6g} to {high:.6g}"

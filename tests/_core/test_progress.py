@@ -1,0 +1,86 @@
+"""What long calls say while they run, in a terminal; in Jupyter see tests/plot/test_jupyter.py."""
+
+import time
+
+import jax.numpy as jnp
+import pytest
+
+import hybridjax as hj
+from hybridjax._core import progress
+
+
+def lines(text):
+    return [line.strip() for line in text.split("\r") if line.strip()]
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    monkeypatch.setattr(progress, "_DELAY", 0.0)
+    monkeypatch.setattr(progress, "_PERIOD", 0.01)
+    monkeypatch.setattr(progress, "_enabled", True)
+
+
+def wait_for(capsys, text):
+    """All that was written until `text` was."""
+    seen = ""
+    for _ in range(1000):
+        seen += capsys.readouterr().err
+        if text in seen:
+            return seen
+        time.sleep(0.01)
+    raise AssertionError(f"'{text}' is not in {seen!r}")
+
+
+def test_nothing_is_said_where_nobody_watches(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "_DELAY", 0.0)
+    with progress.working("call"):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_outermost_call_has_the_line_and_parts_say_what_they_do(capsys, shown):
+    with progress.working("outer"):
+        wait_for(capsys, "outer, 00:00")
+        progress.say("first step")
+        wait_for(capsys, "outer: first step, 00:00")
+        for k in progress.counted(range(3), "parts", 3):
+            wait_for(capsys, f"{k} of 3 parts")
+            with progress.working("inner"):
+                progress.say("something else")
+                wait_for(capsys, "something else")
+    assert "inner" not in capsys.readouterr().err
+
+
+def test_the_line_is_wiped_when_a_call_ends_or_fails(capsys, shown):
+    with pytest.raises(ZeroDivisionError), progress.working("call"):
+        wait_for(capsys, "call")
+        _ = 1 / 0
+    *_, last, end = capsys.readouterr().err.split("\r")
+    assert last.strip() == "" and len(last) >= len("call, 00:00") and end == ""
+    assert progress._running == []
+
+
+def test_a_short_call_says_nothing(capsys, monkeypatch, shown):
+    monkeypatch.setattr(progress, "_DELAY", 60.0)
+    with progress.working("call"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_users_say_where_it_is_shown(capsys, monkeypatch, shown):
+    hj.enable_progress(False)
+    with progress.working("call"):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
+def test_programs_are_said_to_be_compiled_while_they_are():
+    from hybridjax._core.compilation.compile import quick_jit
+
+    seen = []
+    with progress.working("call") as call:
+        twice = quick_jit(lambda x: seen.append(str(call)) or 2 * x)
+        twice(jnp.ones(2))
+        assert seen == ["(compiling)"] and str(call) == ""
+        twice(jnp.zeros(2))
+        assert len(seen) == 1
