@@ -1,11 +1,14 @@
 """State-space models from measured responses: minimal, with dimensions that vary."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers, names
+from ..._core.boundary.arrays import Integers, Reals
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Order, SignalNames
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
@@ -27,14 +30,15 @@ _SHORTEST_HORIZON = 8
 _SMALLEST_ERROR = 1e-15
 
 
+@checked
 def realize(
-    source: HTF | SeriesFit | Numbers,
-    dims: int | Sequence[int] | Int[np.ndarray, " N"] | None = None,
+    source: HTF | SeriesFit | Annotated[Numbers, Reals("N lags ny nu")],
+    dims: Order | Annotated[Numbers, Integers("N", sign="positive")] | None = None,
     *,
-    order: int = 1,
-    horizon: int | None = None,
-    outputs: str | Sequence[str] | None = None,
-    inputs: str | Sequence[str] | None = None,
+    order: Order = 1,
+    horizon: Count | None = None,
+    outputs: SignalNames | None = None,
+    inputs: SignalNames | None = None,
 ) -> LDTP:
     r"""A minimal periodic state-space model with the responses given.
 
@@ -64,7 +68,7 @@ def realize(
       where the source is that long. Long ones average more noise.
     - `outputs`, `inputs`: names, for an array.
 
-    **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, NaN, or more
+    **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, or more
     dimensions than the horizon can show.
     """
     require_x64()
@@ -79,8 +83,6 @@ def realize(
         spread = np.sqrt((source.roots**2).sum(axis=4).mean(axis=(0, 2, 3))) * source.noise
     else:
         markov = np.asarray(source)
-        if not np.isfinite(markov).all():
-            raise DefinitionError("the Markov parameters hold NaN or infinity.")
         N, lags = markov.shape[:2]
         p = _horizon(horizon, N) if horizon is not None else min(_horizon(None, N), (lags - 1) // 2)
         if p < 1 or lags < 2 * p + 1:
