@@ -13,9 +13,6 @@ import reprlib
 import textwrap
 import types
 import typing
-from collections.abc import Mapping
-import uuid
-import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,8 +25,8 @@ from .. import __version__
 from ..errors import DefinitionError, FileFormatError, HybridJaxError
 from . import limits
 from .npz import damaged, read_arrays
-from .writing import replacing
 from .signal import Signal
+from .writing import replacing
 
 
 _FORMAT, _VERSION = "hybridjax", 2

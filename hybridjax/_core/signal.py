@@ -1,6 +1,6 @@
 """Names of signals that know their units, from where these are declared to the axes of figures."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
 
 class Signal(str):
@@ -34,10 +34,6 @@ class Signal(str):
 
     def __getnewargs__(self) -> tuple[str, str]:
         return str(self), self.unit
-
-
-Names = str | Sequence[str] | Mapping[str, str]
-"""One name or several; or units by name, as in `{"yM": "m", "force": "N"}`."""
 
 
 def signals(names: Iterable[str], units: Iterable[str]) -> tuple[Signal, ...]:

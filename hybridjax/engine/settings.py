@@ -1,16 +1,15 @@
 """Accuracy and effort of the flow, and every accuracy that the package takes by default."""
 
 import functools as ft
-from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
-from .._core.precision import at_precision, real
+from .._core.boundary.converters import positive, sizes
+from .._core.boundary.kinds import StepCount
+from .._core.precision import at_precision
 from .._core.text import fields
 from ..errors import DefinitionError
 from .solver.step import Step
@@ -46,14 +45,6 @@ ROUNDING = 4e-15, 2e-6
 _TIMES_ROUNDING = 10.0
 
 
-def _number(x: PositiveScalar) -> Array:
-    return real(x)
-
-
-def _numbers(x: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None) -> Array | None:
-    return None if x is None else real(x)
-
-
 @checked
 class Settings(eqx.Module):
     """Accuracy and effort of the flow.
@@ -62,13 +53,13 @@ class Settings(eqx.Module):
     `rtol * |q[k]| + atol * scale[a, k]`.
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    rtol: Float[Array, ""] = eqx.field(converter=positive, default=SIMULATION)
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    atol: Float[Array, ""] = eqx.field(converter=positive, default=SIMULATION)
     """Error of a step relative to each state's `scale`."""
     max_steps: StepCount = eqx.field(static=True, default=256)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
-    scale: Float[Array, "A d"] | None = eqx.field(converter=_numbers, default=None)
+    scale: Float[Array, "A d"] | None = eqx.field(converter=sizes, default=None)
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""

@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import json
 import operator
-import os
 import reprlib
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -21,13 +20,15 @@ import numpy as np
 
 from .._core import limits
 from .._core.archive import read_module, write_module
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import ExperimentCount, Index, Path as PathLike
 from .._core.npz import damaged
-from .._core.writing import made_folder, replacing
 from .._core.progress import counted, working
+from .._core.writing import made_folder, replacing
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
+from ..systems.output import OutputNames
 from .campaign import Campaign, chunks, prepare
 from .data import ExperimentData, summary
 from .design.design import Design
@@ -49,16 +50,17 @@ _SAME_CYCLE = 1e-7
 _SAME_SIZES = 4.0
 
 
+@checked
 @working("store_experiments")
 def store_experiments(
-    folder: str | os.PathLike,
+    folder: PathLike,
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: OutputNames,
     *,
-    chunk: int = CHUNK,
-    share: tuple[int, int] = (0, 1),
+    chunk: ExperimentCount = CHUNK,
+    share: tuple[Index, ExperimentCount] = (0, 1),
     **options: Unpack[OptionsByName],
 ) -> "StoredExperiments":
     """Run experiments and write them to a folder, in memory that does not depend on their number.
@@ -80,7 +82,7 @@ def store_experiments(
     for an argument that does not exist; and as `run_experiments`.
     """
     rank, size = share
-    if not 0 <= rank < size:
+    if rank >= size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
     chosen, folder = options_of(store_experiments, options), Path(folder)
     with made_folder(folder):
@@ -100,6 +102,7 @@ def store_experiments(
     return stored
 
 
+@checked
 class StoredExperiments:
     """Experiments in a folder that `store_experiments` fills.
 
@@ -107,7 +110,7 @@ class StoredExperiments:
     `estimate_htf(StoredExperiments(folder))` needs memory for one chunk only.
     """
 
-    def __init__(self, folder: str | os.PathLike):
+    def __init__(self, folder: PathLike):
         """**Arguments:** `folder`.
 
         **Raises:** `DefinitionError` if `folder` holds no experiments, or chunks of others;
@@ -136,7 +139,7 @@ class StoredExperiments:
         """The number of chunks, whether they are there or not."""
         return -(-self.experiments // self.chunk)
 
-    def path(self, k: int) -> Path:
+    def path(self, k: Index) -> Path:
         """The file of chunk k, which holds the experiments from `k * chunk` on."""
         return self.folder / f"{k:06d}-{self._id}.npz"
 
@@ -162,7 +165,7 @@ class StoredExperiments:
             path = self.path(k)
             yield read_module(path, {"ExperimentData": ExperimentData}, path.stem)
 
-    def summary(self, limit: int = 5) -> str:
+    def summary(self, limit: Index = 5) -> str:
         """As `ExperimentData.summary`, of all experiments."""
         result, failed_at = zip(*((part.result, part.failed_at) for part in self), strict=True)
         return summary(np.concatenate(result), np.concatenate(failed_at), self.n_sections, limit)

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.precision import real
+from .._core.boundary.checked import checked
+from .._core.boundary.converters import number
 from .._core.text import fields
-from ..errors import DefinitionError
 from ..systems.output import Output
 from ..systems.structure import Structure
 
@@ -17,6 +17,7 @@ from ..systems.structure import Structure
 Direction = Literal["falling", "rising"]
 
 
+@checked
 class Crossing(eqx.Module):
     """A section: the level set `function = value`, crossed in a stated direction.
 
@@ -33,14 +34,8 @@ class Crossing(eqx.Module):
 
     function: str | Output | Callable[..., Any]
     direction: Direction = eqx.field(static=True)
-    value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    value: Float[Array, ""] = eqx.field(converter=number, default=0.0)
     charts: tuple[str, ...] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        if self.direction not in ("falling", "rising"):
-            raise DefinitionError(
-                f"a Crossing has direction {self.direction!r}; say 'falling' or 'rising'."
-            )
 
     def __str__(self):
         name = self.function
@@ -78,6 +73,7 @@ class Crossing(eqx.Module):
         return sign * (value - self.value)
 
 
+@checked
 class AtEvent(eqx.Module):
     """A hybrid boundary as a section: the state right after the event `name` and its reset.
 

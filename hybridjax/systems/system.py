@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._core.precision import real
+from .._core.boundary.checked import check_fields, checked
+from .._core.boundary.converters import number, vector
 from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
@@ -19,6 +20,7 @@ Parameter = Float[Array, ""] | float
 """The type of a parameter: an array, made from any number by `parameter`."""
 
 
+@checked
 def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
@@ -30,7 +32,7 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
-    return eqx.field(converter=real, metadata=metadata, **options)
+    return eqx.field(converter=number, metadata=metadata, **options)
 
 
 def unit_of_parameter(system: Any, path: str) -> str:
@@ -41,12 +43,13 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+@checked
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=real)
-    time: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    state: Float[Array, " n"] = eqx.field(converter=vector)
+    time: Float[Array, ""] = eqx.field(converter=number, default=0.0)
 
     def __repr__(self):
         return fields(self)
@@ -79,6 +82,10 @@ class HybridSystem(eqx.Module):
     inputs: ClassVar[tuple[str, ...]] = ("u",)
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
+
+    def __new__(cls, *args, **kwargs):
+        check_fields(cls, args, kwargs)
+        return super().__new__(cls)
 
     @abc.abstractmethod
     def charts(self) -> dict[str, Chart]:

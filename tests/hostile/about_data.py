@@ -61,9 +61,12 @@ def estimates(t):
     yield "estimate_htf", hj.estimate_htf, dict(data=t.data, harmonics=0), {
         "data": alone, "harmonics": HARMONICS, "variance": WORD, "half_integers": WORD,
     } | shared  # fmt: skip
-    yield "estimate_coherence", hj.identify.estimate_coherence, dict(
-        data=t.data, harmonics=0, repeats=2
-    ), {"data": alone, "harmonics": HARMONICS} | shared
+    yield (
+        "estimate_coherence",
+        hj.identify.estimate_coherence,
+        dict(data=t.data, harmonics=0, repeats=2),
+        {"data": alone, "harmonics": HARMONICS} | shared,
+    )
     yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.data), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
@@ -185,9 +188,12 @@ def fitting(t):
         "std": ["x", -1.0, 0.0, NAN, 1j, [1.0] * 5], "times_std": ["x", -1.0, 0.0, NAN, 1j],
         "period_std": ["x", -1.0, 0.0, NAN, 1j],
     }  # fmt: skip
-    yield "ObservedCycle.of", hj.ObservedCycle.of, dict(
-        cycle=t.cycle, sections=PHASE, outputs=STATES
-    ), {"cycle": instance(t.system), "sections": sections, "outputs": NAMES[1:2] + NAMES[3:]}
+    yield (
+        "ObservedCycle.of",
+        hj.ObservedCycle.of,
+        dict(cycle=t.cycle, sections=PHASE, outputs=STATES),
+        {"cycle": instance(t.system), "sections": sections, "outputs": NAMES[1:2] + NAMES[3:]},
+    )
     for name in ("ObservedCycle", "ObservedHTF"):
         made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
         for method in ("residuals", "prepare"):
@@ -234,8 +240,11 @@ def recordings(t):
         "timing": optional(WORD), "drift": optional(POSITIVE),
     }  # fmt: skip
     yield "section_data", hj.recordings.section_data, take, taken | {"max_gap": optional(POSITIVE)}
-    yield "identify_recording", hj.identify_recording, take | dict(order=1), (
-        taken | {"order": optional(FEW)}
+    yield (
+        "identify_recording",
+        hj.identify_recording,
+        take | dict(order=1),
+        (taken | {"order": optional(FEW)}),
     )
     yield "SectionData.experiments", t.section_data.experiments, dict(periods=4), {
         "periods": LIMITED,
@@ -280,9 +289,12 @@ def recordings(t):
     yield "read_design", hj.recordings.read_design, dict(path="nope.csv"), {
         "path": [*PATH, "nope.csv"],
     }  # fmt: skip
-    yield "read_recording", lambda paths, **k: hj.read_recording(paths, **k), dict(
-        paths="nope.csv"
-    ), {"paths": [*PATH, "nope.csv", "nope.docx"], "time": NEW_NAME, "units": UNITS}
+    yield (
+        "read_recording",
+        lambda paths, **k: hj.read_recording(paths, **k),
+        dict(paths="nope.csv"),
+        {"paths": [*PATH, "nope.csv", "nope.docx"], "time": NEW_NAME, "units": UNITS},
+    )
     pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
     tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
     yield "PhaseTracker", hj.recordings.PhaseTracker, tracker, {
@@ -302,9 +314,12 @@ def testing(t):
         "irregular": FLAG, "lost_events": WHOLE, "doubled_events": WHOLE, "stretch": FINITE,
         "seed": SEED,
     }  # fmt: skip
-    yield "spoil", hj.testing.spoil, dict(
-        recording=t.recording, signals=("x",), dirt=hj.testing.Dirt()
-    ), {"recording": instance(t.record), "signals": SIGNAL, "dirt": instance(PHASE)}
+    yield (
+        "spoil",
+        hj.testing.spoil,
+        dict(recording=t.recording, signals=("x",), dirt=hj.testing.Dirt()),
+        {"recording": instance(t.record), "signals": SIGNAL, "dirt": instance(PHASE)},
+    )
     yield "random_force", hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5), {
         "duration": [*POSITIVE, 1e12], "rate": [*POSITIVE, 1e12], "bandwidth": [*POSITIVE, 40],
         "rms": NONNEGATIVE, "inputs": LIMITED, "seed": SEED,

@@ -280,18 +280,27 @@ def experiments(t):
         "accuracy": optional(POSITIVE), "record_events": FLAG, "execution": EXECUTION,
     }  # fmt: skip
     yield "run_experiments", hj.run_experiments, to_run, drive | options
-    yield "stream_experiments", hj.experiments.stream_experiments, to_run, (
-        drive | options | {"chunk": LIMITED}
+    yield (
+        "stream_experiments",
+        hj.experiments.stream_experiments,
+        to_run,
+        (drive | options | {"chunk": LIMITED}),
     )
-    yield "store_experiments", hj.experiments.store_experiments, to_run | dict(folder="store"), (
-        drive | options | {"chunk": LIMITED, "folder": PATH, "share": SHARES}
+    yield (
+        "store_experiments",
+        hj.experiments.store_experiments,
+        to_run | dict(folder="store"),
+        (drive | options | {"chunk": LIMITED, "folder": PATH, "share": SHARES}),
     )
     yield "StoredExperiments", hj.experiments.StoredExperiments, dict(folder="nope"), {
         "folder": [*PATH, "nope"],
     }  # fmt: skip
-    yield "response_function", hj.response_function, {
-        name: to_run[name] for name in ("cycle", "sections", "outputs")
-    }, {name: drive[name] for name in ("cycle", "sections", "outputs")} | {"accuracy": POSITIVE}
+    yield (
+        "response_function",
+        hj.response_function,
+        {name: to_run[name] for name in ("cycle", "sections", "outputs")},
+        {name: drive[name] for name in ("cycle", "sections", "outputs")} | {"accuracy": POSITIVE},
+    )
     u = np.zeros((1, 8, 1))
     yield "ResponseFunction", t.response, dict(u=u), {
         "u": array(u), "start": ["x", np.zeros(9), Other()], "system": ["x", 3, PHASE],

@@ -52,9 +52,12 @@ def calls(t):
         "cycle": instance(t.system), "x": named, "y": named, "sections": ["x", 3, PHASE],
         "perturbed": ["x", 3, PHASE], "numbers": optional(WHOLE),
     } | look  # fmt: skip
-    yield "plot.branch", lambda branches, **k: plot.branch(branches, **k), dict(
-        branches=t.branch
-    ), {"branches": instance(t.cycle), "output": named} | look
+    yield (
+        "plot.branch",
+        lambda branches, **k: plot.branch(branches, **k),
+        dict(branches=t.branch),
+        {"branches": instance(t.cycle), "output": named} | look,
+    )
     yield "plot.experiment", plot.experiment, dict(data=t.data), {
         "data": instance(t.record), "index": [*INTEGER, 10**6],
     } | look  # fmt: skip

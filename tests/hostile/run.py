@@ -12,8 +12,8 @@ import warnings
 
 import equinox as eqx
 import matplotlib
-from matplotlib import pyplot
 import numpy as np
+from matplotlib import pyplot
 
 import hybridjax as hj
 

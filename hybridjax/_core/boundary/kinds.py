@@ -5,7 +5,7 @@ Static type checkers see the plain type in each. What else is needed is written 
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from jax.typing import ArrayLike
@@ -33,6 +33,7 @@ Seed = Annotated[int, Whole(0)]
 Positive = Annotated[float, Number("a positive number", above=0)]
 NonNegative = Annotated[float, Number("a number that is not negative", low=0)]
 Probability = Annotated[float, Number("a number between 0 and 1", above=0, below=1)]
+Share = Annotated[float, Number("a number above 0, at most 1", above=0, high=1)]
 Fraction = Annotated[float, Number("a number from 0 to 1", low=0, high=1)]
 
 # The same, where one has an array of JAX at hand as often as a `float`.
@@ -48,4 +49,6 @@ Vector = Annotated[Numbers, Reals("n")]
 # Words.
 SignalNames = Annotated[str | Sequence[str], Names()]
 """One name, or several distinct ones; handed on as a tuple."""
+NewNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True)]
+"""Names that are given to something; or units by name, as in `{"yM": "m", "force": "N"}`."""
 Path = str | os.PathLike[str]
