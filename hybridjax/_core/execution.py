@@ -1,15 +1,17 @@
 """How a computation on many lanes is run."""
 
 import dataclasses
-from typing import Literal, get_args
+from typing import Literal
 
-from ..errors import DefinitionError
+from .boundary.checked import checked
+from .boundary.kinds import ExperimentCount, WorkerCount
 from .threads import thread_count
 
 
 Precision = Literal["double", "single"]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Execution:
     """How many experiments, or many systems, are run. It changes no result beyond rounding.
@@ -24,24 +26,12 @@ class Execution:
       cycle, the sections and the plan remain in 64. What rounding costs is measured on the cycle
       and is part of `ExperimentData.error`.
     - `progress`: show a progress bar.
-
-    **Raises:** `DefinitionError` for numbers below one, or another precision.
     """
 
-    batch: int | None = None
-    workers: int | None = None
+    batch: ExperimentCount | None = None
+    workers: WorkerCount | None = None
     precision: Precision = "double"
     progress: bool = False
-
-    def __post_init__(self):
-        if self.batch is not None and self.batch < 1:
-            raise DefinitionError(
-                f"batch is the number of lanes of one compiled call, not {self.batch}."
-            )
-        if self.workers is not None and self.workers < 1:
-            raise DefinitionError(f"workers is the number of threads, not {self.workers}.")
-        if self.precision not in get_args(Precision):
-            raise DefinitionError(f"precision is 'double' or 'single', not {self.precision!r}.")
 
     @property
     def threads(self) -> int:

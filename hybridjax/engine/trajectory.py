@@ -1,16 +1,18 @@
 """Single trajectories with their events, dense enough to plot."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -45,6 +47,7 @@ class Event(NamedTuple):
     """State after the reset, by name."""
 
 
+@checked_methods
 class Trajectory(eqx.Module):
     """A hybrid trajectory: steps, events, and interpolation between steps.
 
@@ -76,7 +79,7 @@ class Trajectory(eqx.Module):
             found.append(Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after))
         return found
 
-    def dense(self, per_step: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def dense(self, per_step: Count = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (p,), charts (p,) and states (p, d), with `per_step` points in every step.
 
         Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
@@ -93,7 +96,7 @@ class Trajectory(eqx.Module):
         keep[1:, 0] = self.event[1:-1] >= 0  # a step's start repeats the last end, but for resets
         return t[keep], chart[keep], q[keep]
 
-    def __call__(self, *names: str, per_step: int = 8) -> tuple[np.ndarray, ...]:
+    def __call__(self, *names: str, per_step: Count = 8) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
 
         Values are NaN in charts where they are not defined.
@@ -102,16 +105,17 @@ class Trajectory(eqx.Module):
         return (t, *_evaluate(self.system, names, t, chart, q))
 
 
+@checked
 def simulate(
     system: HybridSystem,
     chart: str,
-    state: ArrayLike | Sequence[ArrayLike],
-    duration: ArrayLike,
+    state: Annotated[Numbers, Reals("n")],
+    duration: Duration,
     *,
-    time: ArrayLike = 0.0,
-    input: Callable[[Any], Any] | ArrayLike | Sequence[ArrayLike] | None = None,
+    time: Scalar = 0.0,
+    input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
     settings: Settings | None = None,
-    max_steps: int = 100_000,
+    max_steps: StepCount = 100_000,
     throw: bool = True,
 ) -> Trajectory:
     """Follow one trajectory through any number of events.
@@ -139,10 +143,6 @@ def simulate(
             f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
             f"shape ({s.dims[a]},); it has {start.state.shape}."
         )
-    if not np.all(np.isfinite(start.state)) or not np.isfinite(start.time):
-        raise DefinitionError(f"the start of a trajectory must be finite; got {start.state}.")
-    if not (np.isfinite(duration) and duration > 0):
-        raise DefinitionError(f"the duration must be positive and finite; got {duration}.")
     settings = Settings() if settings is None else settings
     u = jnp.asarray(_constant_input(s, input), float)[:, None]
     if callable(input):
@@ -203,8 +203,6 @@ def _constant_input(s: Structure, input) -> np.ndarray:
         )
     if callable(input):
         return np.zeros(s.nu)
-    if not np.all(np.isfinite(value)):
-        raise DefinitionError(f"the input must be finite; got {value}.")
     return np.broadcast_to(value, (s.nu,))
 
 

@@ -168,7 +168,7 @@ def prepare(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: Sequence[str | Output],
     options: Options,
     chunk: int | None = None,
 ) -> Campaign:
@@ -182,7 +182,7 @@ def prepare(
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
-    accuracy = _ACCURACY[execution.precision] if accuracy is None else float(accuracy)
+    accuracy = _ACCURACY[execution.precision] if accuracy is None else accuracy
     discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
     inputs = check_inputs(design, discard, N, nu)
@@ -217,12 +217,7 @@ def prepare(
 
 
 def chunks(count: int, chunk: int) -> list[slice]:
-    """Consecutive parts of `count` experiments, all but the last of the size `chunk`.
-
-    **Raises:** `DefinitionError` if `chunk` is not positive.
-    """
-    if chunk < 1:
-        raise DefinitionError(f"chunk is the number of experiments of one part, not {chunk}.")
+    """Consecutive parts of `count` experiments, all but the last of the size `chunk`."""
     return [slice(k, min(k + chunk, count)) for k in range(0, count, chunk)]
 
 

@@ -1,20 +1,22 @@
 """What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
-from .._core.arguments import names
+from .._core.arguments import Numbers, names
+from .._core.boundary.arrays import Integers, Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Index, PeriodCount, SectionCount, SignalNames
 from .._core.results import Result
 from ..errors import DefinitionError
 from .events import EventTimes
 from .record import Record
 
 
+@checked
 class Simulated(eqx.Module):
     """What only a simulation knows of its S experiments.
 
@@ -31,6 +33,7 @@ class Simulated(eqx.Module):
     events: EventTimes | None = None
 
 
+@checked
 class ExperimentData(eqx.Module):
     """Inputs and outputs of S experiments, sampled at the sections of a limit cycle.
 
@@ -61,16 +64,16 @@ class ExperimentData(eqx.Module):
 
     def __init__(
         self,
-        u: ArrayLike,
-        y: ArrayLike,
+        u: Annotated[Numbers, Reals("S n nu", missing=True, infinite=True)],
+        y: Annotated[Numbers, Reals("S n ny", missing=True, infinite=True)],
         *,
-        n_sections: int,
-        periods: int,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
-        result: ArrayLike | None = None,
+        n_sections: SectionCount,
+        periods: PeriodCount,
+        inputs: SignalNames | None = None,
+        outputs: SignalNames | None = None,
+        result: Annotated[Numbers, Integers("S")] | None = None,
         simulated: Simulated | None = None,
-        cycle_outputs: ArrayLike | None = None,
+        cycle_outputs: Annotated[Numbers, Reals("N ny")] | None = None,
         label: str = "",
     ):
         """**Arguments:** the fields. Without `result` every experiment counts as good; names
@@ -79,9 +82,9 @@ class ExperimentData(eqx.Module):
         **Raises:** `DefinitionError` for shapes that do not fit together, a record that is not a
         whole number of periods or shorter than the window, and for NaN in a good experiment.
         """
-        self.u, self.y = _real("u", u), _real("y", y)
+        self.u, self.y = np.array(u), np.array(y)
         shapes = self.u.shape, self.y.shape
-        if any(len(s) != 3 or 0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
+        if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
             raise DefinitionError(
                 "u must have the shape (experiments, samples, inputs) and y (experiments, "
                 f"samples, outputs), not {shapes[0]} and {shapes[1]}."
@@ -89,9 +92,7 @@ class ExperimentData(eqx.Module):
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
         self.simulated = simulated
-        self.cycle_outputs = (
-            None if cycle_outputs is None else _real("cycle_outputs", cycle_outputs)
-        )
+        self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
         self.n_sections, self.periods, self.label = n_sections, periods, label
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
@@ -101,8 +102,6 @@ class ExperimentData(eqx.Module):
     def _check(self) -> None:
         S, n, _ = self.u.shape
         N, P, ny = self.n_sections, self.periods, self.y.shape[2]
-        if N < 1 or P < 1:
-            raise DefinitionError(f"n_sections ({N}) and periods ({P}) must be at least 1.")
         if n % N:
             raise DefinitionError(
                 f"the record has {n} samples, not a multiple of N = {N} sections: cut it to whole "
@@ -169,22 +168,22 @@ class ExperimentData(eqx.Module):
         """The samples that estimates use: the last P periods."""
         return slice(self.u.shape[1] - self.n_sections * self.periods, None)
 
-    def windows(self, repeats: int = 1) -> list[slice]:
+    def windows(self, repeats: Count = 1) -> list[slice]:
         """The last `repeats` windows of P periods each, one after the other.
 
         **Raises:** `DefinitionError` if the record is too short.
         """
         n, length = self.u.shape[1], self.n_sections * self.periods
-        if repeats < 1 or repeats * length > n:
+        if repeats * length > n:
             raise DefinitionError(
                 f"{repeats} windows of P = {self.periods} periods need {repeats * self.periods} "
-                f"cycles (and repeats >= 1), but the record has {n // self.n_sections}: record "
+                f"cycles, but the record has {n // self.n_sections}: record "
                 "more cycles, or take fewer repeats."
             )
         first = n - repeats * length
         return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
 
-    def summary(self, limit: int = 5) -> str:
+    def summary(self, limit: Index = 5) -> str:
         """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
         return summary(self.result, self.failed_at, self.n_sections, limit)
 
@@ -211,13 +210,3 @@ def summary(
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return "; ".join(text)
-
-
-def _real(name: str, values: Any) -> np.ndarray:
-    try:
-        values = np.asarray(values)
-    except ValueError as error:
-        raise DefinitionError(f"{name} is not a rectangular array: {error}.") from error
-    if values.dtype.kind not in "fiu":
-        raise DefinitionError(f"{name} must hold real numbers, not {values.dtype}.")
-    return values.astype(float)

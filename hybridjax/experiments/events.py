@@ -6,6 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Index
+from ..errors import DefinitionError
 from .flow_batch import IntervalEvents
 
 
@@ -23,6 +26,7 @@ class ExperimentEvent(NamedTuple):
     """How much later it is than on the limit cycle, or NaN for one that is not the cycle's."""
 
 
+@checked_methods
 class EventTimes(eqx.Module):
     """When the events of S experiments happened, each in order of time.
 
@@ -63,8 +67,15 @@ class EventTimes(eqx.Module):
         expected = self.cycle_time[place] + turn * self.period
         return np.where(self.event == self.cycle_event[place], self.time - expected, np.nan)
 
-    def of(self, experiment: int) -> list[ExperimentEvent]:
-        """The events of one experiment, in order."""
+    def of(self, experiment: Index) -> list[ExperimentEvent]:
+        """The events of one experiment, in order.
+
+        **Raises:** `DefinitionError` for an experiment that does not exist.
+        """
+        if experiment >= len(self.time):
+            raise DefinitionError(
+                f"there is no experiment {experiment}; there are {len(self.time)}."
+            )
         late = self.deviations[experiment]
         return [
             ExperimentEvent(

@@ -1,15 +1,19 @@
 """Where the inputs of experiments come from."""
 
 import dataclasses
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Array, Float
+from jax import Array
+from jaxtyping import Float
 
+from .._core.boundary.arrays import Reals
 from ..errors import DefinitionError
 from .design.design import Design
 
 
-DesignLike = Design | Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"]
+DesignLike = Design | Annotated[np.ndarray | Array, Reals("S n nu", missing=True, infinite=True)]
+"""A design, or inputs. (What lies on disk is looked at part by part.)"""
 
 # Experiments whose inputs are looked at together for NaN, since an array may lie on disk. Twice as
 # many take twice the memory.
@@ -44,9 +48,6 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
 
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
-    if discard < 0 or discard != int(discard):
-        raise DefinitionError(f"discard is the number of cycles before the window, not {discard}.")
-    discard = int(discard)
     if isinstance(design, Design):
         if design.n_sections != n_sections:
             raise DefinitionError(
@@ -57,8 +58,6 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
                 f"the design has {len(design.input_names)} inputs, but the system has {nu}."
             )
         return Inputs(design, discard + design.periods, design.periods)
-    if np.iscomplexobj(design):
-        raise DefinitionError("inputs must be real; these are complex.")
     u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
     if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % n_sections or 0 in u.shape:
         raise DefinitionError(

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from .data import ExperimentData
@@ -14,11 +16,12 @@ from .design.design import DISCARD, Design
 from .noise import ProcessNoise
 
 
+@checked
 def simulate_experiments(
     ldtp: LDTP,
     design: Design,
     *,
-    discard: int | None = None,
+    discard: Index | None = None,
     start: Literal["cycle", "periodic"] = "cycle",
     process_noise: ProcessNoise | None = None,
 ) -> ExperimentData:
@@ -38,8 +41,6 @@ def simulate_experiments(
     **Raises:** `DefinitionError` if N or the number of inputs differ, or if a periodic response
     does not exist (a multiplier that is a P-th root of one).
     """
-    if start not in ("cycle", "periodic"):
-        raise DefinitionError(f"start is 'cycle' or 'periodic', not {start!r}.")
     if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
         raise DefinitionError(
             f"the design is for N = {design.n_sections} and {len(design.input_names)} inputs, the "
@@ -47,8 +48,6 @@ def simulate_experiments(
         )
     if discard is None:
         discard = DISCARD if start == "cycle" else 0
-    if discard < 0:
-        raise DefinitionError(f"discard must not be negative, but is {discard}.")
     u = design.inputs(design.periods + discard)
     x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None
     applied = u if process_noise is None else u + process_noise.draw(u.shape)

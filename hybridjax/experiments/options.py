@@ -3,11 +3,12 @@
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, TypedDict
 
+from .._core.boundary.kinds import Index
 from .._core.execution import Execution
-from ..errors import DefinitionError
 from .noise import ProcessNoise
+from .stepping.plan import Accuracy
 
 
 StartName = Literal["cycle", "periodic", "steady"]
@@ -15,30 +16,23 @@ StartName = Literal["cycle", "periodic", "steady"]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The arguments that `run_experiments` describes, with their defaults.
+    """The arguments that `run_experiments` describes, with their defaults."""
 
-    **Raises:** `DefinitionError` for another start.
-    """
-
-    start: str = "cycle"  # one of `StartName`, as is checked here
+    start: StartName = "cycle"
     discard: int | None = None
     process_noise: ProcessNoise | None = None
     accuracy: float | None = None
     record_events: bool = False
     execution: Execution | None = None
 
-    def __post_init__(self):
-        if self.start not in get_args(StartName):
-            raise DefinitionError(f"start is 'cycle', 'periodic' or 'steady', not {self.start!r}.")
-
 
 class OptionsByName(TypedDict, total=False):
     """`Options` for type checkers, where a function hands them on."""
 
     start: StartName
-    discard: int | None
+    discard: Index | None
     process_noise: ProcessNoise | None
-    accuracy: float | None
+    accuracy: Accuracy | None
     record_events: bool
     execution: Execution | None
 

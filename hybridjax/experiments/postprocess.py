@@ -1,22 +1,25 @@
 """What may be done to recorded experiments before an estimate: noise added, pairs combined."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Numbers, Seed
 from .._core.results import Result
 from ..errors import DefinitionError
 from .data import ExperimentData, Simulated
 
 
-Number = int | float
-
-
+@checked
 def add_noise(
     data: ExperimentData,
     *,
-    std: Number | np.ndarray | None = None,
-    snr: Number | None = None,
-    seed: int = 0,
+    std: Annotated[Numbers, Reals(sign="nonnegative")] | None = None,
+    snr: float | None = None,
+    seed: Seed = 0,
 ) -> ExperimentData:
     """White measurement noise added to all outputs of all samples.
 
@@ -26,7 +29,7 @@ def add_noise(
     - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
       all samples and good experiments) and of the noise, in dB, for each output.
 
-    **Raises:** `DefinitionError` unless exactly one of them is given, or for negative ones.
+    **Raises:** `DefinitionError` unless exactly one of them is given, for so many outputs.
     """
     if (std is None) == (snr is None):
         raise DefinitionError("add_noise needs either `std` or `snr`.")
@@ -34,13 +37,14 @@ def add_noise(
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
-    std = np.broadcast_to(np.asarray(std, float), (data.y.shape[2],))
-    if not (np.isfinite(std) & (std >= 0)).all():
-        raise DefinitionError(f"std of noise must be finite and not negative, but is {std}.")
-    noise = np.random.default_rng(seed).normal(size=data.y.shape) * std
+    ny = data.y.shape[2]
+    if np.shape(std) not in ((), (ny,)):
+        raise DefinitionError(f"`std` must be one number or {ny}, one for each output, not {std}.")
+    noise = np.random.default_rng(seed).normal(size=data.y.shape) * np.asarray(std)
     return eqx.tree_at(lambda d: d.y, data, data.y + noise)
 
 
+@checked
 def odd_part(data: ExperimentData) -> ExperimentData:
     """Half the difference of each pair of experiments with opposite inputs.
 

@@ -1,16 +1,24 @@
 """Recorded inputs and outputs at the sections of a cycle, of any length and with gaps."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers, names
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, SectionCount, SignalNames
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 
 
+Drift = Annotated[float, Number("a positive number of cycles", above=0, infinite=True)]
+
+
+@checked
 class Record(eqx.Module):
     """One stretch of recorded inputs and outputs, of any length, with any input.
 
@@ -39,34 +47,30 @@ class Record(eqx.Module):
 
     def __init__(
         self,
-        u: Numbers,
-        y: Numbers,
+        u: Annotated[Numbers, Reals("n nu", missing=True)],
+        y: Annotated[Numbers, Reals("n ny", missing=True)],
         *,
-        n_sections: int,
-        first_section: int = 0,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
-        lead: int = 0,
-        drift: int | float | None = None,
+        n_sections: SectionCount,
+        first_section: Index = 0,
+        inputs: SignalNames | None = None,
+        outputs: SignalNames | None = None,
+        lead: Index = 0,
+        drift: Drift | None = None,
     ):
-        """**Raises:** `DefinitionError` for shapes that do not fit together, or infinite values."""
-        self.u, self.y = _columns("u", u), _columns("y", y)
+        """**Raises:** `DefinitionError` for shapes that do not fit together."""
+        self.u, self.y = np.array(u), np.array(y)
         if len(self.u) != len(self.y) or 0 in self.u.shape + self.y.shape:
             raise DefinitionError(
                 "u must have the shape (samples, inputs) and y (samples, outputs), not "
                 f"{self.u.shape} and {self.y.shape}."
             )
-        if n_sections < 1 or not 0 <= first_section < n_sections:
+        if first_section >= n_sections:
             raise DefinitionError(
-                "a record needs n_sections >= 1 and a first_section from 0 to n_sections - 1, not "
-                f"{n_sections} and {first_section}."
+                f"`first_section` must be one of the sections 0..{n_sections - 1}, not "
+                f"{first_section}."
             )
-        if lead < 0:
-            raise DefinitionError(f"lead must not be negative, but is {lead}.")
-        if drift is not None and not drift > 0:
-            raise DefinitionError(f"drift must be a positive number of cycles, not {drift}.")
         self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
-        self.drift = None if drift is None else float(drift)
+        self.drift = drift
         self.inputs = names("inputs", inputs, self.u.shape[1])
         self.outputs = names("outputs", outputs, self.y.shape[1])
 
@@ -75,7 +79,7 @@ class Record(eqx.Module):
         """Itself alone, so that a record may stand wherever data of several may."""
         return (self,)
 
-    def part(self, first: int, stop: int) -> "Record":
+    def part(self, first: Index, stop: Index) -> "Record":
         """The samples `first`, ..., `stop - 1` as a record of their own.
 
         **Raises:** `DefinitionError` if there are none.
@@ -141,17 +145,3 @@ def _with_known_inputs(record: Record) -> Iterator[Record]:
         part = record.part(first, stop)
         part.y[max(len(part.y) - record.lead, 0) :] = np.nan  # (`part` copies)
         yield part
-
-
-def _columns(name: str, values: Numbers) -> Float[np.ndarray, "n columns"]:
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiu" or array.ndim != 2:
-        raise DefinitionError(
-            f"{name} must hold real numbers on two axes, not {array.dtype} of shape {array.shape}."
-        )
-    bad = np.argwhere(np.isinf(array))
-    if len(bad):
-        raise DefinitionError(
-            f"{name} is infinite at sample {bad[0][0]}; put NaN where a sample is bad."
-        )
-    return array.astype(float)

@@ -1,23 +1,25 @@
 """The response to inputs as a function that can be differentiated."""
 
 import dataclasses
-from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Numbers
 from .._core.precision import require_x64
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..maps.place import as_placed
 from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
+from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
 from .flow_batch import Response, flow_batch
-from .stepping.plan import Stepping, plan_flow
+from .stepping.plan import Accuracy, Stepping, plan_flow
 
 
 # Steps that a derivative remembers: between two sections at least, and in a period of the cycle.
@@ -25,6 +27,7 @@ from .stepping.plan import Stepping, plan_flow
 _STEPS, _STEPS_PER_PERIOD = 32, 1024
 
 
+@checked_methods
 class ResponseFunction(eqx.Module):
     """From inputs held between sections to outputs at the sections; see `response_function`.
 
@@ -37,7 +40,7 @@ class ResponseFunction(eqx.Module):
 
     def __call__(
         self,
-        u: Float[ArrayLike, "S n nu"],
+        u: Annotated[Numbers, Reals("S n nu")],
         start: Float[Array, "m S"] | None = None,
         system: HybridSystem | None = None,
     ) -> Response:
@@ -68,12 +71,13 @@ class ResponseFunction(eqx.Module):
         )
 
 
+@checked
 def response_function(
     cycle: LimitCycle,
     sections: SectionsLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: OutputNames,
     *,
-    accuracy: float = EXPERIMENT,
+    accuracy: Accuracy = EXPERIMENT,
 ) -> ResponseFunction:
     """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.
 

@@ -1,35 +1,39 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Unpack
 
 from tqdm import tqdm
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import ExperimentCount, Index
 from .._core.execution import Execution
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
+from ..systems.output import OutputNames
 from .campaign import chunks, prepare
 from .data import ExperimentData
 from .inputs import DesignLike
 from .noise import ProcessNoise
 from .options import Options, OptionsByName, StartName, options_of
+from .stepping.plan import Accuracy
 
 
 # Experiments in one part of a stream. Twice as many need twice the memory.
 CHUNK = 640
 
 
+@checked
 def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: OutputNames,
     *,
     start: StartName = "cycle",
-    discard: int | None = None,
+    discard: Index | None = None,
     process_noise: ProcessNoise | None = None,
-    accuracy: float | None = None,
+    accuracy: Accuracy | None = None,
     record_events: bool = False,
     execution: Execution | None = None,
 ) -> ExperimentData:
@@ -69,13 +73,14 @@ def run_experiments(
     return campaign.run(progress=campaign.execution.progress)
 
 
+@checked
 def stream_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: OutputNames,
     *,
-    chunk: int = CHUNK,
+    chunk: ExperimentCount = CHUNK,
     **options: Unpack[OptionsByName],
 ) -> Iterator[ExperimentData]:
     """Run experiments chunk by chunk, in memory that does not depend on their number.

@@ -2,13 +2,15 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Numbers, Positive
 from ..engine.settings import STEADY_START, Settings
 from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
@@ -104,12 +106,13 @@ def settle_batch(
     return settled.start.T, settled.change
 
 
+@checked
 def steady_start(
     response: ResponseFunction,
-    u: Float[ArrayLike, "S n nu"],
+    u: Annotated[Numbers, Reals("S n nu")],
     system: HybridSystem | None = None,
     *,
-    accuracy: float = STEADY_START,
+    accuracy: Positive = STEADY_START,
 ) -> Float[Array, "m S"]:
     r"""Where experiments must start so that their responses repeat with their inputs.
 

@@ -21,10 +21,12 @@ import numpy as np
 from tqdm import tqdm
 
 from .._core.archive import read_module, write_module
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import ExperimentCount, Index, Path as PathLike
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
+from ..systems.output import OutputNames
 from .campaign import Campaign, chunks, prepare
 from .data import ExperimentData, summary
 from .design.design import Design
@@ -45,15 +47,16 @@ _SAME_CYCLE = 1e-7
 _SAME_SIZES = 4.0
 
 
+@checked
 def store_experiments(
-    folder: str | os.PathLike,
+    folder: PathLike,
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output] | str | Output,
+    outputs: OutputNames,
     *,
-    chunk: int = CHUNK,
-    share: tuple[int, int] = (0, 1),
+    chunk: ExperimentCount = CHUNK,
+    share: tuple[Index, ExperimentCount] = (0, 1),
     **options: Unpack[OptionsByName],
 ) -> "StoredExperiments":
     """Run experiments and write them to a folder, in memory that does not depend on their number.
@@ -75,7 +78,7 @@ def store_experiments(
     for an argument that does not exist; and as `run_experiments`.
     """
     rank, size = share
-    if not 0 <= rank < size:
+    if rank >= size:
         raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
     chosen = options_of(store_experiments, options)
     campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
@@ -89,6 +92,7 @@ def store_experiments(
     return stored
 
 
+@checked
 class StoredExperiments:
     """Experiments in a folder that `store_experiments` fills.
 
@@ -96,7 +100,7 @@ class StoredExperiments:
     `estimate_htf(StoredExperiments(folder))` needs memory for one chunk only.
     """
 
-    def __init__(self, folder: str | os.PathLike):
+    def __init__(self, folder: PathLike):
         """**Arguments:** `folder`.
 
         **Raises:** `DefinitionError` if `folder` holds no experiments, or chunks of others.
@@ -121,7 +125,7 @@ class StoredExperiments:
         """The number of chunks, whether they are there or not."""
         return -(-self.experiments // self.chunk)
 
-    def path(self, k: int) -> Path:
+    def path(self, k: Index) -> Path:
         """The file of chunk k, which holds the experiments from `k * chunk` on."""
         return self.folder / f"{k:06d}-{self._id}.npz"
 
@@ -146,7 +150,7 @@ class StoredExperiments:
         for k in range(len(self)):
             yield read_module(self.path(k), {"ExperimentData": ExperimentData})
 
-    def summary(self, limit: int = 5) -> str:
+    def summary(self, limit: Index = 5) -> str:
         """As `ExperimentData.summary`, of all experiments."""
         self._complete()
         result, failed_at = [], []

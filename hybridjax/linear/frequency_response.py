@@ -6,12 +6,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from .._core.boundary.kinds import Scalar, Vector
 from ..errors import DefinitionError
 from .time_response import monodromy
 
 
-Harmonics = int | Iterable
-"""One harmonic, or several: integers of any type, numpy's too."""
+Frequencies = Vector | Scalar
+"""Cycles per period: (F,), or one."""
+Harmonics = int | Iterable[int]
+"""One harmonic, or several."""
 
 
 def all_harmonics(n_sections: int) -> tuple[int, ...]:
@@ -25,19 +28,12 @@ def all_harmonics(n_sections: int) -> tuple[int, ...]:
 def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, ...]:
     """`harmonics` as an ascending tuple; `None` means all of them.
 
-    **Raises:** `DefinitionError` for harmonics that are out of range, repeated or no integers.
+    **Raises:** `DefinitionError` for harmonics that are out of range, repeated, or none.
     """
     known = all_harmonics(n_sections)
     if harmonics is None:
         return known
-    try:
-        wanted = sorted(harmonics) if isinstance(harmonics, Iterable) else [harmonics]
-        integers = tuple(int(m) for m in wanted)
-        whole = all(i == m for i, m in zip(integers, wanted, strict=True))
-    except (TypeError, ValueError):
-        whole = False
-    if not whole:
-        raise DefinitionError(f"`harmonics` must be integers, but is {harmonics!r}.")
+    integers = tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
     outside = [m for m in integers if m not in known]
     if outside:
         raise DefinitionError(

@@ -1,18 +1,20 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from .._core.arguments import Numbers, names, real_array, require_finite
+from .._core.arguments import Numbers, names
+from .._core.boundary.arrays import Complexes, Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Probability, SectionCount, SignalNames, Vector
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
-from .frequency_response import Harmonics, check_harmonics
+from .frequency_response import Frequencies, Harmonics, check_harmonics
 
 
 # Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
@@ -21,10 +23,13 @@ _SAME_FREQUENCY = 1e-9
 # A gap between frequencies is interpolated if it is no wider than so many of the widest step
 # (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
 _WIDEST_GAP = 2
+Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative")]
+
 # Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
 _SILENT_LINE = 1e-10
 
 
+@checked
 class HTF(eqx.Module):
     r"""Harmonic transfer functions of a periodic system on a grid of input frequencies.
 
@@ -67,41 +72,34 @@ class HTF(eqx.Module):
 
     def __init__(
         self,
-        f: Numbers,
-        H: Numbers,
+        f: Vector,
+        H: Annotated[Numbers, Complexes("M F ny nu")],
         harmonics: Harmonics,
-        n_sections: int,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        n_sections: SectionCount,
+        inputs: SignalNames | None = None,
+        outputs: SignalNames | None = None,
         source: str = "estimate",
         *,
-        variance: Numbers | None = None,
-        noise_variance: Numbers | None = None,
-        variance_freedom: Numbers | None = None,
+        variance: Variance | None = None,
+        noise_variance: Variance | None = None,
+        variance_freedom: Annotated[Numbers, Reals("F", sign="positive")] | None = None,
     ):
-        values = H if isinstance(H, jax.Array) else np.asarray(H)
-        if not np.issubdtype(values.dtype, np.number) or values.ndim != 4:
-            raise DefinitionError(
-                "`H` must hold complex numbers on the axes (harmonic, frequency, output, input), "
-                f"but it is {values.dtype} of shape {values.shape}."
-            )
-        self.f = real_array("f", f, ndim=1)
-        require_finite("f", self.f)
-        self.H = jnp.asarray(values, complex)
+        self.f, self.H = jnp.asarray(f), jnp.asarray(H, complex)
         self.harmonics = check_harmonics(harmonics, n_sections)
-        if values.shape[:2] != (len(self.harmonics), self.f.shape[0]):
+        shape = self.H.shape
+        if shape[:2] != (len(self.harmonics), self.f.shape[0]):
             raise DefinitionError(
-                f"`H` has shape {values.shape}, but there are {len(self.harmonics)} harmonics and "
+                f"`H` has shape {shape}, but there are {len(self.harmonics)} harmonics and "
                 f"{self.f.shape[0]} frequencies (its first two axes)."
             )
         if tuple(np.atleast_1d(harmonics)) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
-        self.outputs = names("outputs", outputs, values.shape[2])
-        self.inputs = names("inputs", inputs, values.shape[3])
+        self.outputs = names("outputs", outputs, shape[2])
+        self.inputs = names("inputs", inputs, shape[3])
         self.source = source
-        self.variance = _optional("variance", variance, values.shape)
-        self.noise_variance = _optional("noise_variance", noise_variance, values.shape)
+        self.variance = _optional("variance", variance, shape)
+        self.noise_variance = _optional("noise_variance", noise_variance, shape)
         self.variance_freedom = _optional("variance_freedom", variance_freedom, self.f.shape)
 
     def __repr__(self) -> str:
@@ -136,7 +134,7 @@ class HTF(eqx.Module):
         variance, noise = (None if v is None else v[rows] for v in self._variances)
         return self._with(self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom)
 
-    def at(self, f: Numbers) -> "HTF":
+    def at(self, f: Frequencies) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
 
         **Raises:** `DefinitionError` for a frequency that was not measured.
@@ -159,7 +157,7 @@ class HTF(eqx.Module):
             self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom
         )
 
-    def confidence_radius(self, level: float = 0.95) -> Float[Array, "M F ny nu"]:
+    def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
         $r^2 = v\, F_{2, 2\nu}(level) = v\, \nu\, ((1 - level)^{-1/\nu} - 1)$ for the variance $v$
@@ -174,15 +172,13 @@ class HTF(eqx.Module):
                 "the HTFs have no variance: estimate them from several realizations of the "
                 "design or from repeated periods."
             )
-        if not 0 < level < 1:
-            raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
         if self.variance_freedom is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
         freedom = self.variance_freedom
         quantile = freedom * jnp.expm1(-np.log1p(-level) / freedom)
         return jnp.sqrt(quantile[:, None, None] * self.variance)
 
-    def interpolate(self, f: Numbers) -> "HTF":
+    def interpolate(self, f: Frequencies) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbors (host side).
 
         If the harmonics are symmetric about 0, the symmetry for real signals adds the negative
@@ -197,7 +193,7 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, self.H, f):
             raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
-        wanted = np.asarray(real_array("f", np.atleast_1d(f), ndim=1))
+        wanted = np.atleast_1d(f)
         knots, values = self._neighbors(self.H)
         given = np.unique(self.f)
         if len(given) < 2:
@@ -236,7 +232,7 @@ class HTF(eqx.Module):
         variance, noise = map(linear, self._variances)
         return self._with(wanted, H, self.harmonics, variance, noise, freedom)
 
-    def predict(self, u: Numbers) -> Float[Array, "time ny"]:
+    def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
 
         Harmonics that are not stored count as zero. Differentiable with respect to `H`.
@@ -250,7 +246,7 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, u):
             raise DefinitionError("`predict` must know `u` and `f`: call it outside of jit.")
-        values = np.asarray(real_array("u", u, ndim=2))
+        values = np.asarray(u)
         n, nu = values.shape
         if n == 0 or n % self.n_sections or nu != len(self.inputs):
             raise DefinitionError(
@@ -356,7 +352,7 @@ class HTF(eqx.Module):
 def _optional(name: str, value: Numbers | None, shape: tuple[int, ...]) -> Array | None:
     if value is None:
         return None
-    array = real_array(name, value, ndim=len(shape))
+    array = jnp.asarray(value)
     if array.shape != shape:
         raise DefinitionError(f"`{name}` must have the shape {shape}, not {array.shape}.")
     return array

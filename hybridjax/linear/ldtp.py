@@ -1,23 +1,29 @@
 """Linear discrete-time periodic systems whose state dimension may vary over the period."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.arguments import Numbers, names, real_array, require_finite
+from .._core.arguments import Numbers, names
+from .._core.boundary.arrays import Integers, Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, NonNegative, PeriodCount, SignalNames, Vector
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from . import time_response
-from .frequency_response import Harmonics, check_harmonics, harmonic_transfer
+from .frequency_response import Frequencies, Harmonics, check_harmonics, harmonic_transfer
 from .htf import HTF
 from .multipliers import product_eigenvalues, product_rank
 
+
+Matrix = Annotated[Numbers, Reals("rows columns")]
+Signals = Annotated[Numbers, Reals("n nu")]
 
 # Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier
 # that is carried by so weak a direction counts as zero.
@@ -27,6 +33,7 @@ _RANK_TOLERANCE = 1e-12
 _RESONANCE = 1e-8
 
 
+@checked
 class LDTP(eqx.Module):
     r"""A linear discrete-time periodic system of period $N$ sections.
 
@@ -60,19 +67,19 @@ class LDTP(eqx.Module):
 
     def __init__(
         self,
-        A: Numbers,
-        B: Numbers,
-        C: Numbers,
-        D: Numbers | None = None,
-        dims: Numbers | None = None,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        A: Annotated[Numbers, Reals("N d d")],
+        B: Annotated[Numbers, Reals("N d nu")],
+        C: Annotated[Numbers, Reals("N ny d")],
+        D: Annotated[Numbers, Reals("N ny nu")] | None = None,
+        dims: Annotated[Numbers, Integers("N")] | None = None,
+        inputs: SignalNames | None = None,
+        outputs: SignalNames | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
     ):
-        A, B, C = (real_array(*pair, ndim=3) for pair in (("A", A), ("B", B), ("C", C)))
+        A, B, C = map(jnp.asarray, (A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
-        D = jnp.zeros((n_sections, ny, nu)) if D is None else real_array("D", D, ndim=3)
+        D = jnp.zeros((n_sections, ny, nu)) if D is None else jnp.asarray(D)
         expected = {
             "A": (A, (n_sections, d, d)),
             "B": (B, (n_sections, d, nu)),
@@ -85,7 +92,6 @@ class LDTP(eqx.Module):
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
                     f"C {C.shape} it should be {shape}, without empty axes."
                 )
-            require_finite(name, array)
         require_x64({"A": A, "B": B, "C": C, "D": D})
         if coordinates is not None:
             coordinates = tuple(map(tuple, coordinates))
@@ -103,12 +109,12 @@ class LDTP(eqx.Module):
     @classmethod
     def from_blocks(
         cls,
-        A: Sequence[Numbers],
-        B: Sequence[Numbers],
-        C: Sequence[Numbers],
-        D: Sequence[Numbers] | None = None,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
+        A: Sequence[Matrix],
+        B: Sequence[Matrix],
+        C: Sequence[Matrix],
+        D: Sequence[Matrix] | None = None,
+        inputs: SignalNames | None = None,
+        outputs: SignalNames | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
     ) -> "LDTP":
         """An LDTP from matrices that each have their own dimensions.
@@ -125,7 +131,7 @@ class LDTP(eqx.Module):
                     f"`A` has {n_sections} matrices, `{name}` {len(given or ())}."
                 )
         blocks = {
-            name: [real_array(f"{name}[{n}]", block, ndim=2) for n, block in enumerate(given)]
+            name: [jnp.asarray(block) for block in given]
             for name, given in (("A", A), ("B", B), ("C", C), ("D", D))
             if given is not None
         }
@@ -164,7 +170,7 @@ class LDTP(eqx.Module):
         )
 
     def states(
-        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
+        self, u: Signals, x0: Vector | None = None, first_section: int = 0
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
@@ -177,14 +183,14 @@ class LDTP(eqx.Module):
         return time_response.states(self.A, self.B, u, x0, self._sections_from(first_section, u))
 
     def simulate(
-        self, u: Numbers, x0: Numbers | None = None, first_section: int = 0
+        self, u: Signals, x0: Vector | None = None, first_section: int = 0
     ) -> Float[Array, "time ny"]:
         """The outputs (n, ny) that an input leads to; arguments as in `states`."""
         u = self._input(u)
         x = self.states(u, x0, first_section)[:-1]
         return time_response.outputs(self.C, self.D, u, x, self._sections_from(first_section, u))
 
-    def impulse_response(self, n_lags: int) -> Float[Array, "N lags ny nu"]:
+    def impulse_response(self, n_lags: Count) -> Float[Array, "N lags ny nu"]:
         """The time-periodic impulse response (Markov parameters).
 
         **Arguments:** `n_lags`, the number of lags `r = 0 .. n_lags - 1`.
@@ -192,11 +198,9 @@ class LDTP(eqx.Module):
         **Returns:** at `[n, r]` the response at section `n` to a unit input `r` sections earlier:
         `D[n]` for `r = 0`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]`.
         """
-        if n_lags < 1:
-            raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
         return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
-    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
+    def htf(self, f: Frequencies, harmonics: Harmonics | None = None) -> HTF:
         """The exact harmonic transfer functions.
 
         **Arguments:**
@@ -209,9 +213,7 @@ class LDTP(eqx.Module):
         transformations values are not known, and the result there is infinite or meaningless.)
         """
         harmonics = check_harmonics(harmonics, self.n_sections)
-        f = jnp.atleast_1d(f) if np.ndim(f) == 0 else f
-        f = real_array("f", f, ndim=1)
-        require_finite("f", f)
+        f = jnp.atleast_1d(f)
         require_x64(self)
         self._refuse_resonance(f)
         H = harmonic_transfer(self.A, self.B, self.C, self.D, f)
@@ -243,7 +245,7 @@ class LDTP(eqx.Module):
         """
         return product_eigenvalues(self._blocks("multipliers"), _RANK_TOLERANCE)
 
-    def rank(self, section: int = 0, rtol: float = _RANK_TOLERANCE) -> int:
+    def rank(self, section: int = 0, rtol: NonNegative = _RANK_TOLERANCE) -> int:
         """Rank of the monodromy matrix at a section, from the ranks of the factors (host side).
 
         **Arguments:** `rtol`: singular values of a factor below `rtol` times its largest one
@@ -253,7 +255,7 @@ class LDTP(eqx.Module):
         first = section % self.n_sections
         return product_rank([*blocks[first:], *blocks[:first]], rtol)
 
-    def periodic_state(self, u: Numbers, periods: int) -> Float[Array, " d"]:
+    def periodic_state(self, u: Signals, periods: PeriodCount) -> Float[Array, " d"]:
         r"""The state at section 0 from which the response to a repeated input is periodic.
 
         $x_0 = (I - \Phi^P)^{-1} x_f$, with $x_f$ the state that `u` reaches from rest.
@@ -265,10 +267,12 @@ class LDTP(eqx.Module):
         """
         return self.periodic_states(self._input(u)[None], periods)[0]
 
-    def periodic_states(self, u: Numbers, periods: int) -> Float[Array, "S d"]:
+    def periodic_states(
+        self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
+    ) -> Float[Array, "S d"]:
         """As `periodic_state`, for S inputs (S, P N, nu) at once."""
-        u = self._input(u, ndim=3)
-        if periods < 1 or u.shape[1] != periods * self.n_sections:
+        u = self._input(u)
+        if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(
                 f"`u` has {u.shape[1]} samples, but {periods} periods of {self.n_sections} "
                 f"sections are {periods * self.n_sections}."
@@ -280,8 +284,8 @@ class LDTP(eqx.Module):
     def _sections_from(self, first_section, u):
         return (first_section + jnp.arange(u.shape[0])) % self.n_sections
 
-    def _input(self, u, ndim=2):
-        u = real_array("u", u, ndim)
+    def _input(self, u):
+        u = jnp.asarray(u)
         if u.shape[-1] != len(self.inputs):
             raise DefinitionError(
                 f"`u` has {u.shape[-1]} columns, but the inputs are ({', '.join(self.inputs)})."
@@ -292,7 +296,7 @@ class LDTP(eqx.Module):
         d = self.A.shape[-1]
         if x0 is None:
             return jnp.zeros(d)
-        x0 = real_array("x0", x0, ndim=1)
+        x0 = jnp.asarray(x0)
         true = (
             d
             if is_traced(self.dims)
@@ -343,8 +347,7 @@ class LDTP(eqx.Module):
 def _dimensions(dims, n_sections, d):
     if dims is None:
         return jnp.full(n_sections, d)
-    dims = dims if isinstance(dims, jax.Array) else np.asarray(dims)
-    if dims.shape != (n_sections,) or not np.issubdtype(dims.dtype, np.integer):
+    if len(dims) != n_sections:
         raise DefinitionError(f"`dims` must hold {n_sections} integers, one per section.")
     if not is_traced(dims):
         dims = np.asarray(dims)

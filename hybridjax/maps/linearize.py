@@ -1,12 +1,12 @@
 """From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import SignalNames
 from .._core.compilation.compile import quick_jit
 from .._core.lanes.per_lane import by_lane
 from .._core.results import Result
@@ -16,17 +16,18 @@ from ..engine.lanes import for_each_chart, only
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
-from ..systems.output import Output
+from ..systems.output import Output, OutputNames
 from ..systems.structure import Structure
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 
 
+@checked
 def linearize(
     cycle: LimitCycle,
     sections: SectionsLike,
-    outputs: Sequence[str | Output] | str | Output | None = None,
-    inputs: Sequence[str] | str | None = None,
+    outputs: OutputNames | None = None,
+    inputs: SignalNames | None = None,
 ) -> LDTP:
     """The linear discrete-time periodic system between consecutive sections, eqs. (5) and (6).
 
@@ -70,11 +71,11 @@ def _states_everywhere(s: Structure) -> list[str]:
 
 
 def _inputs(
-    s: Structure, inputs: Sequence[str] | str | None
+    s: Structure, inputs: tuple[str, ...] | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs, all by default, and their indices."""
     known = s.system.inputs
-    names = known if inputs is None else (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    names = known if inputs is None else inputs
     for name in names:
         if name not in known:
             raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")

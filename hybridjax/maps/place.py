@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.boundary.checked import checked
 from .._core.compilation.compile import quick_jit
 from .._core.lanes.per_lane import by_lane
 from .._core.results import Result
@@ -38,6 +39,7 @@ _LONGEST_WAY = 1.5
 _SAME_PHASE = 1e-9
 
 
+@checked
 def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     """Find a family's sections on a cycle, and check them.
 
@@ -59,13 +61,9 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
 def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     """`sections` placed on `cycle`: a family is placed, sections that were placed on it are kept.
 
-    **Raises:** `DefinitionError` for something that is not a cycle, or sections that were placed
-    on another one; otherwise as `place_sections`.
+    **Raises:** `DefinitionError` for sections that were placed on another one; otherwise as
+    `place_sections`.
     """
-    if not isinstance(cycle, LimitCycle):
-        raise DefinitionError(
-            f"expected a LimitCycle, got {type(cycle).__name__}: use find_limit_cycle first."
-        )
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
     other = sections.cycle

@@ -1,13 +1,12 @@
 """A section family that was placed on a limit cycle."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.boundary.checked import checked
 from .._core.compilation.compile import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
@@ -16,7 +15,7 @@ from ..engine.target import Target
 from ..orbits.cycle import LimitCycle
 from ..sections.abstract import AbstractSections, BoundSections
 from ..sections.section_list import FamilyLike
-from ..systems.output import Output
+from ..systems.output import Output, OutputNames
 from ..systems.structure import Structure
 from .outputs import observe
 
@@ -69,7 +68,8 @@ class PlacedSections(eqx.Module):
         next."""
         return Structure(self.cycle.system)
 
-    def observe(self, outputs: Sequence[str | Output] | str | Output) -> Float[Array, "N ny"]:
+    @checked
+    def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
         """Outputs of the cycle at the sections, without input; NaN where a chart does not define
         them.
 

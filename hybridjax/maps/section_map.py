@@ -1,14 +1,15 @@
 """The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
 
-import operator
-from typing import NamedTuple, SupportsIndex
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Index, Numbers, Scalar
 from .._core.compilation.compile import quick_jit
 from .._core.results import Result, update_result
 from .._core.tracing import is_traced
@@ -31,6 +32,7 @@ class Arrival(NamedTuple):
     """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's."""
 
 
+@checked_methods
 class SectionMap(eqx.Module):
     """P_{i->j}: from a state on section i, under a constant input, to section j.
 
@@ -55,7 +57,10 @@ class SectionMap(eqx.Module):
         return self.placed.lanes.q[: self.dims[0], self.i]
 
     def __call__(
-        self, q: ArrayLike, u: ArrayLike | None = None, t: ArrayLike | None = None
+        self,
+        q: Annotated[Numbers, Reals("n")],
+        u: Annotated[Numbers, Reals()] | None = None,
+        t: Scalar | None = None,
     ) -> Arrival:
         q = jnp.asarray(q, float)
         if q.shape != self.fixed_point.shape:
@@ -64,7 +69,10 @@ class SectionMap(eqx.Module):
                 f"shape {self.fixed_point.shape}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)
-        u = jnp.broadcast_to(jnp.asarray(0.0 if u is None else u, float), (nu,))
+        u = jnp.asarray(0.0 if u is None else u, float)
+        if u.shape not in ((), (nu,)):
+            raise DefinitionError(f"`u` must be {nu} numbers, one for each input; got {u.shape}.")
+        u = jnp.broadcast_to(u, (nu,))
         t = self.placed.lanes.t[self.i] if t is None else jnp.asarray(t, float)
         arrival = _map(self.placed, self.i, self.j, q, u, t)
         if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
@@ -75,18 +83,16 @@ class SectionMap(eqx.Module):
         return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
 
 
-def section_map(
-    cycle: LimitCycle, sections: SectionsLike, i: SupportsIndex, j: SupportsIndex
-) -> SectionMap:
+@checked
+def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -> SectionMap:
     """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
 
     For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
     range; `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
-    i, j = operator.index(i), operator.index(j)
     for k in (i, j):
-        if not 0 <= k < placed.n_sections:
+        if k >= placed.n_sections:
             raise DefinitionError(
                 f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
             )

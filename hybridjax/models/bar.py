@@ -5,11 +5,14 @@ hopping, J. Biomech. 22, 1989). Both feet land, and both let go, within a few hu
 period, and each touchdown changes the speed at which the other foot comes down.
 """
 
+from typing import Literal
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.boundary.checked import checked_methods
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
@@ -17,6 +20,9 @@ from ..systems.transition import Transition
 
 # Chart by the legs that stand on the table.
 _CHARTS = {(): "air", ("hind",): "hind", ("front",): "front", ("hind", "front"): "both"}
+
+
+Leg = Literal["hind", "front"]
 
 
 class _Standing(Chart):
@@ -32,6 +38,7 @@ class _Standing(Chart):
         return v, (sum(forces.values(), start=0.0) + u[0]) / bar.m - bar.g, p, torque / bar.J
 
 
+@checked_methods
 class TwoLeggedBar(HybridSystem):
     """A rigid bar, hopping on a hind and a front leg over a table that shakes up and down.
 
@@ -53,23 +60,23 @@ class TwoLeggedBar(HybridSystem):
     A: Parameter = parameter(0.2, unit="m", doc="amplitude of the table")
     T: Parameter = parameter(1.0, unit="s", doc="period of the table")
 
-    def hip(self, leg: str) -> Parameter:
+    def hip(self, leg: Leg) -> Parameter:
         """Position of a leg's hip along the bar."""
         return self.hind if leg == "hind" else self.front
 
-    def length(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+    def length(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Length of a standing leg less its rest length: the foot's height while in the air."""
         y, _, q, _ = state
         table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
         return y + self.hip(leg) * q - table - self.l0
 
-    def speed(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+    def speed(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Rate of `length`."""
         _, v, _, p = state
         rate = 2 * jnp.pi / self.T
         return v + self.hip(leg) * p - self.A * rate * jnp.cos(rate * t)
 
-    def force(self, leg: str, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+    def force(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Force of a standing leg on the bar."""
         return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
 

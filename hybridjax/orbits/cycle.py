@@ -4,6 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Positive
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -24,6 +26,7 @@ from .scale import sizes_of
 _RANK = 1e-9
 
 
+@checked_methods
 class LimitCycle(eqx.Module):
     """A periodic orbit of a hybrid system.
 
@@ -119,7 +122,7 @@ class LimitCycle(eqx.Module):
         chart = Structure(self.system).charts[int(self.anchor.chart[0])]
         return dict(zip(chart.states, self.anchor.q[:, 0].tolist(), strict=False))
 
-    def trajectory(self, periods: float = 1.0) -> Trajectory:
+    def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot."""
         _require_values(self, "trajectory")
         s = Structure(self.system)

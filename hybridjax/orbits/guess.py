@@ -66,13 +66,11 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
             f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
         )
     a = s.chart_index(guess.chart)
-    if guess.state.shape != (s.dims[a],) or not np.all(np.isfinite(guess.state)):
+    if guess.state.shape != (s.dims[a],):
         raise DefinitionError(
-            f"the guess must give finite values for the {s.dims[a]} states "
+            f"the guess must give values for the {s.dims[a]} states "
             f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
         )
-    if not np.isfinite(guess.time):
-        raise DefinitionError(f"the guess's time must be finite; got {guess.time}.")
     q = np.zeros((s.d, 1))
     q[: s.dims[a], 0] = guess.state
     return start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.boundary.checked import checked_methods
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine.events import arm, start_lanes
@@ -89,6 +90,7 @@ class Turn(NamedTuple):
         return self.distance <= _CLOSED
 
 
+@checked_methods
 class ReturnMap(eqx.Module):
     """The return map P of a system, and which of its fixed points is meant.
 

@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.boundary.kinds import Scalar
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Scalar, SectionCount
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
 from ..engine.target import AbstractLevels as AbstractLevels
-from ..errors import DefinitionError
 from ..systems.structure import Structure as Structure
 from .crossing import Crossing, number
 
@@ -29,6 +28,7 @@ class CyclePoint(NamedTuple):
     """The chart's field there, padded likewise."""
 
 
+@checked
 class BoundSections(eqx.Module):
     """A family of N sections with its numbers filled in: section i ends a piece of flow at a time,
     at the zero of a level function, or at an event."""
@@ -46,7 +46,7 @@ class BoundSections(eqx.Module):
         return cls(time, jnp.full(time.shape, -1, jnp.int32))
 
     @classmethod
-    def at_levels(cls, levels: AbstractLevels, n_sections: int) -> "BoundSections":
+    def at_levels(cls, levels: AbstractLevels, n_sections: SectionCount) -> "BoundSections":
         """Sections where level functions fall through zero."""
         never = jnp.full(n_sections, jnp.inf)
         return cls(never, jnp.full(n_sections, -1, jnp.int32), levels)
@@ -85,14 +85,6 @@ class AbstractSections(eqx.Module):
     @abc.abstractmethod
     def describe(self, i: int) -> str:
         """Section i in a few words, for errors."""
-
-
-def check_n_sections(n_sections: int) -> None:
-    """**Raises:** `DefinitionError` for what is no number of sections."""
-    if not isinstance(n_sections, int | np.integer) or n_sections < 1:
-        raise DefinitionError(
-            f"a family needs a whole number of sections, at least 1; got {n_sections}."
-        )
 
 
 def as_anchor(x: Crossing | Scalar) -> Crossing | Array:

@@ -5,10 +5,10 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..errors import DefinitionError
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Scalar
 from ..systems.output import Output
 from ..systems.structure import Structure
 
@@ -16,11 +16,12 @@ from ..systems.structure import Structure
 Direction = Literal["falling", "rising"]
 
 
-def number(x: ArrayLike) -> Array:
+def number(x: Scalar) -> Array:
     """`x` as a floating-point array, so that families can be differentiated in their numbers."""
     return jnp.asarray(x, float)
 
 
+@checked
 class Crossing(eqx.Module):
     """A section: the level set `function = value`, crossed in a stated direction.
 
@@ -39,12 +40,6 @@ class Crossing(eqx.Module):
     direction: Direction = eqx.field(static=True)
     value: Float[Array, ""] = eqx.field(converter=number, default=0.0)
     charts: tuple[str, ...] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        if self.direction not in ("falling", "rising"):
-            raise DefinitionError(
-                f"a Crossing has direction {self.direction!r}; say 'falling' or 'rising'."
-            )
 
     def __str__(self):
         name = self.function
@@ -79,6 +74,7 @@ class Crossing(eqx.Module):
         return sign * (value - self.value)
 
 
+@checked
 class AtEvent(eqx.Module):
     """A hybrid boundary as a section: the state right after the event `name` and its reset.
 

@@ -1,14 +1,15 @@
 """Sections at equally spaced angles in a plane of two signals."""
 
-from collections.abc import Sequence
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Numbers, SectionCount
 from ..engine.target import AbstractLevels
 from ..systems.structure import Structure
 from .abstract import (
@@ -17,15 +18,19 @@ from .abstract import (
     CyclePoint,
     as_anchor,
     check_anchor,
-    check_n_sections,
 )
 from .crossing import Crossing
 
 
-def _pair(x: ArrayLike | Sequence[ArrayLike] | None) -> Array | None:
+def _center(x: Annotated[Numbers, Reals("2")] | None) -> Array | None:
     return None if x is None else jnp.asarray(x, float)
 
 
+def _scale(x: Annotated[Numbers, Reals("2", sign="positive")] | None) -> Array | None:
+    return None if x is None else jnp.asarray(x, float)
+
+
+@checked
 class KinematicPhase(AbstractSections):
     """N equally spaced angles of (position - o_p) / s_p + i (velocity - o_v) / s_v (Sec. VI-B).
 
@@ -47,15 +52,12 @@ class KinematicPhase(AbstractSections):
     """
 
     label: ClassVar[str] = "kinematic"
-    n_sections: int = eqx.field(static=True)
+    n_sections: SectionCount = eqx.field(static=True)
     position: str = eqx.field(static=True)
     velocity: str = eqx.field(static=True)
-    center: Float[Array, "2"] | None = eqx.field(converter=_pair, default=None)
-    scale: Float[Array, "2"] | None = eqx.field(converter=_pair, default=None)
+    center: Float[Array, "2"] | None = eqx.field(converter=_center, default=None)
+    scale: Float[Array, "2"] | None = eqx.field(converter=_scale, default=None)
     anchor: Crossing | Float[Array, ""] = eqx.field(converter=as_anchor, default=0.0)
-
-    def __check_init__(self):
-        check_n_sections(self.n_sections)
 
     def check(self, s: Structure) -> None:
         s.resolve_outputs((self.position, self.velocity))

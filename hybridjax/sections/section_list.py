@@ -6,13 +6,15 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from .._core.boundary.checked import checked
 from ..engine.target import AbstractLevels
 from ..errors import DefinitionError
 from ..systems.structure import Structure
-from .abstract import AbstractSections, BoundSections, CyclePoint, check_n_sections
+from .abstract import AbstractSections, BoundSections, CyclePoint
 from .crossing import AtEvent, Crossing
 
 
+@checked
 class SectionList(AbstractSections):
     """Sections one by one, in the order in which the cycle meets them.
 
@@ -23,14 +25,10 @@ class SectionList(AbstractSections):
     items: tuple[Crossing | AtEvent, ...]
 
     def __init__(self, items: Iterable[Crossing | AtEvent]):
-        """**Raises:** `DefinitionError` for an empty list, and entries of another kind."""
+        """**Raises:** `DefinitionError` for an empty list."""
         self.items = tuple(items)
-        check_n_sections(len(self.items))
-        for item in self.items:
-            if not isinstance(item, Crossing | AtEvent):
-                raise DefinitionError(
-                    f"SectionList takes Crossing and AtEvent objects, not {type(item).__name__}."
-                )
+        if not self.items:
+            raise DefinitionError("a list of sections needs at least one Crossing or AtEvent.")
 
     @property
     def n_sections(self) -> int:
@@ -78,17 +76,7 @@ FamilyLike = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent
 
 
 def as_family(sections: FamilyLike) -> AbstractSections:
-    """A family from a family, a single section, or a list of sections.
-
-    **Raises:** `DefinitionError` for anything else.
-    """
+    """A family from a family, a single section, or a list of sections."""
     if isinstance(sections, Crossing | AtEvent):
         return SectionList([sections])
-    if isinstance(sections, list | tuple):
-        return SectionList(sections)
-    if not isinstance(sections, AbstractSections):
-        raise DefinitionError(
-            "sections are a family such as ClockPhase(32) or KinematicPhase(32, ...), or a list of "
-            f"Crossing and AtEvent objects; got {type(sections).__name__}."
-        )
-    return sections
+    return sections if isinstance(sections, AbstractSections) else SectionList(sections)

@@ -1,11 +1,15 @@
 """Outputs z = h(t, q, u) of a hybrid system (paper eq. 4)."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
 
 import equinox as eqx
 
+from .._core.boundary.checked import checked
+from .._core.boundary.containers import Names
 
+
+@checked
 class Output(eqx.Module):
     """A named scalar output z = h(t, q, u).
 
@@ -18,3 +22,7 @@ class Output(eqx.Module):
 
     name: str = eqx.field(static=True)
     function: Callable[..., Any] | Mapping[str, Callable[..., Any]]
+
+
+OutputNames = Annotated[Sequence[str | Output] | str | Output, Names(Output)]
+"""States and outputs: one, or several distinct ones; names, or `Output`s in their place."""

@@ -156,6 +156,8 @@ class Outputs:
                 raise DefinitionError(f"there is no output '{item}'; outputs are {_list(known)}.")
             self.items.append(item)
         self.names = tuple(o if isinstance(o, str) else o.name for o in self.items)
+        if len(set(self.names)) < len(self.names):
+            raise DefinitionError(f"two outputs have the same name: {_list(self.names)}.")
 
     def __call__(self, a: int, t, q, u) -> jax.Array:
         """All outputs in chart a, shape (ny,); NaN where a chart does not define one."""
@@ -191,16 +193,11 @@ class Outputs:
         return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))
 
 
-def check_system(system: Any) -> None:
+def check_system(system: HybridSystem) -> None:
     """Check that a system is well formed: names, shapes of every function, finite parameters.
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
-    if not isinstance(system, HybridSystem):
-        raise DefinitionError(
-            f"expected a HybridSystem, got {system!r:.80}; pass an instance of the model, e.g. "
-            "`VerticalHopper()`."
-        )
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
         if (
             jnp.issubdtype(leaf.dtype, jnp.inexact)

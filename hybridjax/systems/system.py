@@ -2,12 +2,15 @@
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import check_fields, checked
+from .._core.boundary.kinds import Numbers, Scalar
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -17,6 +20,7 @@ Parameter = Float[Array, ""] | float
 """The type of a parameter: an array, made from any number by `parameter`."""
 
 
+@checked
 def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
@@ -28,15 +32,24 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
-    return eqx.field(converter=lambda x: jnp.asarray(x, float), metadata=metadata, **options)
+    return eqx.field(converter=_number, metadata=metadata, **options)
 
 
+def _number(x: Scalar) -> Array:
+    return jnp.asarray(x, float)
+
+
+def _state(x: Annotated[Numbers, Reals("n")]) -> Array:
+    return jnp.asarray(x, float)
+
+
+@checked
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    time: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    state: Float[Array, " n"] = eqx.field(converter=_state)
+    time: Float[Array, ""] = eqx.field(converter=_number, default=0.0)
 
 
 class HybridSystem(eqx.Module):
@@ -63,6 +76,10 @@ class HybridSystem(eqx.Module):
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("u",)
+
+    def __new__(cls, *args, **kwargs):
+        check_fields(cls, args, kwargs)
+        return super().__new__(cls)
 
     @abc.abstractmethod
     def charts(self) -> dict[str, Chart]:

@@ -4,33 +4,37 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..errors import DefinitionError
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PositiveScalar, Scalar
 
 
 Direction = Literal["falling", "rising"]
 
 
+def _period(x: PositiveScalar) -> Array:
+    return jnp.asarray(x, float)
+
+
+def _offset(x: Scalar) -> Array:
+    return jnp.asarray(x, float)
+
+
+@checked
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
 
-    period: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    offset: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
-
-    def __check_init__(self):
-        if not isinstance(self.period, jax.core.Tracer) and not 0 < self.period < jnp.inf:
-            raise DefinitionError(
-                f"the period of a schedule must be positive and finite; it is {self.period}."
-            )
+    period: Float[Array, ""] = eqx.field(converter=_period)
+    offset: Float[Array, ""] = eqx.field(converter=_offset, default=0.0)
 
 
 def _identity(t, q, u):
     return q
 
 
+@checked
 class Transition(eqx.Module):
     """An event that ends a stay in chart `source` and begins one in chart `target`.
 
@@ -53,16 +57,9 @@ class Transition(eqx.Module):
     source: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
     guard: Callable[..., Any] | Scheduled
-    direction: str = eqx.field(static=True, default="falling")
+    direction: Direction = eqx.field(static=True, default="falling")
     reset: Callable[..., Any] = _identity
     enabled: Callable[..., Any] | None = None
-
-    def __check_init__(self):
-        if self.direction not in ("falling", "rising"):
-            raise DefinitionError(
-                f"transition '{self.name}': direction is {self.direction!r}; say 'falling' (from "
-                "positive to negative) or 'rising'."
-            )
 
     @property
     def sign(self) -> float:

@@ -5,7 +5,6 @@ import pytest
 
 import hybridjax as hj
 
-from ..conftest import unchecked
 from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
@@ -37,15 +36,15 @@ def test_periodic_start_has_no_transient(model):
 @pytest.mark.parametrize(
     "message, arguments",
     {
-        "start is 'cycle' or": dict(start="rest"),
-        "discard must not be negative": dict(discard=-1),
+        "`start` must be 'cycle' or": dict(start="rest"),
+        "`discard` must be an integer from 0": dict(discard=-1),
         "the design is for N = 5": dict(design=hj.multisine(5, 4, (0, 2.0), inputs=2)),
         "and 1 inputs": dict(design=hj.multisine(4, 4, (0, 2.0))),
     }.items(),
 )
 def test_bad_simulations(model, message, arguments):
     with pytest.raises(hj.DefinitionError, match=message):
-        unchecked(hj.experiments.simulate_experiments)(model, **(dict(design=DESIGN) | arguments))
+        hj.experiments.simulate_experiments(model, **(dict(design=DESIGN) | arguments))
 
 
 def test_failed_experiments_are_named():
@@ -80,15 +79,15 @@ HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
     {
         "13 samples, not a multiple of N = 4": dict(u=np.ones((3, 13, 1)), y=np.ones((3, 13, 2))),
         "longer than the record, 3 periods": dict(periods=4),
-        "u must have the shape": dict(u=np.ones((3, 12))),
+        "`u` must be of shape": dict(u=np.ones((3, 12))),
         r"not \(3, 12, 1\) and \(2, 12, 2\)": dict(y=np.ones((2, 12, 2))),
-        "y must hold real numbers, not complex128": dict(y=1j * np.ones((3, 12, 2))),
-        "u is not a rectangular array": dict(u=[[[1.0]], [[1.0, 2.0]]]),
+        "`y` must be real, not an array of complex128": dict(y=1j * np.ones((3, 12, 2))),
+        "`u` must be a rectangular array": dict(u=[[[1.0]], [[1.0, 2.0]]]),
         "experiment 0: u is NaN or infinite at sample 7": dict(u=HOLE),
         "result, failed_at, error and events": dict(result=[0, 0]),
         "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
         "`outputs` is": dict(outputs=("yM",)),
-        "must be at least 1": dict(n_sections=0),
+        "`n_sections` must be an integer from 1": dict(n_sections=0),
     }.items(),
 )
 def test_bad_records(message, change):

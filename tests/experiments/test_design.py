@@ -129,7 +129,7 @@ BAD = {
     r"experiment 1: f = 4.125 lies outside \[0, N/2 = 4": [[0.25], [4.125]],
     "experiment 0: f = -0.25 lies outside": [[-0.25]],
     "f = 0.3 is not a multiple of 1/8": [[0.3]],
-    "f = nan is not a multiple of 1/8": [[np.nan]],
+    "`frequencies.0.` must be finite, but is nan": [[np.nan]],
     "needs at least one frequency": [[0.25], []],
 }
 
@@ -153,12 +153,12 @@ def test_half_integers_by_hand():
     "message, arguments",
     {
         "amplitude that is not a positive number": dict(amplitudes=[[0.1, -0.1]]),
-        "amplitude that is not": dict(amplitudes=np.nan),
-        "phase that is not finite": dict(phases=np.inf),
+        "`amplitudes` must be a finite number": dict(amplitudes=np.nan),
+        "`phases` must be a finite number": dict(phases=np.inf),
         "`phases` must be one number": dict(phases=[[0.1]]),
         "not one of the 1": dict(channels=1),
-        "at least one input": dict(inputs=0),
-        "periods must be at least 1": dict(periods=0),
+        "`inputs` must be an integer from 1": dict(inputs=0),
+        "`periods` must be an integer from 1": dict(periods=0),
     }.items(),
 )
 def test_bad_arguments_of_a_design(message, arguments):
@@ -171,8 +171,8 @@ def test_bad_arguments_of_a_design(message, arguments):
     {
         "must lie in": dict(band=(0, 17.0)),
         "the band from 3.0 to 2.0": dict(band=(3.0, 2.0)),
-        "n_sections .32. and periods .-2. must be at least 1": dict(periods=-2),
-        "not a positive number": dict(amplitude=0.0),
+        "`periods` must be an integer from 1 to 10000000, not -2": dict(periods=-2),
+        "`amplitude` must be a positive number": dict(amplitude=0.0),
         "more than the 620": dict(experiments=621),
         "no multiple of 1/64 other than those of 1/2 lies": dict(band=(0, 0.01)),
         "no odd multiple of 1/64 other than those of 1/2": dict(band=(0, 0.01), lines="odd"),
@@ -186,5 +186,5 @@ def test_bad_arguments_of_multisine(message, arguments):
 
 
 def test_cycles_of_a_signal_must_be_positive():
-    with pytest.raises(hj.DefinitionError, match="cycles must be at least 1"):
+    with pytest.raises(hj.DefinitionError, match="`cycles` must be an integer from 1"):
         hj.paper_design().inputs(0)

@@ -6,7 +6,6 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 
-from ..conftest import unchecked
 from ..linear.conftest import blocks_at_random, hopper as hopper
 
 
@@ -206,17 +205,17 @@ def test_distortion_stands_where_a_linear_system_is_silent(hopper):
 @pytest.mark.parametrize(
     "message, arguments",
     {
-        "lines is 'all', 'odd' or 'two-phase', not 'even'": dict(lines="even"),
-        "division is 'random', 'sum-free', .* or 'orthogonal', not 'fair'": dict(division="fair"),
+        "`lines` must be 'all', 'odd' or 'two-phase', not 'even'": dict(lines="even"),
+        "`division` must be 'random', 'sum-free', .*, not 'fair'": dict(division="fair"),
         "exclude each other": dict(division="2-adic", highest_harmonic=2),
         "leave out `experiments`": dict(division="2-adic", experiments=99),
         "not with highest_harmonic": dict(highest_harmonic=2, lines="two-phase"),
         "goes with division='random' or": dict(division="2-adic", lines="two-phase"),
         "an even number of periods, not 63": dict(lines="odd", periods=63),
-        "must not be negative": dict(highest_harmonic=-1),
+        "`highest_harmonic` must be an integer from 0": dict(highest_harmonic=-1),
         "4 experiments are too few for harmonics up to 2": dict(highest_harmonic=2, experiments=4),
     }.items(),
 )
 def test_bad_choices(message, arguments):
     with pytest.raises(hj.DefinitionError, match=message):
-        unchecked(hj.multisine)(**arguments)
+        hj.multisine(**arguments)

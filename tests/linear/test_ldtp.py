@@ -135,24 +135,24 @@ GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"A": np.zeros((2, 3, 2))}, "`A` has shape"),
-        ({"A": np.zeros((2, 3))}, "`A` must have 3 axes"),
-        ({"A": np.full((2, 3, 3), np.nan)}, "`A` is not finite at index"),
+        ({"A": np.zeros((2, 3, 2))}, r"`A` must be of shape \(N, d, d\), not"),
+        ({"A": np.zeros((2, 3))}, r"`A` must be of shape \(N, d, d\), not of shape \(2, 3\)"),
+        ({"A": np.full((2, 3, 3), np.nan)}, r"`A` must be finite, but is nan at index \(0, 0, 0\)"),
         ({"A": np.zeros((2, 3, 3), complex)}, "`A` must be real"),
-        ({"A": [[[1.0, 2.0]], [[1.0]]]}, "`A` is not a rectangular array"),
-        ({"A": "three"}, "`A` must hold real numbers"),
+        ({"A": [[[1.0, 2.0]], [[1.0]]]}, "`A` must be a rectangular array"),
+        ({"A": "three"}, "`A` must be an array of real numbers"),
         ({"B": np.zeros((3, 3, 1))}, "`B` has shape"),
         ({"C": np.zeros((2, 1, 2))}, "`C` has shape"),
         ({"C": np.zeros((2, 0, 3))}, "without empty axes"),
         ({"D": np.zeros((2, 1, 2))}, "`D` has shape"),
         ({"dims": [3, 3, 3]}, "`dims` must hold 2 integers"),
-        ({"dims": [3.0, 3.0]}, "`dims` must hold 2 integers"),
+        ({"dims": [3.0, 3.0]}, "`dims` must hold integers, not float64"),
         ({"dims": [3, 4]}, "`dims` must lie between 1 and 3"),
         ({"dims": [3, 2], "A": np.ones((2, 3, 3))}, r"`A\[0\]` has entries outside"),
         ({"dims": [3, 2], "B": np.ones((2, 3, 1))}, r"`B\[0\]` has entries outside"),
         ({"dims": [3, 2], "C": np.ones((2, 1, 3))}, r"`C\[1\]` has entries outside"),
         ({"inputs": ("a", "b")}, "1 inputs need 1 names"),
-        ({"C": np.zeros((2, 2, 3)), "outputs": ("a", "a")}, "`outputs` repeats a name"),
+        ({"C": np.zeros((2, 2, 3)), "outputs": ("a", "a")}, "`outputs` must name each only once"),
         ({"coordinates": [("x", "y", "z")]}, "`coordinates` names 1 sections"),
     ],
 )
@@ -172,7 +172,7 @@ def test_bad_blocks():
         hj.LDTP.from_blocks(A, [B[0], B[0]], C, D)
     with pytest.raises(hj.DefinitionError, match="`A` has 2 matrices, `C` 1"):
         hj.LDTP.from_blocks(A, B, C[:1])
-    with pytest.raises(hj.DefinitionError, match=r"`C\[0\]` must have 2 axes"):
+    with pytest.raises(hj.DefinitionError, match=r"`C\[0\]` must be of shape \(rows, columns\)"):
         hj.LDTP.from_blocks(A, B, [c[0] for c in C])
     with pytest.raises(hj.DefinitionError, match="`A` has 0 matrices"):
         hj.LDTP.from_blocks([], [], [])
@@ -182,14 +182,14 @@ def test_bad_calls(synthetic):
     u = np.zeros((6, 2))
     with pytest.raises(hj.DefinitionError, match="`u` has 1 columns"):
         synthetic.simulate(u[:, :1])
-    with pytest.raises(hj.DefinitionError, match="`u` must have 2 axes"):
+    with pytest.raises(hj.DefinitionError, match=r"`u` must be of shape \(n, nu\)"):
         synthetic.simulate(u[:, 0])
     with pytest.raises(hj.DefinitionError, match="`x0` has 3 entries, but section 1 has 2"):
         varying = hj.LDTP.from_blocks(*blocks_at_random(0, (4, 2), 1, 2))
         varying.states(u, np.zeros(3), first_section=1)
     with pytest.raises(hj.DefinitionError, match="`u` has 6 samples, but 2 periods of 6"):
         synthetic.periodic_state(u, 2)
-    with pytest.raises(hj.DefinitionError, match="`n_lags` must be at least 1"):
+    with pytest.raises(hj.DefinitionError, match="`n_lags` must be an integer from 1"):
         synthetic.impulse_response(0)
     rotation = hj.LDTP([[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2)))
     rotation.periodic_state(np.ones((3, 1)), 3)

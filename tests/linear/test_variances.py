@@ -57,7 +57,7 @@ def test_some_frequencies(htf):
 def test_bad_variances(htf):
     with pytest.raises(hj.DefinitionError, match="have no variance"):
         an_htf().confidence_radius()
-    with pytest.raises(hj.DefinitionError, match="level must lie between 0 and 1"):
+    with pytest.raises(hj.DefinitionError, match="`level` must be a number between 0 and 1"):
         htf.confidence_radius(1.0)
     with pytest.raises(hj.DefinitionError, match="`variance_freedom` must have the shape"):
         an_htf(variance_freedom=np.ones(3))

@@ -141,10 +141,10 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
 @pytest.mark.parametrize(
     "define, message",
     [
-        (lambda: hj.ClockPhase(0), "a whole number of sections, at least 1; got 0"),
-        (lambda: hj.ClockPhase(2.5), "a whole number of sections, at least 1; got 2.5"),
-        (lambda: hj.SectionList([]), "a whole number of sections, at least 1; got 0"),
-        (lambda: hj.SectionList(["x"]), "takes Crossing and AtEvent objects, not str"),
+        (lambda: hj.ClockPhase(0), "`n_sections` must be an integer from 1 to 100000, not 0"),
+        (lambda: hj.ClockPhase(2.5), "`n_sections` must be .*, not 2.5"),
+        (lambda: hj.SectionList([]), "needs at least one Crossing or AtEvent"),
+        (lambda: hj.SectionList(["x"]), r"`items\[0\]` must be a Crossing or an AtEvent, not 'x'"),
     ],
 )
 def test_bad_families(define, message):

@@ -69,7 +69,7 @@ def test_events_before_the_search_do_not_count(hopper_cycle):
         ({"section": hj.Crossing("yM", "falling")}, "returns to itself after its clock's period"),
         ({"settle": 1.0}, "leave out `settle` and `max_period`"),
         ({"max_period": 1.0}, "leave out `settle` and `max_period`"),
-        ({"settle": -1.0}, "settle must be a finite time"),
+        ({"settle": -1.0}, "`settle` must be a number that is not negative"),
         ({"multiplicity": 2}, "has multiplicity 1, not 2"),
     ],
 )

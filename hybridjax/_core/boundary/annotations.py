@@ -35,10 +35,10 @@ _PLAIN = {
     typing.SupportsIndex: Whole(),
 }
 _SEQUENCES = {
-    list: list,
-    collections.abc.Sequence: None,
-    collections.abc.Iterable: tuple,
-    collections.abc.Collection: tuple,
+    list: {"form": list},
+    collections.abc.Sequence: {},
+    collections.abc.Iterable: {"iterable": True},
+    collections.abc.Collection: {"iterable": True},
 }
 _MAPPINGS = {dict, collections.abc.Mapping}
 _ARRAYS = {"complex128": Complexes, "float64": Reals, "int64": Integers}
@@ -69,7 +69,7 @@ def kind_of(hint: Any) -> Kind | None:
         return Tuple(*map(kind_of, arguments))
     container = hint if origin is None else origin
     if container in _SEQUENCES:
-        return Items(kind_of(arguments[0]) if arguments else None, form=_SEQUENCES[container])
+        return Items(kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container])
     if container in _MAPPINGS:
         return Table(*map(kind_of, arguments)) if arguments else Table(None, None)
     if origin is type:
@@ -91,6 +91,8 @@ def _either(arguments: tuple[Any, ...]) -> Kind | None:
 def _of_class(cls: type) -> Kind:
     if issubclass(cls, jaxtyping.AbstractArray):
         return _array(cls)
+    if cls.__module__.startswith("numpy._typing"):
+        raise TypeError("an array is annotated as `Annotated[Numbers, Reals(shape)]`.")
     if getattr(cls, "_is_protocol", False):
         return Having(cls)
     return Instance(cls)

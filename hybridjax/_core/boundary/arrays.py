@@ -113,7 +113,8 @@ class Reals(Kind):
     def _check_values(self, array: np.ndarray | jax.Array) -> None:
         values = np.asarray(array)
         # (A sum is a number where all of them are, and takes no memory.)
-        if values.dtype.kind not in "iu" and not np.isfinite(_sum(values)):
+        free = self.missing and self.infinite
+        if values.dtype.kind not in "iu" and not free and not np.isfinite(_sum(values)):
             bad = np.isinf(values) if self.missing else ~np.isfinite(values)
             if self.infinite:
                 bad &= ~np.isinf(values)

@@ -5,11 +5,12 @@ import inspect
 import sys
 import typing
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import jax
 
 from ...errors import DefinitionError
+from ..memo import Memory
 from ..tracing import is_inside_program, is_traced
 from .annotations import kind_of
 from .kind import Kind
@@ -17,6 +18,7 @@ from .misfit import Misfit
 
 
 Thing = TypeVar("Thing", bound=Callable)
+Class = TypeVar("Class", bound=type)
 
 _JAX_ERRORS = jax.errors.JAXTypeError, jax.errors.JAXIndexError
 
@@ -40,12 +42,17 @@ def checked(thing: Thing) -> Thing:
 
     It stands above all other decorators, except `classmethod` and `staticmethod`.
     """
-    if isinstance(thing, type):
-        return _checked_class(thing)
-    return _wrapped(thing, thing.__qualname__)
+    if not isinstance(thing, type):
+        return _wrapped(thing, thing.__qualname__)
+    maker = "__new__" if issubclass(thing, tuple) else "__init__"
+    if maker in vars(thing):
+        setattr(thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing))
+    return checked_methods(thing)
 
 
-def _checked_class(cls: type) -> type:
+def checked_methods(cls: Class) -> Class:
+    """A class whose public methods are checked, but not its constructor: results, which this
+    package makes, and JAX."""
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in ("__call__", "__getitem__"):
             continue
@@ -55,10 +62,20 @@ def _checked_class(cls: type) -> type:
         if len(inspect.signature(function).parameters) > (not isinstance(member, staticmethod)):
             wrapped = _wrapped(function, f"{cls.__name__}.{name}")
             setattr(cls, name, type(member)(wrapped) if function is not member else wrapped)
-    maker = "__new__" if issubclass(cls, tuple) else "__init__"
-    if maker in vars(cls):
-        setattr(cls, maker, _wrapped(getattr(cls, maker), cls.__name__, cls))
     return cls
+
+
+def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
+    """Check what the constructor of a class is given for those of its fields whose converters say
+    by a `Kind` what they take. (Its other annotations are its author's business.)
+
+    **Raises:** `DefinitionError`.
+    """
+    fields = _fields.recall(cls, None, lambda: _Fields(cls.__init__, cls))
+    try:
+        fields.take((None, *args), dict(kwargs))
+    except Misfit as misfit:
+        raise DefinitionError(f"{cls.__name__}: `{misfit.path}` {misfit.problem}.") from None
 
 
 def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable:
@@ -78,6 +95,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
             f"{name} needs values, but JAX traces them here: call it outside of jit, vmap and grad."
         )
 
+    call.kinds = kinds
     return call
 
 
@@ -137,3 +155,17 @@ class _Kinds:
         except Misfit as misfit:
             raise misfit.of(at[0]) from None
         return taken, kwargs
+
+
+class _Fields(_Kinds):
+    """What fields with converters may be."""
+
+    @functools.cached_property
+    def by_name(self) -> dict[str, Kind | None]:
+        hints = self.function.__annotations__
+        kinds = dict.fromkeys(inspect.signature(self.function).parameters)
+        own = {name: hint for name, hint in hints.items() if typing.get_origin(hint) is Annotated}
+        return kinds | {name: kind_of(hint) for name, hint in own.items()}
+
+
+_fields = Memory()

@@ -1,8 +1,8 @@
 """Kinds that are made of others: choices, sequences, tables, objects of a class."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -25,7 +25,7 @@ class Either(Kind):
             try:
                 return kind.take(value)
             except Misfit as misfit:
-                near = misfit if misfit.near else near
+                near = near or (misfit if misfit.near else None)
         raise self.refused(value) if near is None else near
 
 
@@ -52,7 +52,7 @@ class Having(Kind):
     would do.)"""
 
     def __init__(self, protocol: type):
-        self.names = [name for name in vars(protocol) if not name.startswith("_")]
+        self.names = sorted(set(vars(protocol)) - _OF_EVERY_PROTOCOL)
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def take(self, value):
@@ -60,6 +60,13 @@ class Having(Kind):
             if inspect.getattr_static(value, name, self) is self:
                 raise self.refused(value)
         return value
+
+
+class _Empty(Protocol):
+    pass
+
+
+_OF_EVERY_PROTOCOL = {*vars(_Empty), "_is_runtime_protocol"}
 
 
 class Subclass(Kind):
@@ -88,30 +95,30 @@ class Function(Kind):
 
 class Items(Kind):
     """A sequence all of whose items are of one kind: a list, a tuple, an array's first axis. With
-    `form`, what any iterable holds is brought to that form."""
+    `form`, it is brought to that form; with `iterable`, whatever can be iterated over is taken."""
 
-    def __init__(self, item: Kind | None, *, form: Callable[[Iterable], Any] | None = None):
-        self.item, self.form = item, form
-        self.allowed = "a sequence" if item is None else f"a sequence of items, each {item.allowed}"
+    def __init__(
+        self,
+        item: Kind | None,
+        *,
+        form: type | None = None,
+        iterable: bool = False,
+    ):
+        self.item, self.form, self.iterable = item, form, iterable
+        self.allowed = "a sequence" if item is None else f"a sequence (each item {item.allowed})"
 
     def take(self, value):
-        if isinstance(value, jax.core.Tracer | str | bytes | Mapping):
+        if isinstance(value, str | bytes | Mapping):
             raise self.refused(value)
-        if isinstance(value, np.ndarray | jax.Array):
-            if value.ndim == 0:
-                raise self.refused(value)
-            value = list(np.asarray(value))
-        elif (
-            isinstance(value, Iterable)
-            and self.form is not None
-            and not isinstance(value, Sequence)
-        ):
-            value = self.form(value)
+        if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0:
+            value = list(value if isinstance(value, jax.core.Tracer) else np.asarray(value))
         elif not isinstance(value, Sequence):
-            raise self.refused(value)
-        if self.item is None:
-            return value
-        return _rebuilt(value, [_taken(self.item, i, x) for i, x in enumerate(value)])
+            if not (self.iterable and isinstance(value, Iterable)):
+                raise self.refused(value)
+            value = tuple(value)
+        if self.item is not None:
+            value = _rebuilt(value, [_taken(self.item, i, x) for i, x in enumerate(value)])
+        return value if self.form is None or isinstance(value, self.form) else self.form(value)
 
 
 class Tuple(Kind):

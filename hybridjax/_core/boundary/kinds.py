@@ -33,6 +33,7 @@ Seed = Annotated[int, Whole(0)]
 Positive = Annotated[float, Number("a positive number", above=0)]
 NonNegative = Annotated[float, Number("a number that is not negative", low=0)]
 Probability = Annotated[float, Number("a number between 0 and 1", above=0, below=1)]
+Share = Annotated[float, Number("a number above 0, at most 1", above=0, high=1)]
 Fraction = Annotated[float, Number("a number from 0 to 1", low=0, high=1)]
 
 # The same, where one has an array of JAX at hand as often as a `float`.

@@ -5,8 +5,12 @@ import pathlib
 
 import jax
 
+from ..boundary.checked import checked
+from ..boundary.kinds import Path
 
-def enable_compilation_cache(folder: str | os.PathLike | None = None) -> pathlib.Path:
+
+@checked
+def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
     """Keep compiled programs on disk, so that the next process starts faster.
 
     **Arguments:** `folder`, by default `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache

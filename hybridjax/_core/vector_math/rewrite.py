@@ -16,6 +16,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jax.extend.core import primitives
 
+from ..boundary.checked import checked
 from ..device import on_cpu
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
 
@@ -40,6 +41,7 @@ _OUTER = ("jit", "pjit", "cond", "while", "scan")
 _enabled = True
 
 
+@checked
 def enable_vector_math(enabled: bool = True) -> None:
     """Whether trigonometric functions in fields, guards, resets and outputs are computed for
     several lanes at once, for this process: they are, unless this is called with `False`.

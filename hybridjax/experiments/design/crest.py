@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 from scipy.optimize import minimize
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Seed
 from ...errors import DefinitionError
 from .design import Design
 from .partition import is_real
@@ -18,7 +20,8 @@ _POWERS = (4, 8, 16, 32, 64, 128)
 _STEPS = 100
 
 
-def optimize_phases(design: Design, seed: int = 0) -> Design:
+@checked
+def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     r"""The design with phases that give each signal a low crest factor max |u| / rms(u).
 
     The peak is approached by norms $\sum |u|^p$ of growing p, minimized over the phases (Guillaume,

@@ -2,18 +2,33 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.arguments import names
+from ..._core.arguments import Numbers, names
+from ..._core.boundary.arrays import Integers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import (
+    Count,
+    ExperimentCount,
+    Index,
+    NonNegative,
+    PeriodCount,
+    Positive,
+    SectionCount,
+    Seed,
+    SignalNames,
+    Vector,
+)
 from ...errors import DefinitionError
 from .partition import check_sharing, is_real, meets_itself, regular
 
 
-Number = int | float
-Numbers = Sequence[Number] | np.ndarray
+InputNames = Count | SignalNames
+"""The number of inputs, or their names."""
 
 # Cycles at the start of experiments from the limit cycle that are discarded where nothing else is
 # said (the paper's). Twice as many square what is left of the transient.
@@ -29,6 +44,7 @@ _VANISHING = 1e-3
 _OFF_LINE = 1e-6
 
 
+@checked
 class Design(eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
 
@@ -54,11 +70,11 @@ class Design(eqx.Module):
     channel: Int[np.ndarray, " K"]
     amplitude: Float[np.ndarray, " K"]
     phase: Float[np.ndarray, " K"]
-    n_sections: int = eqx.field(static=True)
-    periods: int = eqx.field(static=True)
-    experiments: int = eqx.field(static=True)
+    n_sections: SectionCount = eqx.field(static=True)
+    periods: PeriodCount = eqx.field(static=True)
+    experiments: ExperimentCount = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
-    highest_harmonic: int | None = eqx.field(static=True, default=None)
+    highest_harmonic: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         self.check()
@@ -66,14 +82,14 @@ class Design(eqx.Module):
     @classmethod
     def from_lines(
         cls,
-        frequencies: Sequence[Numbers],
-        amplitudes: Number | Sequence[Numbers] = 0.01,
-        phases: Number | Sequence[Numbers] = 0.0,
+        frequencies: Sequence[Vector],
+        amplitudes: float | Sequence[Vector] = 0.01,
+        phases: float | Sequence[Vector] = 0.0,
         *,
-        n_sections: int = 32,
-        periods: int = 64,
-        channels: int | Sequence[Sequence[int] | np.ndarray] = 0,
-        inputs: int | str | Sequence[str] = 1,
+        n_sections: SectionCount = 32,
+        periods: PeriodCount = 64,
+        channels: Index | Sequence[Annotated[Numbers, Integers("n")]] = 0,
+        inputs: InputNames = 1,
     ) -> "Design":
         """A design from your own cosines.
 
@@ -130,8 +146,6 @@ class Design(eqx.Module):
         **Raises:** `DefinitionError` that names the experiment and the frequencies.
         """
         P, N = self.periods, self.n_sections
-        if N < 1 or P < 1:
-            raise DefinitionError(f"n_sections ({N}) and periods ({P}) must be at least 1.")
         empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
         if len(empty) or len(self.experiment) == 0:
             raise DefinitionError("every experiment of a design needs at least one frequency.")
@@ -200,7 +214,7 @@ class Design(eqx.Module):
         return np.unique(self.line) / self.periods
 
     def inputs(
-        self, cycles: int | None = None, experiments: slice | None = None
+        self, cycles: PeriodCount | None = None, experiments: slice | None = None
     ) -> Float[np.ndarray, "S n nu"]:
         """The signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
 
@@ -211,8 +225,6 @@ class Design(eqx.Module):
         **Arguments:** `experiments`, consecutive ones, e.g. `slice(0, 100)`; by default all.
         """
         cycles = self.periods if cycles is None else cycles
-        if cycles < 1:
-            raise DefinitionError(f"cycles must be at least 1, not {cycles}.")
         first, last, step = (experiments or slice(None)).indices(self.experiments)
         if step != 1 or last <= first:
             raise DefinitionError(f"{experiments} holds no consecutive experiments.")
@@ -227,17 +239,15 @@ class Design(eqx.Module):
         index = np.arange(cycles * self.n_sections) % length
         return one[:, index]
 
-    def scaled(self, rms: Number) -> "Design":
+    def scaled(self, rms: Positive) -> "Design":
         """The same with amplitudes multiplied so that every signal has this rms value.
 
         Each experiment and input by itself, over one window; the proportions within stay.
         """
-        if not rms > 0:
-            raise DefinitionError(f"rms must be a positive number, not {rms}.")
         now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[self.experiment, self.channel]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
 
-    def realizations(self, count: int, seed: int = 0) -> "Design":
+    def realizations(self, count: Count, seed: Seed = 0) -> "Design":
         """The design `count` times over, each time with new random phases.
 
         Their responses scatter by noise and by distortion, so that the variance of an estimate can
@@ -246,8 +256,6 @@ class Design(eqx.Module):
 
         **Returns:** a design with `count` times the experiments, one realization after the other.
         """
-        if count < 1:
-            raise DefinitionError(f"count is the number of realizations, not {count}.")
         rng = np.random.default_rng(seed)
         pair = self.line * len(self.input_names) + self.channel
         pairs, place = np.unique(pair, return_inverse=True)
@@ -281,7 +289,9 @@ class Design(eqx.Module):
             **each,
         )
 
-    def expected_variance(self, noise: Number = 1.0, repeats: int = 1) -> Float[np.ndarray, "F nu"]:
+    def expected_variance(
+        self, noise: NonNegative = 1.0, repeats: Count = 1
+    ) -> Float[np.ndarray, "F nu"]:
         """The variance of every H_m at `frequencies` under white noise of this std on the output.
 
         `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
@@ -296,7 +306,7 @@ class Design(eqx.Module):
         with np.errstate(divide="ignore"):
             return 4 * noise**2 / (samples * power)
 
-    def cycles(self, discard: int = DISCARD) -> int:
+    def cycles(self, discard: Index = DISCARD) -> int:
         """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
         return self.experiments * (self.periods + discard)
 
@@ -339,8 +349,6 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
 
     **Raises:** `DefinitionError` for a frequency that is not a multiple of 1/periods.
     """
-    if periods < 1:
-        raise DefinitionError(f"periods must be at least 1, not {periods}.")
     exact = np.asarray(frequencies, float) * periods
     lines = np.rint(exact)
     wrong = ~(np.abs(exact - lines) < _OFF_LINE)
@@ -353,11 +361,6 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
     return lines.astype(int)
 
 
-def input_names(inputs: int | str | Sequence[str]) -> tuple[str, ...]:
+def input_names(inputs: int | tuple[str, ...]) -> tuple[str, ...]:
     """Names from names, or from a number: `u`, or `u0`, `u1`, ..."""
-    if isinstance(inputs, int):
-        if inputs < 1:
-            raise DefinitionError(f"a design needs at least one input, not {inputs}.")
-        return names("inputs", None, inputs)
-    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
-    return names("inputs", inputs, len(inputs))
+    return names("inputs", None, inputs) if isinstance(inputs, int) else inputs

@@ -1,12 +1,24 @@
 """The usual designs: multisines over a band, the paper's, single cosines."""
 
-from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import (
+    ExperimentCount,
+    Index,
+    NonNegative,
+    PeriodCount,
+    Positive,
+    Scalar,
+    SectionCount,
+    Seed,
+    Vector,
+)
 from ...errors import DefinitionError
-from .design import Design, Number, Numbers, input_names, to_lines
+from .design import Design, InputNames, input_names, to_lines
 from .partition import (
     assign,
     assign_apart,
@@ -19,6 +31,7 @@ from .partition import (
 )
 
 
+Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
 
@@ -27,18 +40,19 @@ Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
 _EDGE = 1e-9
 
 
+@checked
 def multisine(
-    n_sections: int = 32,
-    periods: int = 64,
-    band: tuple[Number, Number] | None = None,
-    amplitude: Number | Callable[[np.ndarray], np.ndarray] = 0.01,
-    seed: int = 0,
+    n_sections: SectionCount = 32,
+    periods: PeriodCount = 64,
+    band: Band | None = None,
+    amplitude: Positive | Callable[[np.ndarray], np.ndarray] = 0.01,
+    seed: Seed = 0,
     *,
     lines: Lines = "all",
     division: Division = "random",
-    experiments: int | None = None,
-    highest_harmonic: int | None = None,
-    inputs: int | str | Sequence[str] = 1,
+    experiments: ExperimentCount | None = None,
+    highest_harmonic: Index | None = None,
+    inputs: InputNames = 1,
 ) -> Design:
     """Multisines that measure every frequency `j / periods` in a band.
 
@@ -148,10 +162,6 @@ def multisine(
 
 
 def _check_choices(lines, division, periods, experiments, highest_harmonic) -> None:
-    for name, given, known in (("lines", lines, Lines), ("division", division, Division)):
-        if given not in get_args(known):
-            *most, last = map(repr, get_args(known))
-            raise DefinitionError(f"{name} is {', '.join(most)} or {last}, not {given!r}.")
     usual = division in ("random", "sum-free") and highest_harmonic is None
     if lines == "two-phase" and not usual:
         raise DefinitionError(
@@ -170,18 +180,12 @@ def _check_choices(lines, division, periods, experiments, highest_harmonic) -> N
             f"{choice} needs an even number of periods, not {periods}: else the even-order "
             "products fall on the lines themselves."
         )
-    if highest_harmonic is not None and highest_harmonic < 0:
-        raise DefinitionError(f"highest_harmonic must not be negative, but is {highest_harmonic}.")
 
 
-def _lines(n_sections: int, periods: int, band: tuple[Number, Number], lines: Lines) -> np.ndarray:
+def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarray:
     """The lines j of a band."""
-    if n_sections < 1 or periods < 1:
-        raise DefinitionError(
-            f"n_sections ({n_sections}) and periods ({periods}) must be at least 1."
-        )
     f_min, f_max = band
-    if not 0 <= f_min <= f_max <= n_sections / 2:
+    if not f_min <= f_max <= n_sections / 2:
         raise DefinitionError(
             f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}] cycles per "
             "period."
@@ -223,15 +227,16 @@ def _orthogonal(division, j, phase):
     return experiment.ravel(), line.ravel(), channel.ravel(), turned.ravel()
 
 
+@checked
 def paper_design(
-    n_sections: int = 32,
-    periods: int = 64,
-    band: tuple[Number, Number] = (0.0, 10.0),
-    amplitude: Number = 0.01,
-    seed: int = 0,
+    n_sections: SectionCount = 32,
+    periods: PeriodCount = 64,
+    band: Band = (0.0, 10.0),
+    amplitude: Positive = 0.01,
+    seed: Seed = 0,
     *,
     division: Literal["random", "sum-free"] = "sum-free",
-    experiments: int = 80,
+    experiments: ExperimentCount = 80,
 ) -> Design:
     """The design of Ankarali & Cowan, Sec. VI-C: 620 frequencies in 80 random subsets.
 
@@ -248,15 +253,16 @@ def paper_design(
     )  # fmt: skip
 
 
+@checked
 def single_cosine(
-    f: Number | Numbers,
-    n_sections: int = 32,
-    periods: int = 64,
-    amplitude: Number = 0.01,
-    phase: Number = 0.0,
+    f: Vector | Scalar,
+    n_sections: SectionCount = 32,
+    periods: PeriodCount = 64,
+    amplitude: Positive = 0.01,
+    phase: float = 0.0,
     *,
     half_integers: Literal["error", "two-phase"] = "error",
-    inputs: int | str | Sequence[str] = 1,
+    inputs: InputNames = 1,
 ) -> Design:
     """One cosine per experiment (Sec. V-A), at the frequency or each of the frequencies `f`.
 
@@ -267,10 +273,6 @@ def single_cosine(
     **Raises:** `DefinitionError` as `Design.check`.
     """
     names = input_names(inputs)
-    if half_integers not in ("error", "two-phase"):
-        raise DefinitionError(
-            f"half_integers must be 'error' or 'two-phase', not {half_integers!r}."
-        )
     lines = to_lines(np.atleast_1d(np.asarray(f, float)), periods)
     twice = needs_two_phases(lines, periods, n_sections) & (half_integers == "two-phase")
     repeats = np.where(twice, 2, 1)

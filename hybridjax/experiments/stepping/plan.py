@@ -4,7 +4,7 @@ A plan serves prediction, step lengths and error estimates, not control flow: la
 way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._core.boundary.scalars import Number
 from ..._core.compilation.compile import quick_jit
 from ..._core.memo import Memory
 from ..._core.results import Result
@@ -19,7 +20,6 @@ from ...engine.move import move
 from ...engine.search.stride import Stride
 from ...engine.settings import Settings
 from ...engine.watch import watch
-from ...errors import DefinitionError
 from ...maps.place import PATIENCE
 from ...maps.placed import PlacedSections
 
@@ -59,9 +59,10 @@ _LEAST_LEAD, _LARGEST_LEAD = 0.3, 3.0
 # Errors per section that are taken for granted, relative to the states' scales: a few units in the
 # last place. Twice as much changes nothing above accuracies of 1e-13.
 _ROUNDING = 1e-15
-# Accuracies, relative to the states' scales, that a plan can be made for. Below the least, rounding
-# is larger; beyond the largest, the cycle tells little about lanes beside it.
-_LEAST_ACCURACY, _LARGEST_ACCURACY = 1e-13, 1e-2
+
+Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=1e-13, high=1e-2)]
+"""Relative to the states' scales, that a plan can be made for. Below the least, rounding is larger;
+beyond the largest, the cycle tells little about lanes beside it."""
 
 
 class Plan(eqx.Module):
@@ -242,21 +243,8 @@ class Stepping(eqx.Module):
 _made = Memory()
 
 
-def check_accuracy(accuracy: float) -> None:
-    """**Raises:** `DefinitionError` for an accuracy that no plan has."""
-    if not _LEAST_ACCURACY <= accuracy <= _LARGEST_ACCURACY:
-        raise DefinitionError(
-            f"accuracy lies between {_LEAST_ACCURACY} and {_LARGEST_ACCURACY}, not at {accuracy}."
-        )
-
-
 def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
-    """The plan for placed sections; made once for each accuracy.
-
-    **Raises:** `DefinitionError` for an accuracy out of range.
-    """
-    check_accuracy(accuracy)
-    accuracy = float(accuracy)
+    """The plan for placed sections; made once for each accuracy."""
 
     def make() -> Stepping:
         cycle = placed.cycle

@@ -17,7 +17,7 @@ from ...engine.search.stride import Stride
 from ...engine.settings import Settings
 from ...errors import DefinitionError
 from ...maps.placed import PlacedSections
-from .plan import Plan, Stepping, check_accuracy, plan_flow
+from .plan import Plan, Stepping, plan_flow
 
 
 # Lanes that leave each section. Twice as many measure for twice as long, and scatter less by a
@@ -49,20 +49,19 @@ def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
     **Raises:** `DefinitionError` for an accuracy that single precision cannot give here; otherwise
     as `plan_flow`.
     """
-    check_accuracy(accuracy)
     half = plan_flow(placed, accuracy / 2)
     # No step is made shorter because of what rounding leaves in its error estimate.
     noise = _ROUNDINGS_PER_STEP * float(jnp.finfo(jnp.float32).eps) / half.settings.rtol
     slack = jnp.maximum(half.plan.slack, noise)
     rough = dataclasses.replace(half, plan=dataclasses.replace(half.plan, slack=slack))
-    rounding = _known.recall(placed, float(accuracy), lambda: rounding_error(placed, rough))
+    rounding = _known.recall(placed, accuracy, lambda: rounding_error(placed, rough))
     if rounding > accuracy / 2:
         raise DefinitionError(
             f"single precision leaves errors of about {rounding:.1e} of the states' sizes in these "
             f"experiments, more than half the accuracy of {accuracy:.1e}: ask for less, e.g. "
             f"accuracy={3 * rounding:.1g}, or compute in double precision."
         )
-    return dataclasses.replace(rough, accuracy=float(accuracy), rounding=rounding)
+    return dataclasses.replace(rough, accuracy=accuracy, rounding=rounding)
 
 
 def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:

@@ -68,7 +68,7 @@ def realize(
       where the source is that long. Long ones average more noise.
     - `outputs`, `inputs`: names, for an array.
 
-    **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, NaN, or more
+    **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, or more
     dimensions than the horizon can show.
     """
     require_x64()

@@ -1,15 +1,14 @@
 """A branch of limit cycles along a parameter, and the points at which its stability changes."""
 
-import operator
-from typing import NamedTuple, SupportsIndex
+from typing import Literal, NamedTuple, SupportsIndex, get_args
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from ..._core.boundary.checked import checked_methods
 from ..._core.memo import remembered
 from ..._core.results import Result
-from ...errors import DefinitionError
 from ..cycle import LimitCycle
 from ..sweep.limit_cycles import LimitCycles
 
@@ -18,7 +17,8 @@ from ..sweep.limit_cycles import LimitCycles
 # rounding. Doubled, others that are all but critical are shown twice as often.
 _ON_CIRCLE = 1e-6
 
-KINDS = ("fold", "branch point", "flip", "Neimark-Sacker")
+Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
+KINDS = get_args(Kind)
 
 
 class BranchPoint(NamedTuple):
@@ -45,6 +45,7 @@ class BranchEnd(NamedTuple):
     message: str
 
 
+@checked_methods
 class Branch(eqx.Module):
     """Limit cycles along one parameter, in the order in which the branch meets them.
 
@@ -66,15 +67,10 @@ class Branch(eqx.Module):
         return len(self.values)
 
     def __getitem__(self, k: SupportsIndex) -> LimitCycle:
-        return self.cycles[operator.index(k)]
+        return self.cycles[k]
 
-    def find(self, kind: str) -> tuple[BranchPoint, ...]:
-        """The points of a kind: "fold", "branch point", "flip" or "Neimark-Sacker".
-
-        **Raises:** `DefinitionError` for another kind.
-        """
-        if kind not in KINDS:
-            raise DefinitionError(f"there is no kind '{kind}' of points; kinds are {KINDS}.")
+    def find(self, kind: Kind) -> tuple[BranchPoint, ...]:
+        """The points of a kind: "fold", "branch point", "flip" or "Neimark-Sacker"."""
         return tuple(p for p in self.points if p.kind == kind)
 
     @remembered

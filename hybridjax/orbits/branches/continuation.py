@@ -4,15 +4,16 @@ H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problem
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax.typing import ArrayLike
 from scipy.optimize import brentq
 
+from ..._core.boundary.arrays import Reals
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Numbers, Share
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.tracing import is_traced
@@ -40,13 +41,14 @@ _FIRST = 0.2
 _SHORTEST = 1e-5
 
 
+@checked
 def continuation(
     cycle: LimitCycle,
     parameter: str,
-    values: Sequence[ArrayLike] | ArrayLike,
+    values: Annotated[Numbers, Reals("n")],
     *,
-    step: float = 0.05,
-    max_points: int = 1000,
+    step: Share = 0.05,
+    max_points: Count = 1000,
 ) -> Branch:
     """Follow a limit cycle along a parameter, and mark where its stability changes.
 
@@ -76,7 +78,7 @@ def continuation(
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of them.
     """
-    values = _check(cycle, values, step)
+    values = _check(cycle, values)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
     own = curve.value_of(cycle.system)
     low, high = values.min(), values.max()
@@ -109,11 +111,7 @@ def continuation(
     return Branch(parameter, np.array([p.value for p in points]), cycles, marked, (begin, end))
 
 
-def _check(cycle, values, step) -> np.ndarray:
-    if not isinstance(cycle, LimitCycle):
-        raise DefinitionError(
-            f"expected a LimitCycle, got {type(cycle).__name__}: use find_limit_cycle first."
-        )
+def _check(cycle, values) -> np.ndarray:
     if is_traced(cycle):
         raise DefinitionError(
             "a branch is followed where values are known: call `continuation` outside of "
@@ -124,15 +122,12 @@ def _check(cycle, values, step) -> np.ndarray:
         raise DefinitionError(
             f"the cycle to follow was not found: {Result(int(cycle.result)).message}."
         )
-    values = np.asarray(values, float)
-    steps = np.diff(values) if values.ndim == 1 else np.zeros(0)
-    if not len(steps) or not np.all(np.isfinite(values)) or abs(np.sign(steps).sum()) < len(steps):
+    steps = np.diff(np.asarray(values))
+    if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
         raise DefinitionError(
-            f"the values must be two or more finite numbers, ascending or descending; got {values}."
+            f"the values must be two or more numbers, ascending or descending; got {values}."
         )
-    if not 0 < step <= 1:
-        raise DefinitionError(f"the longest step must lie between 0 and 1; it is {step}.")
-    return values
+    return np.asarray(values)
 
 
 class _Event(NamedTuple):

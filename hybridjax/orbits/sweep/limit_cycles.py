@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import SupportsIndex
 
 import equinox as eqx
 import jax
@@ -9,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from ..._core.boundary.checked import checked, checked_methods
+from ..._core.boundary.kinds import Index, Positive
 from ..._core.execution import Execution
 from ..._core.memo import remembered
 from ..._core.precision import require_x64
@@ -32,6 +35,7 @@ _SMALL = 2000
 _BATCH = 250
 
 
+@checked_methods
 class LimitCycles(eqx.Module):
     """Limit cycles of S systems; `cycles[i]` is one of them.
 
@@ -61,7 +65,7 @@ class LimitCycles(eqx.Module):
     def __len__(self) -> int:
         return len(self.result)
 
-    def __getitem__(self, i: int) -> LimitCycle:
+    def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
         pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
@@ -102,7 +106,7 @@ class LimitCycles(eqx.Module):
         values[~self.ok] = np.nan
         return values
 
-    def summary(self, limit: int = 5) -> str:
+    def summary(self, limit: Index = 5) -> str:
         """`10000/10000 found`, or why the first `limit` of the others were not."""
         text = [f"{self.ok.sum()}/{len(self)} found"]
         text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
@@ -114,11 +118,12 @@ class LimitCycles(eqx.Module):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
 
 
+@checked
 def find_limit_cycles(
     systems: HybridSystem | Sequence[HybridSystem],
     guess: LimitCycle,
     *,
-    scale: Mapping[str, float] | None = None,
+    scale: Mapping[str, Positive] | None = None,
     settings: Settings | None = None,
     execution: Execution | None = None,
 ) -> LimitCycles:
@@ -153,11 +158,6 @@ def find_limit_cycles(
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
     settings = Settings(rtol=SWEEP, atol=SWEEP) if settings is None else settings
-    if not isinstance(guess, LimitCycle):
-        raise DefinitionError(
-            f"the guess is a LimitCycle of a similar system, not {type(guess).__name__}: use "
-            "find_limit_cycle first."
-        )
     s = Structure(guess.system)
     known = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
@@ -182,9 +182,8 @@ def _stacked(systems) -> HybridSystem:
                 "make it by equinox.filter_vmap, or pass a list of systems."
             )
         return systems
-    systems = list(systems)
     kinds = {jax.tree_util.tree_structure(eqx.filter(x, eqx.is_array)) for x in systems}
-    if len(kinds) != 1 or not all(isinstance(x, HybridSystem) for x in systems):
+    if len(kinds) != 1:
         raise DefinitionError("`systems` must be at least one system, all of the same class.")
     arrays = [eqx.filter(x, eqx.is_array) for x in systems]
     stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
