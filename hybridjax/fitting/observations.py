@@ -1,7 +1,6 @@
 """What a system is fitted to: each kind of data turns a limit cycle into weighted residuals."""
 
 import abc
-from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import equinox as eqx
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PositiveScalar
+from .._core.boundary.kinds import PositiveScalar, SignalNames
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -236,7 +235,7 @@ class ObservedCycle(AbstractObservation):
     def __init__(
         self,
         sections: FamilyLike,
-        outputs: Sequence[str] | str = (),
+        outputs: SignalNames = (),
         values: Annotated[Numbers, Reals("N ny")] | None = None,
         *,
         times: Annotated[Numbers, Reals("N")] | None = None,
@@ -278,7 +277,7 @@ class ObservedCycle(AbstractObservation):
 
     @classmethod
     def of(
-        cls, cycle: LimitCycle, sections: FamilyLike, outputs: Sequence[str] | str = ()
+        cls, cycle: LimitCycle, sections: FamilyLike, outputs: SignalNames = ()
     ) -> "ObservedCycle":
         """All that can be seen of a known cycle: what an error-free measurement would give.
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
+from .._core.boundary.kinds import Positive, SignalNames
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
 from ..identify.rational.fit import RationalFit
@@ -44,6 +44,8 @@ def magnitude(
     """
     if not htfs:
         raise DefinitionError("`htfs` holds no HTF to draw.")
+    if not harmonics:
+        raise DefinitionError("`harmonics` must hold one harmonic or more.")
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
@@ -104,7 +106,7 @@ def bode(
     *htfs: HTF,
     fits: Fit | Sequence[Fit] = (),
     harmonic: int = 0,
-    outputs: Sequence[str] | str | None = None,
+    outputs: SignalNames | None = None,
     input: str | int = 0,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
@@ -124,6 +126,8 @@ def bode(
     """
     if not htfs:
         raise DefinitionError("`htfs` holds no HTF to draw.")
+    if outputs == ():
+        raise DefinitionError("`outputs` must name one output or more.")
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
@@ -134,7 +138,7 @@ def bode(
 
 def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
     upper, lower = axes
-    names = htfs[0].outputs if outputs is None else np.atleast_1d(outputs)
+    names = htfs[0].outputs if outputs is None else outputs
     for number, name in enumerate(names):
         color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
         for htf in sorted(htfs, key=_estimates_last):

@@ -12,8 +12,8 @@ import warnings
 
 import equinox as eqx
 import matplotlib
-from matplotlib import pyplot
 import numpy as np
+from matplotlib import pyplot
 
 import hybridjax as hj
 
@@ -47,7 +47,7 @@ def attempt(function, good: dict, name: str, value) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             if isinstance(value, Traced):
-                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good[name]))
+                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good.get(name, 1)))
             else:
                 call(value)
     except Hang:
@@ -67,8 +67,8 @@ def traceable(value):
 
 
 def told(error: hj.HybridJaxError, name: str, value) -> str:
-    """What is wrong with a refusal: it is text on one line, which names the argument or shows the
-    value, and is raised by this package."""
+    """What is wrong with a refusal: it is text on one line, which names the argument or what is
+    wrong in it (tracing concerns the whole call), and is raised by this package."""
     text, last = str(error), error.__traceback__
     while last.tb_next is not None:
         last = last.tb_next
@@ -76,8 +76,12 @@ def told(error: hj.HybridJaxError, name: str, value) -> str:
         return f"FRAME: {last.tb_frame.f_code.co_filename}"
     if "\n" in text or not text.endswith(".") or len(text) > 400:
         return f"TEXT: {text}"
-    named = re.search(rf"[`'\"]{re.escape(name)}\b", text) or repr(value) in text
-    return "" if named else f"UNNAMED {name}: {text}"
+    parts = value if isinstance(value, tuple | list | dict) else [value]
+    words = [name, *(part for part in parts if isinstance(part, str))]
+    if isinstance(value, Traced) and "JAX" in text:
+        return ""
+    named = any(re.search(rf"\b{re.escape(word)}\b", text) for word in words if word)
+    return "" if named or repr(value) in text else f"UNNAMED {name}: {text}"
 
 
 def rows(things: Things, only: list[str]):
