@@ -85,7 +85,7 @@ def estimates(t):
         "htf": htf, "harmonic": INTEGER, "output": OUTPUT, "input": INPUT, "poles": FEW,
         "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD, "max_steps": COUNT,
     }  # fmt: skip
-    yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2], empty=True)), {
+    yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True),
     }  # fmt: skip
     yield "RationalFit.compare", t.rational.compare, dict(true=[0.5]), {
@@ -101,7 +101,7 @@ def estimates(t):
         "htf": htf, "order": order, "harmonics": HARMONICS, "overhang": optional([*WHOLE, 10**6]),
         "errors": WORD, "check": FLAG, "max_steps": COUNT,
     }  # fmt: skip
-    yield "StructuredFit.htf", t.structured.htf, dict(f=np.array([0.1, 0.2], empty=True)), {
+    yield "StructuredFit.htf", t.structured.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     true = np.asarray(t.model.multipliers)
@@ -139,7 +139,7 @@ def series(t):
     yield "SeriesFit.impulse_response", t.fit.impulse_response, dict(n_lags=3), {
         "n_lags": LIMITED,
     }  # fmt: skip
-    yield "SeriesFit.htf", t.fit.htf, dict(f=np.array([0.1, 0.2], empty=True)), {
+    yield "SeriesFit.htf", t.fit.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "validate", hj.validate, dict(model=t.fit, data=t.record), {

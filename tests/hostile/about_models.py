@@ -62,7 +62,7 @@ def systems(t):
     def flow(time, q, u):
         return q[0]
 
-    yield "Guess", hj.Guess, dict(chart="flow", state=(1.0, 0.0), time=0.0), {
+    yield "Guess", hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0), {
         "chart": NEW_NAME, "state": array([1.0, 0.0], free=True), "time": FINITE,
     }  # fmt: skip
     yield "Output", hj.Output, dict(name="z", function=flow), {
@@ -94,7 +94,7 @@ def systems(t):
         "max_steps": LIMITED, "scale": ["x", 1.0, [1.0], [[NAN]], [[-1.0]], [[1j]], Other()],
     }  # fmt: skip
     yield "simulate", hj.simulate, dict(
-        system=t.system, chart="flow", state=(1.0, 0.0), duration=0.1, time=0.0
+        system=t.system, chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0
     ), {
         "system": instance(t.design), "chart": NAME, "state": array([1.0, 0.0]),
         "duration": POSITIVE, "time": FINITE, "input": ["f", [1.0, 2.0, 3.0], [NAN], [1j], Other()],
@@ -108,7 +108,7 @@ def systems(t):
 def sections(t):
     yield "Crossing", hj.Crossing, dict(function="y", direction="falling", value=0.0), {
         "function": CALLABLE[:2] + CALLABLE[3:], "direction": WORD, "value": FINITE,
-        "charts": ["flow", 3, (3,), (), ("flow", "flow"), Other()],
+        "charts": ["plane", 3, (3,), (), ("plane", "plane"), Other()],
     }  # fmt: skip
     yield "AtEvent", hj.AtEvent, dict(name="hit"), {"name": NEW_NAME}
     yield "ClockPhase", hj.ClockPhase, dict(n_sections=8, anchor=0.0), {
