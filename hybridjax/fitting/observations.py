@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PositiveScalar, SignalNames
+from .._core.boundary.containers import Names
+from .._core.boundary.kinds import PositiveScalar
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -30,6 +31,7 @@ from ..sections.section_list import FamilyLike, as_family
 from ..systems.structure import Structure
 
 
+AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
 Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 
 
@@ -235,7 +237,7 @@ class ObservedCycle(AbstractObservation):
     def __init__(
         self,
         sections: FamilyLike,
-        outputs: SignalNames = (),
+        outputs: AnyNames = (),
         values: Annotated[Numbers, Reals("N ny")] | None = None,
         *,
         times: Annotated[Numbers, Reals("N")] | None = None,
@@ -276,9 +278,7 @@ class ObservedCycle(AbstractObservation):
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
-    def of(
-        cls, cycle: LimitCycle, sections: FamilyLike, outputs: SignalNames = ()
-    ) -> "ObservedCycle":
+    def of(cls, cycle: LimitCycle, sections: FamilyLike, outputs: AnyNames = ()) -> "ObservedCycle":
         """All that can be seen of a known cycle: what an error-free measurement would give.
 
         **Raises:** as `place_sections`; `DefinitionError` for an output that is zero throughout.

@@ -126,8 +126,6 @@ def bode(
     """
     if not htfs:
         raise DefinitionError("`htfs` holds no HTF to draw.")
-    if outputs == ():
-        raise DefinitionError("`outputs` must name one output or more.")
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)

@@ -70,9 +70,6 @@ def section_data(
     **Raises:** `DefinitionError` for names that are not there, constant signals, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
-    for name, signals in (("inputs", inputs), ("outputs", outputs)):
-        if not signals:
-            raise DefinitionError(f"`{name}` must name one signal or more.")
     _refuse_constant(recording, inputs, outputs)
     if drift is not None:
         check_drift(drift)

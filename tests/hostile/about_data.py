@@ -64,19 +64,19 @@ def estimates(t):
     yield (
         "estimate_coherence",
         hj.identify.estimate_coherence,
-        dict(data=t.data, harmonics=0, repeats=2),
+        dict(data=t.repeated, harmonics=0, repeats=2),
         {"data": alone, "harmonics": HARMONICS} | shared,
     )
-    yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.data), {
+    yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
-    yield "output_levels", hj.identify.output_levels, dict(data=t.data), {
+    yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
         "data": instance(t.design), "repeats": FEW,
     }  # fmt: skip
     yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
         "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
     }  # fmt: skip
-    yield "remove_transient", hj.identify.remove_transient, dict(data=t.data, order=2, skip=1), {
+    yield "remove_transient", hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1), {
         "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
         "multipliers": ["x", 3, [NAN], [[0.5]], [], [2.0], Other()],
     }  # fmt: skip

@@ -102,7 +102,6 @@ def systems(t):
     }  # fmt: skip
     yield "Trajectory", t.trajectory, {}, {"per_step": LIMITED}
     yield "Trajectory.dense", t.trajectory.dense, {}, {"per_step": LIMITED}
-    yield "Structure", hj.sections.Structure, dict(system=t.system), {"system": instance(PHASE)}
 
 
 def sections(t):
@@ -149,7 +148,7 @@ def cycles(t):
         "throw": FLAG,
     }  # fmt: skip
     yield "LimitCycle.trajectory", t.cycle.trajectory, {}, {"periods": POSITIVE}
-    yield "find_limit_cycles", hj.find_limit_cycles, dict(systems=t.system, guess=t.cycle), {
+    yield "find_limit_cycles", hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle), {
         "systems": [*instance(PHASE), [], [3], [t.system, PHASE]], "guess": instance(t.system),
         "scale": SIZES, "settings": ["fast", 1e-9, PHASE], "execution": EXECUTION,
     }  # fmt: skip
@@ -181,21 +180,21 @@ def linear(t):
     }  # fmt: skip
     u = np.ones((12, 2))
     start = ["x", np.zeros(9), [NAN] * 3, [1j] * 3, Other()]
-    first = [*INTEGER, HUGE]
+    first = INTEGER
     for name in ("states", "simulate"):
         yield f"LDTP.{name}", getattr(t.model, name), dict(u=u), {
             "u": array(u), "x0": start, "first_section": first,
         }  # fmt: skip
     for name in ("periodic_state", "periodic_states"):
-        yield f"LDTP.{name}", getattr(t.model, name), dict(u=u, periods=2), {
-            "u": array(u), "periods": LIMITED,
+        yield f"LDTP.{name}", getattr(t.model, name), dict(u=u[None], periods=2), {
+            "u": array(u[None]), "periods": LIMITED,
         }  # fmt: skip
     yield "LDTP.impulse_response", t.model.impulse_response, dict(n_lags=3), {"n_lags": LIMITED}
     yield "LDTP.htf", t.model.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "LDTP.monodromy", t.model.monodromy, {}, {"section": first}
-    yield "LDTP.rank", t.model.rank, {}, {"section": first, "rtol": SHARE}
+    yield "LDTP.rank", t.model.rank, {}, {"section": first, "rtol": NONNEGATIVE}
     f, H = np.asarray(t.estimate.f), np.asarray(t.estimate.H)
     size = np.ones(H.shape)
     yield "HTF", hj.HTF, dict(
@@ -336,8 +335,8 @@ def experiments(t):
     yield "ExperimentData.summary", t.data.summary, {}, {"limit": WHOLE}
     one = t.record
     yield "Record", hj.Record, dict(u=one.u, y=one.y, n_sections=6), {
-        "u": array(one.u), "y": array(one.y, missing=True), "n_sections": LIMITED,
+        "u": array(one.u, missing=True), "y": array(one.y, missing=True), "n_sections": LIMITED,
         "first_section": [*INTEGER, HUGE], "inputs": NEW_NAMES, "outputs": NEW_NAMES,
-        "lead": WHOLE, "drift": optional(POSITIVE),
+        "lead": WHOLE, "drift": ["x", 1j, NAN, 0.0, -1.0, True],
     }  # fmt: skip
     yield "Record.part", one.part, dict(first=0, stop=12), {"first": INTEGER, "stop": INTEGER}
