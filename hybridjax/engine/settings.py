@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.converters import positive, sizes
 from .._core.boundary.kinds import StepCount
-from .._core.precision import at_precision
+from .._core.precision import at_precision, real
 from .._core.text import fields
 from ..errors import DefinitionError
 from .solver.step import Step
@@ -53,13 +52,13 @@ class Settings(eqx.Module):
     `rtol * |q[k]| + atol * scale[a, k]`.
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=positive, default=SIMULATION)
+    rtol: Float[Array, ""]
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""] = eqx.field(converter=positive, default=SIMULATION)
+    atol: Float[Array, ""]
     """Error of a step relative to each state's `scale`."""
-    max_steps: StepCount = eqx.field(static=True, default=256)
+    max_steps: int = eqx.field(static=True)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
-    scale: Float[Array, "A d"] | None = eqx.field(converter=sizes, default=None)
+    scale: Float[Array, "A d"] | None
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""
@@ -68,6 +67,17 @@ class Settings(eqx.Module):
         return fields(self)
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
+
+    def __init__(
+        self,
+        rtol: PositiveScalar = SIMULATION,
+        atol: PositiveScalar = SIMULATION,
+        max_steps: StepCount = 256,
+        scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
+    ):
+        self.rtol, self.atol = real(rtol), real(atol)
+        self.max_steps = max_steps
+        self.scale = None if scale is None else real(scale)
 
     def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
         """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`

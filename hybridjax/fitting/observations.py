@@ -1,7 +1,6 @@
 """What a system is fitted to: each kind of data turns a limit cycle into weighted residuals."""
 
 import abc
-from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import equinox as eqx
@@ -13,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
+from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
 from .._core.text import fields, listed, value
 from ..engine.settings import Settings
@@ -32,6 +32,7 @@ from ..sections.section_list import FamilyLike, as_family
 from ..systems.structure import Structure
 
 
+AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
 Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 
 
@@ -250,7 +251,7 @@ class ObservedCycle(AbstractObservation):
     def __init__(
         self,
         sections: FamilyLike,
-        outputs: Sequence[str] | str = (),
+        outputs: AnyNames = (),
         values: Annotated[Numbers, Reals("N ny")] | None = None,
         *,
         times: Annotated[Numbers, Reals("N")] | None = None,
@@ -291,9 +292,7 @@ class ObservedCycle(AbstractObservation):
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
-    def of(
-        cls, cycle: LimitCycle, sections: FamilyLike, outputs: Sequence[str] | str = ()
-    ) -> "ObservedCycle":
+    def of(cls, cycle: LimitCycle, sections: FamilyLike, outputs: AnyNames = ()) -> "ObservedCycle":
         """All that can be seen of a known cycle: what an error-free measurement would give.
 
         **Raises:** as `place_sections`; `DefinitionError` for an output that is zero throughout.

@@ -73,7 +73,7 @@ class SectionMap(eqx.Module):
         q = jnp.asarray(q, float)
         if q.shape != self.fixed_point.shape:
             raise DefinitionError(
-                f"the map starts on {self.placed.family.describe(self.i)}, where the state has "
+                f"`q` must be a state where the map starts: on {self.placed.family.describe(self.i)}, where the state has "
                 f"shape {self.fixed_point.shape}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
+from .._core.boundary.kinds import Positive, SignalNames
 from .._core.signal import ratio, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
@@ -45,6 +45,8 @@ def magnitude(
     """
     if not htfs:
         raise DefinitionError("`htfs` holds no HTF to draw.")
+    if not harmonics:
+        raise DefinitionError("`harmonics` must hold one harmonic or more.")
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
@@ -106,7 +108,7 @@ def bode(
     *htfs: HTF,
     fits: Fit | Sequence[Fit] = (),
     harmonic: int = 0,
-    outputs: Sequence[str] | str | None = None,
+    outputs: SignalNames | None = None,
     input: str | int = 0,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
@@ -137,7 +139,7 @@ def bode(
 def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
     upper, lower = axes
     first = htfs[0]
-    names = first.outputs if outputs is None else np.atleast_1d(outputs)
+    names = first.outputs if outputs is None else outputs
     pushed = first.inputs[_index(first.inputs, input)]
     units = [ratio(first.outputs[_index(first.outputs, name)], pushed) for name in names]
     same = units[0] if len(set(units)) == 1 else ""  # else each curve says its own

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Complex
 
 from .._core.boundary.checked import checked
 from .._core.signal import Signal, ratio, unit_of, with_unit
+from ..errors import DefinitionError
+from ..identify.multipliers.compare import Multipliers
 from ..identify.series.series_fit import SeriesFit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
@@ -99,6 +100,8 @@ def impulse_responses(
     """Left: responses to a push against its phase and the time since. Right: some of them with
     bands of 95 %."""
     ny, N = len(found.outputs), len(found.phase)
+    if not 0 <= input < len(found.inputs):
+        raise DefinitionError(f"there is no `input` {input}; the inputs are {found.inputs}.")
     chosen = [0, N // 4, N // 2, 3 * N // 4]
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
@@ -132,7 +135,7 @@ def impulse_responses(
 
 @checked
 def multiplier_regions(
-    fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: AxesLike | None = None
+    fit: SeriesFit, plain: Multipliers | None = None, *, ax: AxesLike | None = None
 ) -> Plot:
     """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
     are small; beside them those of plain regression, if given."""

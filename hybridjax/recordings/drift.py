@@ -1,10 +1,13 @@
 """Slow changes of signals that are no response to the inputs."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 from .phase.winding import Phase
 from .recording import Recording, Trial
@@ -16,6 +19,10 @@ from .smoothing import FEWEST, gaps, inside, means, spline
 _LONGEST_GAP = 0.25
 # The least number of cycles that drift takes. Doubled: faster drift is refused.
 _FASTEST_DRIFT = 4
+
+
+DriftCycles = Annotated[float, Number("a positive number of cycles", above=0, infinite=True)]
+"""Slower than in so many cycles; infinite: a constant."""
 
 
 def check_drift(cycles: int | float) -> None:
@@ -37,7 +44,6 @@ def without_drift(
     **Raises:** `DefinitionError` for signals that are not there, fewer than four cycles, or a phase
     of other trials.
     """
-    signals = (signals,) if isinstance(signals, str) else signals
     columns = [recording.column(x) for x in signals]
     check_drift(cycles)
     if len(phase.stretches) != len(recording.trials):

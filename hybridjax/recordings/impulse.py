@@ -1,6 +1,6 @@
 """Phase-dependent impulse responses: what a brief push at each phase does, and for how long."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
+from .._core.boundary.scalars import Number
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit
@@ -57,11 +58,14 @@ class ImpulseResponses(eqx.Module):
         )
 
 
+ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
+
+
 @checked
 def impulse_responses(
     fit: SeriesFit,
     data: SectionData,
-    cycles: Positive = 3,
+    cycles: ResponseCycles = 3,
     *,
     width: Positive | None = None,
 ) -> ImpulseResponses:

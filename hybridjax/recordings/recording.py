@@ -1,21 +1,17 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
-from .smoothing import bridgeable, spline
+from .smoothing import Bandwidth, bridgeable, spline
 
-
-Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
-"""In Hz; infinite: all of it."""
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
 # nothing changes, this is rounding.
@@ -134,7 +130,12 @@ class Recording(eqx.Module):
 
         **Raises:** `DefinitionError` if there is no such column, and as `Recording`.
         """
-        names = [str(key) for key in getattr(frame, "column_names", None) or frame.keys()]
+        columns = getattr(frame, "column_names", None)
+        if columns is None and not hasattr(frame, "keys"):
+            raise DefinitionError(
+                f"`frame` must be a table with named columns, not a {type(frame).__name__}."
+            )
+        names = [str(key) for key in (frame.keys() if columns is None else columns)]
         if time not in names:
             raise DefinitionError(
                 f"trial '{name}' has no column '{time}'; its columns are {', '.join(names)}."
@@ -150,7 +151,7 @@ class Recording(eqx.Module):
         """
         recordings = list(recordings)
         if not recordings:
-            raise DefinitionError("there is no recording to join.")
+            raise DefinitionError("`recordings` holds no recording to join.")
         first, trials = recordings[0], []
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name

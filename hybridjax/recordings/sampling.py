@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive, SectionCount, SignalNames
+from .._core.boundary.kinds import SectionCount, SignalNames
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
-from .drift import check_drift
+from .drift import DriftCycles, check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
-from .smoothing import bridgeable, gaps, inside, means, nearest, spline
+from .smoothing import Bandwidth, bridgeable, gaps, inside, means, nearest, spline
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
@@ -37,11 +37,11 @@ def section_data(
     inputs: SignalNames,
     outputs: SignalNames,
     n_sections: SectionCount | None = None,
-    bandwidth: Positive | None = None,
+    bandwidth: Bandwidth | None = None,
     sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
-    drift: Positive | None = None,
-    max_gap: Positive | None = None,
+    drift: DriftCycles | None = None,
+    max_gap: Bandwidth | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
 
@@ -72,8 +72,6 @@ def section_data(
     **Raises:** `DefinitionError` for names that are not there, constant signals, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
-    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
-    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _refuse_constant(recording, inputs, outputs)
     if drift is not None:
         check_drift(drift)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.converters import number
 from .._core.boundary.kinds import Scalar, SectionCount
+from .._core.precision import real
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
 from .._core.text import fields
@@ -94,7 +94,7 @@ class AbstractSections(eqx.Module):
 
 def as_anchor(x: Crossing | Scalar) -> Crossing | Array:
     """A crossing as it is, a number as an array."""
-    return x if isinstance(x, Crossing) else number(x)
+    return x if isinstance(x, Crossing) else real(x)
 
 
 def check_anchor(anchor: Crossing | Array | None, s: Structure) -> None:

@@ -9,7 +9,8 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
-from .._core.boundary.converters import number, vector
+from .._core.boundary.kinds import Scalar, Vector
+from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
@@ -32,7 +33,7 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
-    return eqx.field(converter=number, metadata=metadata, **options)
+    return eqx.field(converter=_number, metadata=metadata, **options)
 
 
 def unit_of_parameter(system: Any, path: str) -> str:
@@ -43,13 +44,20 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+def _number(x: Scalar) -> Array:
+    return real(x)
+
+
 @checked
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=vector)
-    time: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    state: Float[Array, " n"]
+    time: Float[Array, ""]
+
+    def __init__(self, chart: str, state: Vector, time: Scalar = 0.0):
+        self.chart, self.state, self.time = chart, real(state), real(time)
 
     def __repr__(self):
         return fields(self)

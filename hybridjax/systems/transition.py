@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.converters import number, positive
+from .._core.precision import real
 from .._core.text import fields
 
 
@@ -18,8 +18,11 @@ Direction = Literal["falling", "rising"]
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
 
-    period: Float[Array, ""] = eqx.field(converter=positive)
-    offset: Float[Array, ""] = eqx.field(converter=number, default=0.0)
+    period: Float[Array, ""]
+    offset: Float[Array, ""]
+
+    def __init__(self, period: PositiveScalar, offset: Scalar = 0.0):
+        self.period, self.offset = real(period), real(offset)
 
     def __repr__(self):
         return fields(self)

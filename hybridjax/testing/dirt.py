@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Fraction, Index, NonNegative, Seed, SignalNames
+from ..errors import DefinitionError
 from ..recordings.recording import Recording, Trial
 
 
@@ -41,6 +42,10 @@ class Dirt:
     doubled_events: Index = 0
     stretch: float = 0.0
     seed: Seed = 0
+
+    def __post_init__(self):
+        if self.gap is not None and self.gap[0] >= self.gap[1]:
+            raise DefinitionError(f"`gap` must end after it starts, but is {self.gap}.")
 
 
 # How late a false event is, in median intervals. Doubled: it is still taken for a doubled one.

@@ -6,6 +6,7 @@ from scipy import signal
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NonNegative, Positive, Seed
+from .._core.boundary.limits import PERIODS
 from ..errors import DefinitionError
 
 
@@ -38,6 +39,11 @@ def random_force(
         raise DefinitionError(
             f"`bandwidth` must be less than half of the {rate:g} samples per second, but is "
             f"{bandwidth:g}."
+        )
+    if duration * rate * inputs > PERIODS:
+        raise DefinitionError(
+            f"`duration` times `rate` is {duration * rate * inputs:.3g} samples of all inputs, "
+            f"more than {PERIODS}."
         )
     n = round(duration * rate)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")

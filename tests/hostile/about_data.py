@@ -41,7 +41,7 @@ from .values import (
 FEW = [*COUNT, 10**6]
 
 INPUT = [None, *OUTPUT]
-TRUE = ["x", None, [], [NAN], [INF], [[0.5]], Other(), {}]
+TRUE = ["x", None, [NAN], [INF], Other(), {}]
 SIGNAL = [None, 3, (), "nope", ("nope",), (3,), ("x", "x"), Other()]
 
 
@@ -64,35 +64,35 @@ def estimates(t):
     yield (
         "estimate_coherence",
         hj.identify.estimate_coherence,
-        dict(data=t.data, harmonics=0, repeats=2),
+        dict(data=t.repeated, harmonics=0, repeats=2),
         {"data": alone, "harmonics": HARMONICS} | shared,
     )
-    yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.data), {
+    yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
-    yield "output_levels", hj.identify.output_levels, dict(data=t.data), {
+    yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
         "data": instance(t.design), "repeats": FEW,
     }  # fmt: skip
     yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
         "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
     }  # fmt: skip
-    yield "remove_transient", hj.identify.remove_transient, dict(data=t.data, order=2, skip=1), {
+    yield "remove_transient", hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1), {
         "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
         "multipliers": ["x", 3, [NAN], [[0.5]], [], [2.0], Other()],
     }  # fmt: skip
     htf = instance(t.model, t.data)
     yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
-        "htf": htf, "harmonic": [*INTEGER, 5], "output": OUTPUT, "input": INPUT, "poles": FEW,
+        "htf": htf, "harmonic": INTEGER, "output": OUTPUT, "input": INPUT, "poles": FEW,
         "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD, "max_steps": COUNT,
     }  # fmt: skip
     yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2])), {
-        "f": array([0.1, 0.2]),
+        "f": array([0.1, 0.2], empty=True),
     }  # fmt: skip
     yield "RationalFit.compare", t.rational.compare, dict(true=[0.5]), {
         "true": TRUE, "output": OUTPUT,
     }  # fmt: skip
     yield "fit_aaa", hj.identify.fit_aaa, dict(htf=t.estimate), {
-        "htf": htf, "harmonic": [*INTEGER, 5], "input": INPUT, "tolerance": POSITIVE,
+        "htf": htf, "harmonic": INTEGER, "input": INPUT, "tolerance": POSITIVE,
         "terms": COUNT,
     }  # fmt: skip
     yield "AAAFit.compare", t.aaa.compare, dict(true=[0.5]), {"true": TRUE, "output": OUTPUT}
@@ -102,7 +102,7 @@ def estimates(t):
         "errors": WORD, "check": FLAG, "max_steps": COUNT,
     }  # fmt: skip
     yield "StructuredFit.htf", t.structured.htf, dict(f=np.array([0.1, 0.2])), {
-        "f": array([0.1, 0.2]), "harmonics": HARMONICS,
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     true = np.asarray(t.model.multipliers)
     yield "MultiplierEstimate.distance", t.structured.distance, dict(true=true), {"true": TRUE}
@@ -140,7 +140,7 @@ def series(t):
         "n_lags": LIMITED,
     }  # fmt: skip
     yield "SeriesFit.htf", t.fit.htf, dict(f=np.array([0.1, 0.2])), {
-        "f": array([0.1, 0.2]), "harmonics": HARMONICS,
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "validate", hj.validate, dict(model=t.fit, data=t.record), {
         "model": [*instance(t.design), t.exact], "data": [*data, other], "start": WORD,
@@ -160,7 +160,8 @@ def series(t):
 def fitting(t):
     data = [*instance(t.design, t.model), [], [3], ["x"]]
     free = [None, 3, (), "nope", ("nope",), (3,), ("mu", "mu"), {}, {"mu": 3}, {"mu": (1.0, 0.5)},
-            {"mu": (NAN, 1.0)}, {"mu": ("0", "1")}, {"mu": (0.5, 1.0)}, {"mu": (0.0, 1j)}]  # fmt: skip
+            {"mu": (NAN, 1.0)}, {"mu": ("0", "1")}, {"mu": (0.5, 1.0)}, {"mu": (0.0, 1j)},
+            ]  # fmt: skip
     guess = ["flow", 3, (1.0, 0.0), PHASE, Other()]
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
@@ -298,10 +299,10 @@ def recordings(t):
     pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
     tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
     yield "PhaseTracker", hj.recordings.PhaseTracker, tracker, {
-        "center": pair, "scale": [*pair, (0.0, 1.0), (-1.0, 1.0)], "rate": POSITIVE,
+        "center": pair, "scale": [*pair, (0.0, 1.0), (-1.0, 1.0)], "rate": [*FINITE, 0.0],
         "anchor": FINITE, "bandwidth": optional(POSITIVE),
     }  # fmt: skip
-    update = lambda **given: hj.recordings.PhaseTracker(**tracker).update(**given)
+    update = hj.recordings.PhaseTracker(**tracker).update
     yield "PhaseTracker.update", update, dict(time=0.0, position=1.0, velocity=0.0), {
         "time": FINITE, "position": FINITE, "velocity": FINITE,
     }  # fmt: skip

@@ -59,8 +59,10 @@ def calls(t):
 
 
 def systems(t):
-    flow = lambda time, q, u: q[0]
-    yield "Guess", hj.Guess, dict(chart="flow", state=(1.0, 0.0), time=0.0), {
+    def flow(time, q, u):
+        return q[0]
+
+    yield "Guess", hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0), {
         "chart": NEW_NAME, "state": array([1.0, 0.0], free=True), "time": FINITE,
     }  # fmt: skip
     yield "Output", hj.Output, dict(name="z", function=flow), {
@@ -92,7 +94,7 @@ def systems(t):
         "max_steps": LIMITED, "scale": ["x", 1.0, [1.0], [[NAN]], [[-1.0]], [[1j]], Other()],
     }  # fmt: skip
     yield "simulate", hj.simulate, dict(
-        system=t.system, chart="flow", state=(1.0, 0.0), duration=0.1, time=0.0
+        system=t.system, chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0
     ), {
         "system": instance(t.design), "chart": NAME, "state": array([1.0, 0.0]),
         "duration": POSITIVE, "time": FINITE, "input": ["f", [1.0, 2.0, 3.0], [NAN], [1j], Other()],
@@ -100,13 +102,12 @@ def systems(t):
     }  # fmt: skip
     yield "Trajectory", t.trajectory, {}, {"per_step": LIMITED}
     yield "Trajectory.dense", t.trajectory.dense, {}, {"per_step": LIMITED}
-    yield "Structure", hj.sections.Structure, dict(system=t.system), {"system": instance(PHASE)}
 
 
 def sections(t):
     yield "Crossing", hj.Crossing, dict(function="y", direction="falling", value=0.0), {
         "function": CALLABLE[:2] + CALLABLE[3:], "direction": WORD, "value": FINITE,
-        "charts": ["flow", 3, (3,), (), ("flow", "flow"), Other()],
+        "charts": ["plane", 3, (3,), (), ("plane", "plane"), Other()],
     }  # fmt: skip
     yield "AtEvent", hj.AtEvent, dict(name="hit"), {"name": NEW_NAME}
     yield "ClockPhase", hj.ClockPhase, dict(n_sections=8, anchor=0.0), {
@@ -147,7 +148,7 @@ def cycles(t):
         "throw": FLAG,
     }  # fmt: skip
     yield "LimitCycle.trajectory", t.cycle.trajectory, {}, {"periods": POSITIVE}
-    yield "find_limit_cycles", hj.find_limit_cycles, dict(systems=t.system, guess=t.cycle), {
+    yield "find_limit_cycles", hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle), {
         "systems": [*instance(PHASE), [], [3], [t.system, PHASE]], "guess": instance(t.system),
         "scale": SIZES, "settings": ["fast", 1e-9, PHASE], "execution": EXECUTION,
     }  # fmt: skip
@@ -179,21 +180,21 @@ def linear(t):
     }  # fmt: skip
     u = np.ones((12, 2))
     start = ["x", np.zeros(9), [NAN] * 3, [1j] * 3, Other()]
-    first = [*INTEGER, HUGE]
+    first = INTEGER
     for name in ("states", "simulate"):
         yield f"LDTP.{name}", getattr(t.model, name), dict(u=u), {
             "u": array(u), "x0": start, "first_section": first,
         }  # fmt: skip
     for name in ("periodic_state", "periodic_states"):
-        yield f"LDTP.{name}", getattr(t.model, name), dict(u=u, periods=2), {
-            "u": array(u), "periods": LIMITED,
+        yield f"LDTP.{name}", getattr(t.model, name), dict(u=u[None], periods=2), {
+            "u": array(u[None]), "periods": LIMITED,
         }  # fmt: skip
     yield "LDTP.impulse_response", t.model.impulse_response, dict(n_lags=3), {"n_lags": LIMITED}
     yield "LDTP.htf", t.model.htf, dict(f=np.array([0.1, 0.2])), {
-        "f": array([0.1, 0.2]), "harmonics": HARMONICS,
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "LDTP.monodromy", t.model.monodromy, {}, {"section": first}
-    yield "LDTP.rank", t.model.rank, {}, {"section": first, "rtol": SHARE}
+    yield "LDTP.rank", t.model.rank, {}, {"section": first, "rtol": NONNEGATIVE}
     f, H = np.asarray(t.estimate.f), np.asarray(t.estimate.H)
     size = np.ones(H.shape)
     yield "HTF", hj.HTF, dict(
@@ -207,10 +208,10 @@ def linear(t):
         "variance_freedom": optional([*array(f), -f - 1]),
     }  # fmt: skip
     htf = t.estimate
-    yield "HTF.harmonic", htf.harmonic, dict(m=0), {"m": [*INTEGER, 5]}
+    yield "HTF.harmonic", htf.harmonic, dict(m=0), {"m": INTEGER}
     yield "HTF.select", htf.select, dict(harmonics=0), {"harmonics": [None, *HARMONICS, 5]}
-    yield "HTF.at", htf.at, dict(f=f[:2]), {"f": [*array(f[:2]), f[:2] + 0.01]}
-    yield "HTF.interpolate", htf.interpolate, dict(f=f[:2]), {"f": [*array(f[:2]), f[:2] + 9]}
+    yield "HTF.at", htf.at, dict(f=f[:2]), {"f": [*array(f[:2], empty=True), f[:2] + 0.01]}
+    yield "HTF.interpolate", htf.interpolate, dict(f=f[:2]), {"f": array(f[:2], empty=True)}
     yield "HTF.confidence_radius", htf.confidence_radius, {}, {"level": SHARE}
     yield "HTF.predict", htf.predict, dict(u=u), {"u": array(u)}
     for name in ("error", "harmonic_errors"):
@@ -334,8 +335,8 @@ def experiments(t):
     yield "ExperimentData.summary", t.data.summary, {}, {"limit": WHOLE}
     one = t.record
     yield "Record", hj.Record, dict(u=one.u, y=one.y, n_sections=6), {
-        "u": array(one.u), "y": array(one.y, missing=True), "n_sections": LIMITED,
+        "u": array(one.u, missing=True), "y": array(one.y, missing=True), "n_sections": LIMITED,
         "first_section": [*INTEGER, HUGE], "inputs": NEW_NAMES, "outputs": NEW_NAMES,
-        "lead": WHOLE, "drift": optional(POSITIVE),
+        "lead": WHOLE, "drift": ["x", 1j, NAN, 0.0, -1.0, True],
     }  # fmt: skip
     yield "Record.part", one.part, dict(first=0, stop=12), {"first": INTEGER, "stop": INTEGER}

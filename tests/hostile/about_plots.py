@@ -29,7 +29,7 @@ def calls(t):
     """Name, function, good arguments, hostile values of each argument."""
     plot, htf = hj.plot, instance(t.model, t.data)
     look = {"labels": LABELS, "ax": AXES}
-    one = lambda function: lambda htfs, **given: function(htfs, **given)
+    one = lambda function: lambda htfs, **given: function(htfs, **given)  # noqa: E731
     drawn = [None, *OUTPUT]
     fits = ["x", 3, [3], PHASE, Other()]
     yield "plot.bode", one(plot.bode), dict(htfs=t.estimate), {
@@ -61,7 +61,7 @@ def calls(t):
     yield "plot.experiment", plot.experiment, dict(data=t.data), {
         "data": instance(t.record), "index": [*INTEGER, 10**6],
     } | look  # fmt: skip
-    true = [None, "x", [NAN], [[0.5]], {}, Other(), PHASE, t.design]
+    true = [None, "x", [NAN], {}, Other(), PHASE, t.design]
     yield "plot.multipliers", plot.multipliers, dict(true=np.array([0.5])), {
         "true": true, "estimates": ["x", 3, {"a": "x"}, {3: [0.5]}, {"a": [NAN]}, Other()],
         "zoom": FLAG,
@@ -86,6 +86,5 @@ def calls(t):
         "sweep": instance(t.fit), "misfit": optional(POSITIVE),
     } | look  # fmt: skip
     yield "plot.save", plot.save, dict(path="figure", plot=t.plot), {
-        "path": [*PATH, "nope/figure"], "plot": instance(t.fit), "dpi": LIMITED,
+        "path": [*PATH, "nope/figure"], "plot": instance(t.fit)[:-1], "dpi": LIMITED,
     }  # fmt: skip
-    yield "Plot", plot.Plot, dict(axes=t.plot.axes), {"axes": [None, 3, "x", Other()]}

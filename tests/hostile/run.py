@@ -47,13 +47,13 @@ def attempt(function, good: dict, name: str, value) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             if isinstance(value, Traced):
-                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good[name]))
+                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good.get(name, 1)))
             else:
                 call(value)
     except Hang:
         return "HANG"
     except hj.HybridJaxError as error:
-        return f"REFUSED: {error}" if right else told(error, name, value)
+        return f"REFUSED: {error}" if right else told(error, good, name, value)
     except Exception as error:
         return f"FOREIGN: {type(error).__name__}: {error}"[:200]
     finally:
@@ -66,9 +66,10 @@ def traceable(value):
     return np.asarray(value) if isinstance(value, int | float | tuple | list) else value
 
 
-def told(error: hj.HybridJaxError, name: str, value) -> str:
-    """What is wrong with a refusal: it is text on one line, which names the argument or shows the
-    value, and is raised by this package."""
+def told(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
+    """What is wrong with a refusal: it is text on one line, which names the argument, another that
+    it does not go with, or what is wrong in it (tracing concerns the whole call), and is raised by
+    this package."""
     text, last = str(error), error.__traceback__
     while last.tb_next is not None:
         last = last.tb_next
@@ -76,8 +77,13 @@ def told(error: hj.HybridJaxError, name: str, value) -> str:
         return f"FRAME: {last.tb_frame.f_code.co_filename}"
     if "\n" in text or not text.endswith(".") or len(text) > 400:
         return f"TEXT: {text}"
-    named = re.search(rf"[`'\"]{re.escape(name)}\b", text) or repr(value) in text
-    return "" if named else f"UNNAMED {name}: {text}"
+    if isinstance(value, Traced) and re.search("JAX|jit", text):
+        return ""
+    quoted = re.findall(r"'(\w+)'", text)
+    named = re.search(rf"\b{re.escape(name.removesuffix('s'))}", text)
+    named = named or set(good) & set(re.findall(r"`(\w+)", text))
+    named = named or any(word in repr(value) for word in quoted)
+    return "" if named or repr(value) in text else f"UNNAMED {name}: {text}"
 
 
 def rows(things: Things, only: list[str]):

@@ -66,10 +66,11 @@ def instance(*wrong: Any) -> list:
     return [None, "thing", 3, NAN, np.zeros(3), Other(), hj.Execution(), *wrong, TRACED]
 
 
-def array(good: Any, *, missing: bool = False, free: bool = False) -> list:
+def array(good: Any, *, missing: bool = False, free: bool = False, empty: bool = False) -> list:
     """For an argument that takes real numbers in the shape of `good`.
 
-    `missing`: NaN is right, where a sample is missing. `free`: it takes other shapes, too.
+    `missing`: NaN is right, where a sample is missing. `empty`: nothing at all is right.
+    `free`: it takes other shapes, too.
     """
     good = np.asarray(good, float)
     spoiled = good.copy()
@@ -79,7 +80,8 @@ def array(good: Any, *, missing: bool = False, free: bool = False) -> list:
     ragged = [[1.0, 2.0], [3.0]]
     kind = [None, "abc", ["a", "b"], {}, Other(), ragged, infinite, good + 1j, good != 0, TRACED]
     kind += [] if missing else [spoiled]
-    return kind + ([] if free else [good[None, None], np.zeros(0)])
+    kind += [] if empty or free else [np.zeros(0)]
+    return kind if free else [*kind, good[None, None]]
 
 
 def label(value: Any) -> str:

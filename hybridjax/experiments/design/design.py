@@ -106,7 +106,9 @@ class Design(eqx.Module):
         """
         sizes = [np.size(f) for f in frequencies]
         if len(sizes) == 0 or min(sizes) == 0:
-            raise DefinitionError("every experiment of a design needs at least one frequency.")
+            raise DefinitionError(
+                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+            )
 
         def flat(name, values, dtype):
             if np.isscalar(values):
@@ -148,10 +150,18 @@ class Design(eqx.Module):
         """
         P, N = self.periods, self.n_sections
         check_window(N, P)
+        for name in ("line", "channel", "amplitude", "phase"):
+            if getattr(self, name).shape != self.experiment.shape:
+                raise DefinitionError(
+                    f"`{name}` must hold as many entries as `experiment`, "
+                    f"{len(self.experiment)}, not {len(getattr(self, name))}."
+                )
         found = np.unique(self.experiment)
         count = max(len(found), 1)
         if self.experiments != count or not np.array_equal(found, np.arange(count)):
-            raise DefinitionError("every experiment of a design needs at least one frequency.")
+            raise DefinitionError(
+                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+            )
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
         self._refuse(~good, "has an amplitude that is not a positive number")

@@ -131,7 +131,7 @@ def spectral_sums(data: Experiments, options: SumOptions) -> SpectralSums:
             total = new if total is None else _add(total, new)
             count, good = count + len(part.ok), good + int(part.ok.sum())
         if total is None:
-            raise DefinitionError("there are no experiments: what was given has no parts.")
+            raise DefinitionError("`data` holds no experiments.")
         summary = f"{good}/{count} ok"
     if len(total.line) == 0:
         raise DefinitionError("the inputs are zero in the window: there is nothing to estimate.")

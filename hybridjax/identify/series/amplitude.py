@@ -88,9 +88,15 @@ def amplitude_sweep(
     """
     free_start = start == "free"
     factors = np.sort(np.asarray(amplitudes))
+    if not len(factors):
+        raise DefinitionError("`amplitudes` must hold one amplitude or more.")
     misfit, rms, failed = [], [], []
     for a in factors:
         data = run(a * np.asarray(u))
+        if not isinstance(data, ExperimentData):
+            raise DefinitionError(
+                f"`run` must return ExperimentData, but returned a {type(data).__name__}."
+            )
         require_same_kind(model, data)
         failed.append(float((~data.ok).sum()))
         rms.append(np.sqrt(np.mean(data.u**2, axis=(0, 1))))

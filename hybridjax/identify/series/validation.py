@@ -162,11 +162,9 @@ def validate(
         most = min(N, int(fewest) // _SAMPLES_PER_LAG)
         enough = [_with_past(records, lag).min() >= _FEWEST_SAMPLES for lag in range(1, most + 1)]
         lags = max(int(sum(enough)), 1)
-    if lags < 1:
-        raise DefinitionError(f"lags must be at least 1, not {lags}.")
     if (_with_past(records, lags).max(axis=0) < _FEWEST_SAMPLES).any():
         raise DefinitionError(
-            f"the records are too short for {lags} lags: no section was sampled {_FEWEST_SAMPLES} "
+            f"`lags` is {lags}, and the records are too short for it: no section was sampled {_FEWEST_SAMPLES} "
             "times with so many samples before it in its record."
         )
     auto, white = _whiteness(records, e, N, lags)

@@ -1,12 +1,12 @@
 """From a definition of phase to the phase of a recording."""
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...sections.abstract import AbstractSections
 from ...sections.crossing import AtEvent, Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording, signal_of
+from ..smoothing import Bandwidth
 from .angle import AngleFunction, from_angles, function_angles, kinematic_angles
 from .crossings import from_crossings, from_events
 from .winding import Phase
@@ -21,7 +21,7 @@ def estimate_phase(
     recording: Recording,
     definition: PhaseDefinition,
     *,
-    bandwidth: Positive | None = None,
+    bandwidth: Bandwidth | None = None,
     causal: bool = False,
 ) -> Phase:
     """The phase of every trial.
