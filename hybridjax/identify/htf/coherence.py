@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.precision import require_x64
+from ..._core.text import fields
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.frequency_response import Harmonics
@@ -32,6 +33,9 @@ class Coherence(eqx.Module):
     total: Float[np.ndarray, " ny"]
     harmonics: tuple[int, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 def estimate_coherence(
