@@ -43,6 +43,7 @@ hj.enable_x64()  # before any model is built
 # %%
 class Flight(hj.Chart):
     states = ("y", "v")
+    units = ("m", "m/s")  # for figures and prints
     robot: "Robot"
 
     def field(self, t, q, u):
@@ -52,6 +53,7 @@ class Flight(hj.Chart):
 
 class Stance(hj.Chart):
     states = ("y", "v")
+    units = ("m", "m/s")
     robot: "Robot"
     thrust: jax.Array
 
@@ -71,6 +73,9 @@ class Stance(hj.Chart):
 # %%
 class Robot(hj.HybridSystem):
     """Mass on a leg that thrusts while it gets longer. Input `u`: a force on the mass."""
+
+    input_units = ("N",)
+    time_unit = "s"
 
     m: hj.Parameter = hj.parameter(1.0, unit="kg", doc="mass")
     g: hj.Parameter = hj.parameter(9.81, unit="m/s^2", doc="gravity")

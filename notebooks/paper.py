@@ -42,6 +42,7 @@ SECTIONS, EXPERIMENTS, PERIODS, DISCARD = 32, 80, 64, 20  # the paper's numbers
 # %%
 class Flight(hj.Chart):
     states = ("yM", "vM", "ym", "vm")
+    units = ("m", "m/s", "m", "m/s")
     hopper: "Hopper"
 
     def field(self, t, q, u):
@@ -53,6 +54,7 @@ class Flight(hj.Chart):
 
 class Stance(hj.Chart):
     states = ("yM", "vM")
+    units = ("m", "m/s")
     absent = {"ym": 0.0, "vm": 0.0}  # what they are when somebody asks for them here
     hopper: "Hopper"
 
@@ -63,6 +65,9 @@ class Stance(hj.Chart):
 
 
 class Hopper(hj.HybridSystem):
+    input_units = ("N",)
+    time_unit = "s"
+
     m: hj.Parameter = hj.parameter(1.0, unit="kg")
     M: hj.Parameter = hj.parameter(2.0, unit="kg")
     k: hj.Parameter = hj.parameter(10.0, unit="N/m")

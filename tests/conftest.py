@@ -1,3 +1,4 @@
+import inspect
 import pathlib
 
 import hypothesis
@@ -39,7 +40,7 @@ class no_compilation:
 
 def unchecked(function):
     """`function` without the check of types in these tests, which would be the first to refuse."""
-    return getattr(function, "__wrapped__", function)
+    return inspect.unwrap(function)
 
 
 @pytest.fixture(scope="session")

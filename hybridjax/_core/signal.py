@@ -50,9 +50,16 @@ def unit_of(name: str) -> str:
 def ratio(output: str, input: str) -> str:
     """The unit of an output per input, as in m/N; "" unless both are known."""
     units = unit_of(output), unit_of(input)
-    if not all(units):
-        return ""
-    return "/".join(f"({unit})" if set(unit) & set(" */") else unit for unit in units)
+    return "/".join(map(_factor, units)) if all(units) else ""
+
+
+def square(name: str) -> str:
+    """The unit of a signal's power, as in N²; "" where it is not known."""
+    return _factor(unit_of(name)) and f"{_factor(unit_of(name))}²"
+
+
+def _factor(unit: str) -> str:
+    return f"({unit})" if set(unit) & set(" */") else unit
 
 
 def with_unit(text: str, unit: str) -> str:

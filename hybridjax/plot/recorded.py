@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.signal import Signal, ratio, unit_of, with_unit
+from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import Multipliers
 from ..identify.series.series_fit import SeriesFit
@@ -71,8 +71,8 @@ def section_data(
             spread.set_ylabel(deviation)
             if i < len(data.inputs):
                 last.semilogy(f, np.maximum(power[:, i], 1e-12 * power[:, i].max()), color=CYCLE[1])
-                unit = unit_of(name) and f"({unit_of(name)})²"
-                last.set(xlabel="frequency (cycles/period)", ylabel=with_unit("power", unit))
+                label = with_unit("power", square(name))
+                last.set(xlabel="frequency (cycles/period)", ylabel=label)
             else:
                 most = int(np.argmax(std))
                 each = [

@@ -1,5 +1,6 @@
 """What the data cannot carry, in plain words."""
 
+import textwrap
 from collections.abc import Iterator
 from itertools import combinations
 
@@ -78,7 +79,8 @@ class Advice(eqx.Module):
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
-        return "\n".join(self.warnings) or "Nothing speaks against the fit."
+        lines = (textwrap.fill(text, 100, subsequent_indent="  ") for text in self.warnings)
+        return "\n".join(lines) or "Nothing speaks against the fit."
 
 
 @checked

@@ -34,6 +34,10 @@ class Trial(eqx.Module):
     events: dict[str, Float[np.ndarray, " _"]]
     name: str = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        n, k = self.values.shape
+        return f"Trial({self.name}: {n} samples of {k} signals, {len(self.events)} kinds of events)"
+
 
 @checked
 class Recording(eqx.Module):

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from .._core.lanes.per_lane import PerLane, by_lane, shared
-from .._core.signal import Signal, signals
+from .._core.signal import Signal, signals, unit_of
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
@@ -134,7 +134,11 @@ class Structure:
 
     def state_names(self) -> tuple[str, ...]:
         """All state names, in order of first appearance."""
-        return tuple(dict.fromkeys(n for a in range(len(self.charts)) for n in self.states(a)))
+        found: dict[str, Signal] = {}
+        for name in (name for a in range(len(self.charts)) for name in self.states(a)):
+            if not unit_of(found.get(name, "")):
+                found[name] = name
+        return tuple(found.values())
 
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""

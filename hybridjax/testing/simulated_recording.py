@@ -12,6 +12,7 @@ from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
 from .._core.boundary.limits import SECTIONS
+from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..experiments.response_function import ResponseFunction, response_function
@@ -66,14 +67,15 @@ def simulate_recording(
     u = u.reshape(S, -1, nu)
     response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
     y = np.asarray(_respond(response, jnp.asarray(u)))[:, ::steps]
-    names = tuple(x if isinstance(x, str) else x.name for x in response.outputs)
+    s = response.placed.structure()
+    names = s.inputs + s.resolve_outputs(response.outputs).names
+    units = dict(zip(names, map(unit_of, names), strict=True))
     time = np.arange(y.shape[1]) * period / K
     trials = []
-    for s in range(S):
-        good = slice(0, min(n, int(np.isfinite(y[s]).all(axis=1).sum())))
-        signals = dict(zip(cycle.system.inputs, force[s, good].T, strict=True))
-        signals |= dict(zip(names, y[s, good].T, strict=True))
-        trials.append(Recording(time[good], signals, name=f"trial {s}"))
+    for k in range(S):
+        good = slice(0, min(n, int(np.isfinite(y[k]).all(axis=1).sum())))
+        signals = dict(zip(names, [*force[k, good].T, *y[k, good].T], strict=True))
+        trials.append(Recording(time[good], signals, units=units, name=f"trial {k}"))
     return Recording.join(trials)
 
 

@@ -203,7 +203,7 @@ def test_interpolation_fills_the_gaps(hopper):
 def test_repr(exact, synthetic):
     assert repr(exact) == (
         "HTF(exact; harmonics -16 to 15; 620 frequencies 0.01562 to 9.984 cycles/period; "
-        "inputs (u); outputs (yM, vM); 32 sections)"
+        "32 sections: u -> yM, vM)"
     )
     assert "harmonics -3, 0;" in repr(synthetic.htf([0.1], (0, -3)))
     jax.jit(lambda htf: repr(htf) and 0)(exact)

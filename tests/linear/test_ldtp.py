@@ -122,7 +122,7 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
 
 def test_names_and_repr(synthetic, hopper):
     assert (synthetic.inputs, synthetic.outputs) == (("u0", "u1"), ("y0", "y1"))
-    assert repr(hopper) == "LDTP(32 sections, dimension 2 to 4, inputs (u), outputs (yM, vM))"
+    assert repr(hopper) == "LDTP(32 sections, dimension 2 to 4: u -> yM, vM)"
     jax.jit(lambda ldtp: repr(ldtp) and 0)(hopper)
     ldtp = hj.LDTP(np.zeros((2, 1, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)), outputs="height")
     assert (ldtp.inputs, ldtp.outputs) == (("u",), ("height",))

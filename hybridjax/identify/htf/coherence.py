@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Index, Probability
 from ..._core.precision import require_x64
+from ..._core.text import fields
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics
 from .least_squares import solve_lines
@@ -32,6 +33,9 @@ class Coherence(eqx.Module):
     total: Float[np.ndarray, " ny"]
     harmonics: tuple[int, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 @checked

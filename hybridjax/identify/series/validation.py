@@ -87,9 +87,11 @@ class Validation(eqx.Module):
                 f"{with_unit(name, unit_of(name)):>12}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}"
                 f"  {tests[0]:>11}  {tests[1]:>11}"
             )
-        time = "no sign of correlation in time" if self.white else "correlated in time"
-        cause = "no sign of the input" if self.independent else "dependent on the input"
-        rows.append(f"what is left: {time}, {cause} (level {self.level:g})")
+        verdict = {True: "no sign of it", False: "yes"}
+        rows.append(
+            f"correlated in time: {verdict[self.white]}; with the input: "
+            f"{verdict[self.independent]} (level {self.level:g})"
+        )
         if self.left_out:
             rows.append(f"records too short to be compared, left out: {self.left_out}")
         return "\n".join(rows)
