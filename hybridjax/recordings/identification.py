@@ -5,6 +5,7 @@ from typing import Literal
 
 import equinox as eqx
 
+from .._core.precision import require_x64
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
@@ -61,8 +62,10 @@ def identify_recording(
       taken out of the outputs, and of the signals that define the phase, before the phase is found;
       the fit allows for what is left.
 
-    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
+    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`;
+    `PrecisionError` in single precision.
     """
+    require_x64()
     definition = None if isinstance(phase, Phase) else phase
     found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:

@@ -220,6 +220,11 @@ def test_places_that_cannot_be_written(folder):
             pytest.fail("too late")
 
 
+def test_a_place_that_cannot_hold_compiled_programs():
+    with pytest.raises(hj.DefinitionError, match="set HYBRIDJAX_CACHE to another folder"):
+        hj.enable_compilation_cache("/dev/null/new")
+
+
 def test_a_folder_that_was_made_stays_where_something_is_in_it(tmp_path):
     with pytest.raises(ValueError):
         with made_folder(tmp_path / "a" / "b"):

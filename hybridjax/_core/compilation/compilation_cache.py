@@ -5,6 +5,8 @@ import pathlib
 
 import jax
 
+from ...errors import DefinitionError
+
 
 def enable_compilation_cache(folder: str | os.PathLike | None = None) -> pathlib.Path:
     """Keep compiled programs on disk, so that the next process starts faster.
@@ -13,12 +15,20 @@ def enable_compilation_cache(folder: str | os.PathLike | None = None) -> pathlib
     folder (`$XDG_CACHE_HOME` or `~/.cache`).
 
     **Returns:** the folder in use.
+
+    **Raises:** `DefinitionError` if it cannot be made.
     """
     if folder is None:
         base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
         folder = os.environ.get("HYBRIDJAX_CACHE") or pathlib.Path(base) / "hybridjax"
     folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DefinitionError(
+            f"cannot keep compiled programs in '{folder}' ({error.strerror}): set HYBRIDJAX_CACHE "
+            "to another folder."
+        ) from error
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     return folder
