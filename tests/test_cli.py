@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ def _python(*arguments):
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["reproduce", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["reproduce", "--help"], ["identify", "--help"]])
 def test_help_does_not_import_jax(arguments):
     code = (
         "import sys; from hybridjax.apps.cli import main\n"
@@ -33,7 +34,7 @@ def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
-        main(["reproduce", "--quick", "--out", str(out), "--param", "M=2.0"])
+        assert main(["reproduce", "--quick", "--out", str(out), "--param", "M=2.0"]) == 0
     return out
 
 
@@ -90,25 +91,143 @@ def test_reproduce_draws_its_figures(results):
         (["--param", "M=nan"], "parameter `M` of VerticalHopper is nan"),
         (["--experiments", "10"], "10 experiments are too few"),
         (["--keep", "84"], "leaves no cycle to discard"),
-        (["--out", "/dev/null/x"], "cannot be written"),
+        (["--out", "/dev/null/x"], "cannot write to '/dev/null/x'"),
+        (["--quick", "--keep", "36"], "leaves no cycle to discard"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, monkeypatch, arguments, message):
     monkeypatch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
     with pytest.raises(SystemExit) as error:
-        main(["reproduce", "--out", str(tmp_path), *arguments])
+        main(["reproduce", "--out", str(tmp_path / "new" / "er"), *arguments])
     assert message in str(error.value) and "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+WRONG = {
+    "reproduce": {
+        "": "required: --out",
+        "--out x --family all": "invalid choice: 'all'",
+        "--out x --param M": "'M' is not NAME=VALUE with a number",
+        "--out x --param M=1 --param M=2": "--param gives a parameter twice",
+        "--out x --cycles 0": "--cycles: 0 is not between 1 and",
+        "--out x --keep 1.5": "--keep: '1.5' is not a whole number",
+        "--out x --experiments 1000000000000": "--experiments: 1000000000000 is not between 1 and",
+        "--out x --seed -1": "--seed: -1 is negative",
+        "--out x --seed x": "--seed: 'x' is not a whole number",
+        "--out x --amplitude 0": "--amplitude: 0 is not a positive number",
+        "--out x --amplitude inf": "--amplitude: 'inf' is not a number",
+    },
+    "identify x.csv --out x --input u --outputs y": {
+        "": "one of the arguments --phase --crossing --event is required",
+        "--phase y,v --event e": "not allowed with argument --phase",
+        "--phase y": "--phase: it needs two entries with a comma in between, not 'y'",
+        "--phase y,y": "--phase: 'y,y' is not a list of different names",
+        "--event e --outputs y,,v": "--outputs: 'y,,v' is not a list of different names",
+        "--event e --input u,u": "--input: 'u,u' is not a list of different names",
+        "--event e --center 1,2": "--center and --scale are of the angle of --phase",
+        "--crossing y --scale 1,2": "--center and --scale are of the angle of --phase",
+        "--phase y,v --center 1": "--center: it needs two entries",
+        "--phase y,v --center 1,x": "--center: 'x' is not a number",
+        "--phase y,v --scale 1,-2": "--scale: '1,-2' holds a number that is not positive",
+        "--event e --bandwidth=-3": "--bandwidth: -3 is not a positive number",
+        "--event e --bandwidth nan": "--bandwidth: 'nan' is not a number",
+        "--event e --drift 0": "--drift: 0 is not a positive number",
+        "--event e --order 0": "--order: 0 is not between 1 and",
+        "--event e --sections 8.5": "--sections: '8.5' is not a whole number",
+        "--event e --timing now": "invalid choice: 'now'",
+        "--crossing y:up": "'y:up' is not a signal, a direction and a value",
+        "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
+        "--crossing :rising": "':rising' is not a signal, a direction and a value",
+    },
+    "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
+}
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--param", "M"], ["--cycles", "0"], ["--family", "all"], []]
+    ("command", "options", "message"),
+    [(command, *row) for command, rows in WRONG.items() for row in rows.items()],
 )
-def test_bad_syntax(capsys, arguments):
+def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message):
+    """Said before anything is imported, read or written, with the usage and exit status 2."""
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as error:
-        main(["reproduce", *arguments])
-    assert error.value.code == 2
-    assert "usage: hybridjax reproduce" in capsys.readouterr().err
+        main([*command.split(), *options.split()])
+    said = capsys.readouterr().err
+    assert error.value.code == 2 and said.startswith("usage: hybridjax")
+    assert message in said.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def protocols(monkeypatch):
+    """What `reproduce` would be asked for; it does nothing, and converges."""
+    asked = []
+
+    def reproduce(out, protocol):
+        asked.append(protocol)
+        return {"families": {"isochron": {"converged": protocol.seed == 0}}}
+
+    monkeypatch.setattr("hybridjax.apps.reproduce.reproduce", reproduce)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("options", "sizes"),
+    [
+        ("", (80, 84, 64)),
+        ("--quick", (20, 36, 16)),
+        ("--quick --experiments 25", (25, 36, 16)),
+        ("--keep 17 --cycles 40 --quick", (20, 40, 17)),
+        ("--keep 60", (80, 84, 60)),
+    ],
+)
+def test_explicit_sizes_win(protocols, options, sizes):
+    assert main(["reproduce", "--out", "x", *options.split()]) == 0
+    (asked,) = protocols
+    assert (asked.experiments, asked.cycles, asked.keep) == sizes
+
+
+def test_what_has_not_converged_is_said(protocols, capsys):
+    assert main(["reproduce", "--out", "x", "--seed", "1"]) == 1
+    assert "a fit did not converge" in capsys.readouterr().err
+
+
+def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
+    with pytest.raises(SystemExit) as error:
+        main(["reproduce", "--out", str(tmp_path / "new")])
+    assert error.value.code == 130 and capsys.readouterr().err == "hybridjax: interrupted.\n"
+    assert not list(tmp_path.iterdir())
+
+
+class _Interrupting:
+    """As a callback that is interrupted: Python says so and goes on."""
+
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def test_an_interruption_in_a_callback_is_not_lost(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        _Interrupting()
+        for _ in range(1000):
+            time.sleep(0.01)
+        pytest.fail("the interruption was lost")
+
+    monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
+    with pytest.raises(SystemExit) as error:
+        main(["reproduce", "--out", str(tmp_path / "new")])
+    assert error.value.code == 130 and capsys.readouterr().err == "hybridjax: interrupted.\n"
 
 
 def test_version():
-    assert hj.__version__ == "0.1.0"
+    code = (
+        "import sys; from hybridjax.apps.cli import main\n"
+        "try: main(['--version'])\n"
+        "finally: assert not {'jax', 'numpy'} & set(sys.modules)"
+    )
+    run = _python("-c", code)
+    assert (run.returncode, run.stdout) == (0, f"hybridjax {hj.__version__}\n")

@@ -5,6 +5,7 @@ import argparse
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 
 from .. import __version__
@@ -57,7 +58,7 @@ def _interruptible() -> Iterator[None]:
 
     def hook(unraisable):
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            _thread.interrupt_main()
+            threading.Timer(0.1, _thread.interrupt_main).start()  # when the callback is over
         else:
             usual(unraisable)
 

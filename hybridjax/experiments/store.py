@@ -259,7 +259,7 @@ def _describe(campaign: Campaign, chunk: int) -> dict[str, Any]:
     }
 
 
-def _same_cycle(mine: dict[str, Any], theirs: dict[str, Any]) -> bool:
+def _same_cycle(mine: dict[str, Any], theirs: Any) -> bool:
     """Whether the sections lie on the same cycle; each is described by its points (t, q) at the
     sections and by the scales of these, of which that of time is the period."""
     points, scales = np.array(mine["points"]), np.array(mine["scales"])

@@ -7,6 +7,7 @@ import equinox as eqx
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, SectionCount, SignalNames
 from .._core.progress import say, working
+from .._core.precision import require_x64
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
@@ -66,8 +67,10 @@ def identify_recording(
       taken out of the outputs, and of the signals that define the phase, before the phase is found;
       the fit allows for what is left.
 
-    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`.
+    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`;
+    `PrecisionError` in single precision.
     """
+    require_x64()
     say("phase")
     definition = None if isinstance(phase, Phase) else phase
     found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)

@@ -175,12 +175,15 @@ def files(tmp_path_factory, rhythm):
 def identify(files, out, *more):
     trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
     options = ["--input", "force", "--outputs", "x,v", "--phase", "x,v", "--sections", "16"]
-    main(["identify", *trials, *options, "--out", str(out), *more])
+    return main(["identify", *trials, *options, "--out", str(out), *more])
 
 
-def test_the_command(files, tmp_path):
+def test_the_command(files, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    identify(files, out)
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    monkeypatch.chdir(out)
+    assert identify(files, ".") == 0
     summary = json.loads((out / "summary.json").read_text())
     (found,) = np.array(summary["multipliers"]) @ [1, 1j]
     assert abs(found - MULTIPLIER) < 2e-2
@@ -193,7 +196,14 @@ def test_the_command(files, tmp_path):
     assert rows[0] == "trial,record,cycle,section,time,force (N),x (m),v (m/s)"
     assert len(rows) > 16 * 190
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png", ".pdf"}
+    assert (out / "notes.txt").read_text() == "mine"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_command_says_what_has_not_converged(files, tmp_path, capsys):
+    assert identify(files, tmp_path / "out", "--order", "4") == 1
+    assert "a fit did not converge" in capsys.readouterr().err
+    assert (tmp_path / "out" / "report.html").exists()
 
 
 def test_the_command_from_crossing_to_crossing(files, tmp_path):
@@ -216,7 +226,6 @@ def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsy
     ("more", "message"),
     [
         (["--outputs", "x,q"], "no signal 'q'"),
-        (["--phase", "x"], "--phase needs two entries"),
         (["--time", "t"], "no column 't'"),
         (["--sections", "200"], "are too few"),
     ],
@@ -226,9 +235,16 @@ def test_the_command_writes_nothing_half(files, tmp_path, more, message):
         identify(files, tmp_path / "out", *more)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(SystemExit, match="holds other files"):
+
+
+@pytest.mark.parametrize("name", ["summary.json", "figures/bode.pdf"])
+def test_the_command_computes_nothing_where_a_file_is_in_the_way(files, tmp_path, name, capsys):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(SystemExit, match=f"{name}' is in the way"):
         identify(files, tmp_path)
+    assert not capsys.readouterr().out
+    assert [p.read_text() for p in tmp_path.rglob("*") if p.is_file()] == ["mine"]
 
 
 def test_constant_input(wave):

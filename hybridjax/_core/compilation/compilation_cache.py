@@ -5,6 +5,7 @@ import pathlib
 
 import jax
 
+from ...errors import DefinitionError
 from ..boundary.checked import checked
 from ..boundary.kinds import Path
 
@@ -17,12 +18,20 @@ def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
     folder (`$XDG_CACHE_HOME` or `~/.cache`).
 
     **Returns:** the folder in use.
+
+    **Raises:** `DefinitionError` if it cannot be made.
     """
     if folder is None:
         base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
         folder = os.environ.get("HYBRIDJAX_CACHE") or pathlib.Path(base) / "hybridjax"
     folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DefinitionError(
+            f"cannot keep compiled programs in '{folder}' ({error.strerror}): set HYBRIDJAX_CACHE "
+            "to another folder."
+        ) from error
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     return folder

@@ -1,0 +1,299 @@
+"""All or nothing is written, nothing through links, and nothing of anybody else is touched."""
+
+import json
+import os
+import pathlib
+
+import pytest
+from matplotlib.figure import Figure
+
+import hybridjax as hj
+from hybridjax._core.results_folder import results_folder
+from hybridjax._core.writing import made_folder, replacing
+
+
+LIST = ".hybridjax-report.json"
+
+
+def tree(folder):
+    """All files and folders by name, with their contents; links with what they point to."""
+    found = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            found[name] = "-> " + os.readlink(path)
+        else:
+            found[name] = path.read_text() if path.is_file() else None
+    return found
+
+
+def write(folder, results, names=()):
+    with results_folder(folder, "report", names) as new:
+        for name, text in results.items():
+            (new / name).parent.mkdir(exist_ok=True)
+            (new / name).write_text(text)
+
+
+RESULTS = {"report.html": "page", "figures/bode.png": "image"}
+MINE = {
+    "notes.txt": "mine",
+    "figures/mine.png": "mine",
+    "data/trial.csv": "mine",
+    ".hidden": "mine",
+}
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A folder of somebody else, with links out of it."""
+    folder = tmp_path / "full"
+    for name, text in MINE.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    (tmp_path / "away").mkdir()
+    (tmp_path / "away" / "file").write_text("away")
+    os.symlink(tmp_path / "away", folder / "link")
+    os.symlink("nowhere", folder / "dangling")
+    return folder
+
+
+def test_results_stand_beside_what_is_there(full):
+    before = tree(full)
+    write(full, RESULTS)
+    after = tree(full)
+    assert {k: v for k, v in after.items() if k in before} == before
+    assert {k: v for k, v in after.items() if k not in before and k != LIST} == RESULTS
+
+
+def test_later_results_take_the_place_of_earlier_ones(full):
+    write(full, RESULTS | {"figures/old.png": "image"})
+    write(full, {"report.html": "new page", "figures/bode.png": "image"})
+    after = tree(full)
+    assert after["report.html"] == "new page" and "figures/old.png" not in after
+    assert all(after[name] == text for name, text in MINE.items())
+    assert set(json.loads(after[LIST])) == set(RESULTS)
+
+
+def test_results_that_somebody_has_changed_stay(full):
+    write(full, RESULTS | {"summary.json": "1", "table.csv": "1"})
+    for name in ("table.csv", "report.html"):
+        (full / name).write_text("edited")
+    before = tree(full)
+    with pytest.raises(hj.DefinitionError, match="report.html' is in the way, and was not written"):
+        write(full, RESULTS)
+    assert tree(full) == before
+    (full / "report.html").unlink()
+    write(full, RESULTS)
+    after = tree(full)
+    assert after["table.csv"] == "edited" and "summary.json" not in after
+
+
+def block_by_file(folder):
+    (folder / "report.html").write_text("mine")
+
+
+def block_by_link(folder):
+    (folder / "copy").write_text("page")
+    os.symlink(folder / "copy", folder / "report.html")
+
+
+def block_by_dangling_link(folder):
+    os.symlink("nowhere", folder / "report.html")
+
+
+def block_by_folder(folder):
+    (folder / "report.html").mkdir()
+
+
+def block_by_linked_folder(folder):
+    for path in (folder / "figures").iterdir():
+        path.unlink()
+    (folder / "figures").rmdir()
+    os.symlink(folder.parent / "away", folder / "figures")
+
+
+def block_list_by_link(folder):
+    os.symlink(folder / "notes.txt", folder / LIST)
+
+
+def block_list_by_garbage(folder):
+    (folder / LIST).write_text("[1, 2]")
+
+
+def block_list_by_names_outside(folder):
+    (folder / LIST).write_text(json.dumps({"../away/file": [""]}))
+
+
+BLOCKS = [
+    block_by_file,
+    block_by_link,
+    block_by_dangling_link,
+    block_by_folder,
+    block_by_linked_folder,
+    block_list_by_link,
+    block_list_by_garbage,
+    block_list_by_names_outside,
+]
+
+
+@pytest.mark.parametrize("early", [True, False], ids=["before", "after"])
+@pytest.mark.parametrize("block", BLOCKS)
+def test_what_is_in_the_way_stays(full, block, early):
+    """Refused before anything is computed, if the names of results are known by then."""
+    block(full)
+    before = tree(full.parent)
+    with pytest.raises(hj.DefinitionError, match="is in the way, and was not written by hybridjax"):
+        with results_folder(full, "report", RESULTS if early else ()) as new:
+            assert not early
+            (new / "figures").mkdir()
+            for name, text in RESULTS.items():
+                (new / name).write_text(text)
+    assert tree(full.parent) == before
+
+
+@pytest.mark.parametrize("names", ["../away/file", "/etc/hostname", "a/../../away/file"])
+def test_a_list_cannot_name_what_is_outside(full, names):
+    digest = "6f1f6b0d" * 8
+    (full / LIST).write_text(json.dumps({names: [digest]}))
+    before = tree(full.parent)
+    with pytest.raises(hj.DefinitionError, match="is in the way"):
+        write(full, {"report.html": "page"})
+    assert tree(full.parent) == before
+
+
+def test_kinds_of_results_do_not_touch_each_other(tmp_path):
+    write(tmp_path, {"page.html": "page", "summary.json": "1"})
+    with results_folder(tmp_path, "reproduce") as new:
+        (new / "table.csv").write_text("1")
+    assert {"page.html", "summary.json", "table.csv"} <= set(tree(tmp_path))
+    with pytest.raises(hj.DefinitionError, match="summary.json' is in the way"):
+        with results_folder(tmp_path, "reproduce", ["summary.json"]):
+            pass
+
+
+def test_an_error_leaves_nothing(tmp_path):
+    for error in (ValueError, KeyboardInterrupt):
+        with pytest.raises(error):
+            with results_folder(tmp_path / "new" / "er", "report") as new:
+                (new / "report.html").write_text("half")
+                raise error
+    assert tree(tmp_path) == {}
+
+
+def test_an_interruption_while_results_take_their_places(full, monkeypatch):
+    """Whatever is there then is known to be a result, so that the next call replaces it."""
+    write(full, RESULTS | {"summary.json": "1"})
+    replace, left = os.replace, iter([True, True, False])
+
+    def interrupted(source, target):
+        if not next(left):
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    new = {name: "new" for name in RESULTS}
+    with pytest.raises(KeyboardInterrupt):
+        write(full, new)
+    monkeypatch.undo()
+    assert all((full / name).exists() for name in RESULTS)
+    write(full, new)
+    assert {k: v for k, v in tree(full).items() if v == "new"} == new
+    assert not [name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST]
+
+
+def test_the_folder_at_hand(full, monkeypatch):
+    monkeypatch.chdir(full)
+    write(pathlib.Path("."), RESULTS)
+    assert (full / "report.html").read_text() == "page"
+
+
+def test_a_folder_may_be_named_by_a_link(full, tmp_path):
+    write(full / "link", RESULTS)
+    assert (tmp_path / "away" / "report.html").read_text() == "page"
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a place where nobody may write")
+@pytest.mark.parametrize("folder", ["/proc", "/proc/new", "/dev/null/new"])
+def test_places_that_cannot_be_written(folder):
+    with pytest.raises(hj.DefinitionError, match=f"cannot write to '{folder}'"):
+        with results_folder(pathlib.Path(folder), "report"):
+            pytest.fail("too late")
+
+
+def test_a_place_that_cannot_hold_compiled_programs():
+    with pytest.raises(hj.DefinitionError, match="set HYBRIDJAX_CACHE to another folder"):
+        hj.enable_compilation_cache("/dev/null/new")
+
+
+def test_a_folder_that_was_made_stays_where_something_is_in_it(tmp_path):
+    with pytest.raises(ValueError):
+        with made_folder(tmp_path / "a" / "b"):
+            (tmp_path / "a" / "mine.txt").write_text("mine")
+            raise ValueError
+    assert tree(tmp_path) == {"a": None, "a/mine.txt": "mine"}
+
+
+def test_one_file(tmp_path):
+    path = tmp_path / "x.txt"
+    path.write_text("old")
+    with pytest.raises(ValueError):
+        with replacing(path) as new:
+            new.write_text("half")
+            raise ValueError
+    assert tree(tmp_path) == {"x.txt": "old"}
+    with replacing(path) as new:
+        new.write_text("new")
+    assert tree(tmp_path) == {"x.txt": "new"}
+
+
+def figure(path):
+    hj.plot.save(path, Figure())
+
+
+def design(path):
+    hj.recordings.write_design(path, hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5)))
+
+
+def module(path):
+    hj.save(path, hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5)))
+
+
+WRITERS = {
+    "save": (module, "x.npz"),
+    "write_design": (design, "x.csv"),
+    "plot.save": (figure, "x.pdf"),
+}
+
+
+@pytest.mark.parametrize(("writer", "name"), WRITERS.values(), ids=WRITERS)
+def test_nothing_is_written_through_a_link(tmp_path, writer, name):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (tmp_path / "away").write_text("mine")
+    os.symlink(tmp_path / "away", folder / name)
+    with pytest.raises(hj.DefinitionError, match="is a link"):
+        writer(folder / name)
+    assert (tmp_path / "away").read_text() == "mine" and (folder / name).is_symlink()
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    (folder / name).unlink()
+    writer(folder / name)
+    assert (folder / name).stat().st_size > 100
+
+
+@pytest.mark.parametrize("path", [".", "/"])
+def test_a_figure_needs_a_name(path):
+    with pytest.raises(hj.DefinitionError, match="is a folder: add the name"):
+        hj.plot.save(path, Figure())
+
+
+def test_a_figure_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
+    (tmp_path / "x.png").write_text("old")
+
+    def savefig(self, path, **options):
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    with pytest.raises(hj.DefinitionError, match="cannot write .*x.png': No space left"):
+        hj.plot.save(tmp_path / "x", Figure())
+    assert tree(tmp_path) == {"x.png": "old"}

@@ -1,0 +1,28 @@
+"""The example of docs/processes.md runs as it stands."""
+
+import pathlib
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+
+PAGE = pathlib.Path(__file__).parents[1] / "docs" / "processes.md"
+
+
+@pytest.mark.slow
+def test_the_example_runs_in_processes_of_its_own(tmp_path):
+    (script,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    (tmp_path / "script.py").write_text(script)
+    run = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    scatter, mean = (
+        [complex(z) for z in part.strip(" []\n").split()] for part in run.stdout.split("around")
+    )
+    true = 0.3270675 + 0.05964059j  # of `synthetic_ldtp`
+    np.testing.assert_allclose(mean, [true, true.conjugate()], atol=1e-3)
+    assert 0 < abs(scatter[0]) < 2e-3
