@@ -19,6 +19,7 @@ class SectionData(eqx.Module):
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: of the splines through the outputs, in Hz.
     - `n_sections`, `inputs`, `outputs`, `units` (of inputs, then outputs).
+    - `spikes`: how many samples of each signal (inputs, then outputs) were left out as spikes.
     """
 
     records: tuple[Record, ...]
@@ -29,6 +30,7 @@ class SectionData(eqx.Module):
     period: float = eqx.field(static=True)
     bandwidth: float = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    spikes: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def n_sections(self) -> int:
@@ -41,6 +43,11 @@ class SectionData(eqx.Module):
     @property
     def outputs(self) -> tuple[str, ...]:
         return self.records[0].outputs
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Inputs, then outputs."""
+        return self.inputs + self.outputs
 
     @property
     def cycles(self) -> float:
@@ -86,10 +93,13 @@ class SectionData(eqx.Module):
 
     def __repr__(self) -> str:
         u, y = self.rms()
-        values = zip(self.inputs + self.outputs, (*u, *y), self.units, strict=True)
+        values = zip(self.signals, (*u, *y), self.units, strict=True)
         shown = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
+        struck = [f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k]
+        spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
         return (
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: {shown})"
+            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
+            f"{shown}{spikes})"
         )

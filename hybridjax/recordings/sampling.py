@@ -12,9 +12,10 @@ from ..experiments.record import Record
 from .data import SectionData
 from .drift import check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
-from .phase.winding import Phase, Winding
+from .phase.winding import Phase, Winding, count_on
 from .recording import Recording, Trial
 from .smoothing import gaps, inside, means, nearest, spline
+from .spikes import input_spikes, recurring, spike_heights
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
@@ -42,6 +43,10 @@ def section_data(
     max_gap: int | float | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
+
+    Isolated spikes, which stick out of all around them for up to three samples, are left out as if
+    they were missing, and counted in `spikes`; but not those that come at the same phase of most
+    cycles (impacts), nor pulses of an input that is not smooth otherwise.
 
     **Arguments:**
 
@@ -82,14 +87,17 @@ def section_data(
         )
     N = _number_of_sections(n_sections, phase)
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
-    found, trials = [], []
+    found, trials, spikes = [], [], np.zeros(len(inputs) + len(outputs), int)
     for number, trial in enumerate(recording.trials):
+        stretches = phase.stretches[number]
+        trial, struck = _without_spikes(recording, trial, stretches, inputs, outputs)
+        spikes += struck
         sampler = _Sampler(recording, trial, inputs, outputs, bandwidth, sampled)
         longest = max_gap
         if longest is None:
             step = float(np.median(np.diff(trial.time)))
             longest = max(_GAP_SECTIONS * phase.period / N, _GAP_SAMPLES * step)
-        parts = [sampler(s, N, longest) for s in phase.stretches[number]]
+        parts = [sampler(s, N, longest) for s in stretches]
         parts = [p for p in parts if p is not None]
         if timing is not None:
             parts = _with_times(parts, N, phase.period, timing)
@@ -100,6 +108,7 @@ def section_data(
     units = [recording.unit(name) for name in (*inputs, *outputs)]
     if timing is not None:
         outputs, units = (*outputs, _TIME[timing]), [*units, "s"]
+        spikes = np.append(spikes, 0)
     # A smoothing spline averages over neighbors to both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
     records = [
@@ -126,6 +135,7 @@ def section_data(
         period=phase.period,
         bandwidth=bandwidth,
         units=tuple(units),
+        spikes=tuple(spikes.tolist()),
     )
 
 
@@ -154,6 +164,28 @@ def _number_of_sections(given: int | None, phase: Phase) -> int:
     if N < 1:
         raise DefinitionError(f"there must be one section or more, not {N}.")
     return N
+
+
+def _without_spikes(
+    recording: Recording,
+    trial: Trial,
+    stretches: Sequence[Winding],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+) -> tuple[Trial, Int[np.ndarray, " nuy"]]:
+    """A trial in which samples of spikes are missing, and their numbers, of inputs and outputs."""
+    values, counts = trial.values.copy(), []
+    time, phase = count_on(stretches)
+    for name in (*inputs, *outputs):
+        x = values[:, recording.column(name)]
+        heights = (input_spikes if name in inputs else spike_heights)(x)
+        at = np.flatnonzero(heights)
+        if len(at) and len(time):
+            own = np.interp(trial.time[at], time, phase)
+            at = at[~recurring(heights[at], own, np.ptp(phase))]
+        x[at] = np.nan
+        counts.append(len(at))
+    return Trial(trial.time, values, trial.events, trial.name), np.array(counts)
 
 
 class _Part(eqx.Module):

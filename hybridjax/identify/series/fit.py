@@ -10,7 +10,7 @@ from ..._core.results import Result
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
-from ..multipliers.covariance import Covariance, correlated_cycles, newey_west, sandwich
+from ..multipliers.covariance import Covariance, correlated_cycles, sandwich, serial_covariance
 from ..multipliers.denominator import Denominator, multipliers_of
 from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
@@ -65,7 +65,7 @@ def fit_series(
       "cycle": it starts on the limit cycle, with no input before.
     - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
       cycle, so that it holds also where noise of successive cycles is dependent (process noise),
-      with the weights of Newey and West (1987). "white": from its size alone.
+      with Parzen's weights. "white": from its size alone.
     - `distortion`: whether to allow for a part of the response of second order; None: if that
       explains more than half of the misfit, and lowers the standard errors by 10 % or more.
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
@@ -209,16 +209,17 @@ def _covariance(
     square = parts.sum(axis=(0, 1))
     if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
         return sandwich(square - noise, square)
-    # What a sample would miss a fit to the others by: errors that are large where inputs are, as
-    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
-    error = found.residual / np.maximum(1 - found.leverage, _SMALLEST_REMAINDER)[..., None]
+    # The fit takes a share of each error, which makes it smaller; this makes it as large again on
+    # average (HC2 of MacKinnon and White 1985: HC3 would make it too large by that share).
+    left = np.maximum(1 - found.leverage, _SMALLEST_REMAINDER)
+    error = found.residual / np.sqrt(left)[..., None]
     score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
     lags = correlated_cycles(multipliers_of(c), problem.y.shape[1])
-    gradient = newey_west(score, lags)
+    gradient = serial_covariance(score, lags)
     # The scores add up to zero at the minimum, which takes this part of their covariance away.
     half = np.linalg.inv(np.linalg.cholesky(square))
     share = np.einsum("ij,stjk,lk->stil", half, parts, half).reshape(*parts.shape[:2], d * d)
-    taken = np.trace(newey_west(share, lags).matrix)
+    taken = np.trace(serial_covariance(share, lags).matrix)
     corrected = gradient.matrix / max(1 - taken / d, _SMALLEST_FREEDOM)
     covariance = sandwich(square - noise, corrected, parts.reshape(-1, d, d))
     return covariance._replace(freedom=covariance.freedom / gradient.terms)
