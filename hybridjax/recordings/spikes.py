@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 
-# A spike lasts for so many samples at most: at 1 % of samples, three in a row happen. Doubled: short
-# pulses are taken for spikes.
+# A spike lasts for so many samples at most: where 1 % are struck, three in a row happen. Doubled:
+# short pulses are taken for spikes.
 _LONGEST = 3
 # How far it sticks out, in ranges of the closest half of the samples around it, and how many of
 # these are looked at. Either doubled: spikes where a signal is steep are missed.
