@@ -22,6 +22,7 @@ class SectionData(eqx.Module):
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: of the splines through the outputs, in Hz.
     - `n_sections`, `inputs`, `outputs`; `units` (of inputs, then outputs).
+    - `spikes`: how many samples of each signal (inputs, then outputs) were left out as spikes.
     """
 
     records: tuple[Record, ...]
@@ -31,6 +32,7 @@ class SectionData(eqx.Module):
     cycle_outputs: Float[np.ndarray, "N ny"]
     period: float = eqx.field(static=True)
     bandwidth: float = eqx.field(static=True)
+    spikes: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -47,6 +49,11 @@ class SectionData(eqx.Module):
     @property
     def outputs(self) -> tuple[str, ...]:
         return self.records[0].outputs
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Inputs, then outputs."""
+        return self.inputs + self.outputs
 
     @property
     def cycles(self) -> float:
@@ -93,10 +100,13 @@ class SectionData(eqx.Module):
 
     def __repr__(self) -> str:
         u, y = self.rms()
-        values = zip(self.inputs + self.outputs, (*u, *y), self.units, strict=True)
+        values = zip(self.signals, (*u, *y), self.units, strict=True)
         shown = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
+        struck = [f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k]
+        spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
         return (
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: {shown})"
+            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
+            f"{shown}{spikes})"
         )

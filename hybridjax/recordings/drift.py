@@ -12,6 +12,7 @@ from ..errors import DefinitionError
 from .phase.winding import Phase
 from .recording import Recording, Trial
 from .smoothing import FEWEST, gaps, inside, means, spline
+from .spikes import without_spikes
 
 
 # The longest gap, in cycles, in a cycle whose mean is known. Doubled: means of cycles with half of
@@ -56,7 +57,7 @@ def without_drift(
         values = trial.values.copy()
         whole = [w.when(np.arange(np.ceil(w.phase[0]), w.phase[-1])) for w in stretches]
         for k in columns:
-            x = values[:, k]
+            x = without_spikes(values[:, k])
             holes = gaps(trial.time, np.isfinite(x), _LONGEST_GAP * phase.period)
             middles, levels = [np.zeros(0)], [np.zeros(0)]
             for edges in whole:

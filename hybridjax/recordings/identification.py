@@ -6,8 +6,8 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, SectionCount, SignalNames
-from .._core.progress import say, working
 from .._core.precision import require_x64
+from .._core.progress import say, working
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise

@@ -11,6 +11,7 @@ from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
 from .smoothing import Bandwidth, bridgeable, spline
+from .spikes import without_spikes
 
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
@@ -183,7 +184,8 @@ class Recording(eqx.Module):
         Jumps against the direction (an angle that begins anew) are no events, jumps along it are.
         What crosses a level several times within a cycle, in noise, makes doubled events, which
         `estimate_phase` leaves out. Crossings in gaps that are longer than three samples, and than
-        half a wavelength at the bandwidth, are not known, and make no events.
+        half a wavelength at the bandwidth, are not known, and make no events. Isolated spikes
+        cross nothing (see `section_data`).
 
         **Arguments:** `event`: its name. `crossing`: of a signal, by name. `bandwidth`: in Hz, of
         the smoothing spline whose crossings are taken; by default it interpolates.
@@ -195,7 +197,7 @@ class Recording(eqx.Module):
         column, trials = self.column(signal), []
         sign = 1.0 if crossing.direction == "rising" else -1.0
         for trial in self.trials:
-            curve = spline(trial.time, trial.values[:, column], bandwidth)
+            curve = spline(trial.time, without_spikes(trial.values[:, column]), bandwidth)
             t, y = curve.time, sign * (curve.values - level)
             longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))

@@ -14,9 +14,10 @@ from ..experiments.record import Record
 from .data import SectionData
 from .drift import DriftCycles, check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
-from .phase.winding import Phase, Winding
+from .phase.winding import Phase, Winding, count_on
 from .recording import Recording, Trial
 from .smoothing import Bandwidth, bridgeable, gaps, inside, means, nearest, spline
+from .spikes import input_spikes, recurring, spike_heights
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
@@ -44,6 +45,10 @@ def section_data(
     max_gap: Bandwidth | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
+
+    Isolated spikes, which stick out of all around them for up to three samples, are left out as if
+    they were missing, and counted in `spikes`; but not those that come at the same phase of most
+    cycles (impacts), nor pulses of an input that is not smooth otherwise.
 
     **Arguments:**
 
@@ -84,8 +89,11 @@ def section_data(
         )
     N = _number_of_sections(n_sections, phase)
     bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
-    found, trials = [], []
+    found, trials, spikes = [], [], np.zeros(len(inputs) + len(outputs), int)
     for number, trial in enumerate(recording.trials):
+        stretches = phase.stretches[number]
+        trial, struck = _without_spikes(recording, trial, stretches, inputs, outputs)
+        spikes += struck
         sampler = _Sampler(recording, trial, inputs, outputs, bandwidth, sampled)
         parts = [sampler(s, N, phase.period, max_gap) for s in phase.stretches[number]]
         parts = [p for p in parts if p is not None]
@@ -100,6 +108,7 @@ def section_data(
     )
     if timing is not None:
         outputs = (*outputs, Signal(_TIME[timing], "s"))
+        spikes = np.append(spikes, 0)
     # A smoothing spline averages over neighbors to both sides.
     lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
     records = [
@@ -125,6 +134,7 @@ def section_data(
         cycle_outputs=cycle[:, len(inputs) :],
         period=phase.period,
         bandwidth=bandwidth,
+        spikes=tuple(spikes.tolist()),
     )
 
 
@@ -151,6 +161,28 @@ def _number_of_sections(given: int | None, phase: Phase) -> int:
         )
     N = next((n for n in (given, phase.n_sections) if n is not None), _N_SECTIONS)
     return N
+
+
+def _without_spikes(
+    recording: Recording,
+    trial: Trial,
+    stretches: Sequence[Winding],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+) -> tuple[Trial, Int[np.ndarray, " nuy"]]:
+    """A trial in which samples of spikes are missing, and their numbers, of inputs and outputs."""
+    values, counts = trial.values.copy(), []
+    time, phase = count_on(stretches)
+    for name in (*inputs, *outputs):
+        x = values[:, recording.column(name)]
+        heights = (input_spikes if name in inputs else spike_heights)(x)
+        at = np.flatnonzero(heights)
+        if len(at) and len(time):
+            own = np.interp(trial.time[at], time, phase)
+            at = at[~recurring(heights[at], own, np.ptp(phase))]
+        x[at] = np.nan
+        counts.append(len(at))
+    return Trial(trial.time, values, trial.events, trial.name), np.array(counts)
 
 
 class _Part(eqx.Module):

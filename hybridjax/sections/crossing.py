@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.precision import real
 from .._core.boundary.kinds import Scalar, SignalNames
+from .._core.precision import real
 from .._core.text import fields
 from ..systems.output import Output
 from ..systems.structure import Structure

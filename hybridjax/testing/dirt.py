@@ -22,6 +22,8 @@ class Dirt:
 
     - `noise`: standard deviation of white noise. `quantum`: what values are rounded to.
     - `drift`: amplitude of a slow sine, one turn over each trial. These three in the signals' unit.
+    - `spikes`: share of samples that are off by 20 standard deviations of their signal, to either
+      side.
     - `missing`: share of samples that are lost, NaN. `gap`: times of start and end of a stretch of
       NaN.
     - `irregular`: whether a random third of the samples is not there at all.
@@ -35,6 +37,7 @@ class Dirt:
     noise: NonNegative = 0.0
     quantum: NonNegative = 0.0
     drift: float = 0.0
+    spikes: Fraction = 0.0
     missing: Fraction = 0.0
     gap: tuple[float, float] | None = None
     irregular: bool = False
@@ -48,6 +51,8 @@ class Dirt:
             raise DefinitionError(f"`gap` must end after it starts, but is {self.gap}.")
 
 
+# Height of a spike in standard deviations of its signal. Doubled: spikes of twice the height.
+_SPIKE = 20.0
 # How late a false event is, in median intervals. Doubled: it is still taken for a doubled one.
 _FALSE_EVENT = 0.05
 
@@ -90,6 +95,9 @@ def _measured(
     y = y + dirt.noise * rng.normal(size=y.shape)
     y += dirt.drift * np.sin(2 * np.pi * (time - time[0]) / np.ptp(time))[:, None]
     y = np.round(y / dirt.quantum) * dirt.quantum if dirt.quantum else y
+    if dirt.spikes:
+        struck = rng.random(y.shape) < dirt.spikes
+        y += _SPIKE * np.nanstd(y, axis=0) * rng.choice([-1, 1], y.shape) * struck
     y[rng.random(len(time)) < dirt.missing] = np.nan
     if dirt.gap is not None:
         y[(time >= dirt.gap[0]) & (time < dirt.gap[1])] = np.nan

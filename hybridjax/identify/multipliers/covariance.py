@@ -73,14 +73,16 @@ class GradientCovariance(NamedTuple):
     """How many of its terms stand for one that is independent."""
 
 
-def newey_west(score: Float[np.ndarray, "S T d"], lags: int) -> GradientCovariance:
+def serial_covariance(score: Float[np.ndarray, "S T d"], lags: int) -> GradientCovariance:
     """The covariance of a sum over cycles (T, in S records) that depend on so many neighbors.
 
-    Weights of Newey and West (1987).
+    With Parzen's weights (Gallant, *Nonlinear Statistical Models*, 1987), which leave the first
+    half of the lags nearly as they are, and never make a variance negative.
     """
     gradient = np.einsum("sti,stj->ij", score, score)
-    weights = 1 - np.arange(1, lags + 1) / (lags + 1)
+    lag = np.arange(1, 2 * lags + 2) / (2 * lags + 2)
+    weights = np.where(lag < 0.5, 1 - 6 * lag**2 + 6 * lag**3, 2 * (1 - lag) ** 3)
     for k, w in enumerate(weights, 1):
-        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
+        product = np.einsum("sti,stj->ij", score[:, k:], score[:, : max(score.shape[1] - k, 0)])
         gradient += w * (product + product.T)
     return GradientCovariance(gradient, 1 + 2 * float((weights**2).sum()))

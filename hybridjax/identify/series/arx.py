@@ -15,7 +15,7 @@ from ..multipliers.gauss_newton import Coefficients
 from ..multipliers.order import refuse_invented
 from .cycle_filters import delay_cycles, lagged_inputs
 from .output_error import OutputErrorProblem
-from .section_regression import SectionRegression, sampled_alike
+from .section_regression import SectionRegression, weighted_alike
 
 
 # The leading coefficient relative to the largest one, below which the solution is no start (c would
@@ -57,7 +57,7 @@ def delayed_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         known = (cycle >= problem.first[:, n] + problem.free).T[..., None]
         sampled, y = problem.sampled[:, :, n], problem.y[:, :, n]
         before = np.all([delay_cycles(sampled, j, not problem.free) for j in delays], axis=0)
-        for rows, outputs in sampled_alike(known & before):
+        for rows, outputs in weighted_alike(known & before):
             no_starts = problem.drift[:, :, :0]
             regression = SectionRegression.make(inputs, no_starts, problem.drift, rows)
             past = np.concatenate([delay_cycles(y[..., outputs], j) for j in delays], axis=2)

@@ -12,12 +12,21 @@ from ..._core.results import Result
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
-from ..multipliers.covariance import Covariance, correlated_cycles, newey_west, sandwich
+from ..multipliers.covariance import Covariance, correlated_cycles, sandwich, serial_covariance
 from ..multipliers.denominator import Denominator, multipliers_of
 from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .cycle_grid import CycleGrid
 from .output_error import Linearization, OutputErrorProblem, linearize
+from .robust import (
+    Loss,
+    efficiency,
+    misfit,
+    reweight,
+    rms_of,
+    weigh_outputs,
+    without_outliers,
+)
 from .second_order import allow_for_second_order
 from .series_fit import SeriesFit
 from .shared_state_fit import HORIZON
@@ -26,6 +35,10 @@ from .shared_state_fit import HORIZON
 # Outputs of pure noise, from which the noise in the Jacobian is estimated. Doubled: its share of a
 # covariance scatters 0.7 times as much.
 _PROBES = 4
+# How often weights are found anew, at most, and the change of c, relative to 1 + |c|, that is the
+# last. Doubled: slow iterations come to their end; minima of robust losses are missed by twice as
+# much.
+_MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
 # Smallest noise of an output in the units of the moment: rounding. Doubled: outputs without noise
 # count half as much beside noisy ones.
 _ROUNDING = 1e-15
@@ -44,6 +57,7 @@ def fit_series(
     *,
     overhang: Index | None = None,
     start: Literal["free", "cycle"] = "free",
+    loss: Loss = "squares",
     errors: Literal["residuals", "white"] = "residuals",
     distortion: bool | None = None,
     check: bool = True,
@@ -66,11 +80,17 @@ def fit_series(
     - `overhang`: lags of the numerators beyond d N; None means N.
     - `start`: "free": whatever happened before a record, the state at its start is unknown.
       "cycle": it starts on the limit cycle, with no input before.
+    - `loss`: what is minimized of the errors. "squares", the most accurate for normal ones; "huber"
+      or "student" where some samples are far off: squares up to 1.345 standard deviations and
+      linear beyond, or the likelihood of Student's distribution with 4 degrees of freedom
+      (iteratively reweighted, standard deviations from the median). `noise` is then that of the
+      normal errors with which squares would be as accurate.
     - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
       cycle, so that it holds also where noise of successive cycles is dependent (process noise),
-      with the weights of Newey and West (1987). "white": from its size alone.
-    - `distortion`: whether to allow for a part of the response of second order; None: if that
-      explains more than half of the misfit, and lowers the standard errors by 10 % or more.
+      with Parzen's weights. "white": from its size alone.
+    - `distortion`: whether to allow for a part of the response of second order, with squares only;
+      None: if that explains more than half of the misfit, and lowers the standard errors by 10 % or
+      more.
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
@@ -83,19 +103,29 @@ def fit_series(
     grid = CycleGrid.from_data(data)
     N = grid.n_sections
     overhang = N if overhang is None else overhang
+    if distortion and loss != "squares":
+        raise DefinitionError(f"distortion is allowed for with the loss 'squares', not {loss!r}.")
     _require_signals(grid)
     problem = OutputErrorProblem.from_grid(grid, order, overhang, free_start)
-    delayed = delayed_outputs(problem, order)
+    usual = problem if loss == "squares" else without_outliers(problem)
+    delayed = delayed_outputs(usual, order)
+    if loss != "squares":
+        problem = weigh_outputs(problem)
     c, found, _ = _minimize(problem, total_least_squares(delayed), max_steps)
     _require_freedom(found, order, problem)
-    noise = _noise(found, order)
-    problem = problem.rescale(noise)  # the weights that the misfit suggests
-    c, found, converged = _minimize(problem, c, max_steps, found.rescale(noise))
+    if loss == "squares":
+        noise = _noise(found, order)
+        problem = problem.rescale(noise)  # the weights that the misfit suggests
+        c, found, converged = _minimize(problem, c, max_steps, found.rescale(noise))
+        noise = _noise(found, order)
+    else:
+        problem, c, found, converged = _reweighted(problem, c, found, loss, max_steps)
+        noise = rms_of(usual, misfit(problem, found))
     if check:
-        refuse_order(delayed.rescale(noise * _noise(found, order)))
-    best = Denominator(c, _covariance(problem, c, found, errors), converged)
+        refuse_order(delayed.rescale(noise * problem.scale / usual.scale))
+    best = Denominator(c, _covariance(problem, c, found, errors, loss), converged)
     second = None
-    if distortion is not False:
+    if distortion is not False and loss == "squares":
         first = assemble(grid, problem, found, best)
         second = allow_for_second_order(
             grid,
@@ -110,7 +140,7 @@ def fit_series(
         )
     if second is not None:
         best, found = second, linearize(problem, second.coefficients)
-    return assemble(grid, problem, found, best, distortion=second is not None)
+    return assemble(grid, problem, found, best, distortion=second is not None, loss=loss)
 
 
 def assemble(
@@ -119,6 +149,7 @@ def assemble(
     found: Linearization,
     denominator: Denominator,
     distortion: bool = False,
+    loss: Loss = "squares",
 ) -> SeriesFit:
     """The fit with this denominator, in the units of the data; `found`: the problem there."""
     N, nu, ny = grid.n_sections, len(grid.inputs), len(grid.outputs)
@@ -128,6 +159,9 @@ def assemble(
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
+    noise = _noise(found, len(c))
+    if loss != "squares":
+        noise = efficiency(problem, found, loss).noise
     widest = max(root.shape[1] for row in found.roots for root in row)
     roots = np.zeros((N, ny, problem.lags * nu, widest))
     for n, row in enumerate(found.roots):
@@ -140,7 +174,7 @@ def assemble(
         numerators=by_input(found.numerators),
         slopes=by_input(found.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
-        noise=_noise(found, len(c)) * problem.scale,
+        noise=noise * problem.scale,
         covariance_freedom=denominator.covariance.freedom,
         result=Result.OK if denominator.converged else Result.NOT_CONVERGED,
         n_sections=N,
@@ -172,6 +206,23 @@ def _minimize(
     return c, at(c), converged
 
 
+def _reweighted(
+    problem: OutputErrorProblem, c: Coefficients, found: Linearization, loss: Loss, max_steps: int
+) -> tuple[OutputErrorProblem, Coefficients, Linearization, bool]:
+    """The minimum of a robust loss, that of Huber first, which has no other ones."""
+    converged = False
+    for kind in dict.fromkeys(("huber", loss)):
+        for _ in range(_MAX_REWEIGHTINGS):
+            before = c
+            problem = reweight(problem, found, kind)
+            c, found, converged = _minimize(problem, c, max_steps)
+            settled = np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max())
+            if settled:
+                break
+        converged = converged and bool(settled)
+    return problem, c, found, converged
+
+
 def _noise(found: Linearization, order: int) -> Float[np.ndarray, " ny"]:
     """Standard deviation of each output's noise, in its units of the moment."""
     square = (found.residual**2).sum(axis=(0, 1, 2, 4))
@@ -185,30 +236,34 @@ def _section_noise(found: Linearization) -> Float[np.ndarray, "N ny"]:
 
 
 def _covariance(
-    problem: OutputErrorProblem, c: Coefficients, found: Linearization, errors: str
+    problem: OutputErrorProblem, c: Coefficients, found: Linearization, errors: str, loss: Loss
 ) -> Covariance:
     """Of c, by cycles, which may depend on their neighbors."""
     d = len(c)
+    price = efficiency(problem, found, loss)
     rng = np.random.default_rng(0)
     probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.sampled[..., None]
-    noise = linearize(problem, c, probes).jacobian.reshape(d, -1)
-    noise = noise @ noise.T / _PROBES
-    parts = np.einsum("istnac,jstnac->stij", found.jacobian, found.jacobian)
+    noise = linearize(problem, c, probes * price.noise[:, None]).jacobian
+    noise = np.einsum("istnac,jstnac,a->ij", noise, noise, price.curvature) / _PROBES
+    by_output = np.einsum("istnac,jstnac->astij", found.jacobian, found.jacobian)
+    parts = by_output.sum(axis=0)
     square = parts.sum(axis=(0, 1))
+    curvature = np.einsum("astij,a->ij", by_output, price.curvature) - noise
     if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
-        return sandwich(square - noise, square)
-    # What a sample would miss a fit to the others by: errors that are large where inputs are, as
-    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
-    error = found.residual / np.maximum(1 - found.leverage, _SMALLEST_REMAINDER)[..., None]
+        return sandwich(curvature, np.einsum("astij,a->ij", by_output, price.variance))
+    # The fit takes a share of each error, which makes it smaller; this makes it as large again on
+    # average (HC2 of MacKinnon and White 1985: HC3 would make it too large by that share).
+    left = np.maximum(1 - found.leverage, _SMALLEST_REMAINDER)
+    error = found.residual / np.sqrt(left)[..., None]
     score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
     lags = correlated_cycles(multipliers_of(c), problem.y.shape[1])
-    gradient = newey_west(score, lags)
+    gradient = serial_covariance(score, lags)
     # The scores add up to zero at the minimum, which takes this part of their covariance away.
     half = np.linalg.inv(np.linalg.cholesky(square))
     share = np.einsum("ij,stjk,lk->stil", half, parts, half).reshape(*parts.shape[:2], d * d)
-    taken = np.trace(newey_west(share, lags).matrix)
+    taken = np.trace(serial_covariance(share, lags).matrix)
     corrected = gradient.matrix / max(1 - taken / d, _SMALLEST_FREEDOM)
-    covariance = sandwich(square - noise, corrected, parts.reshape(-1, d, d))
+    covariance = sandwich(curvature, corrected, parts.reshape(-1, d, d))
     return covariance._replace(freedom=covariance.freedom / gradient.terms)
 
 

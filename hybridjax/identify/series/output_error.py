@@ -18,7 +18,7 @@ from ...errors import DefinitionError
 from ..multipliers.gauss_newton import Coefficients
 from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
 from .cycle_grid import CycleGrid
-from .section_regression import RANK, SectionRegression, sampled_alike
+from .section_regression import RANK, SectionRegression, weighted_alike
 
 
 class OutputErrorProblem(NamedTuple):
@@ -27,8 +27,9 @@ class OutputErrorProblem(NamedTuple):
     u: Float[np.ndarray, "S T N nu"]
     y: Float[np.ndarray, "S T N ny"]
     """In units of `scale`; zero where there is no sample."""
-    sampled: Bool[np.ndarray, "S T N ny"]
-    """Where there is one."""
+    weight: Float[np.ndarray, "S T N ny"]
+    """What each sample's equation is multiplied by: 1, less for outliers, zero where there is no
+    sample."""
     first: Int[np.ndarray, "S N"]
     """The cycle in which a record first meets a section."""
     lags: int
@@ -70,7 +71,7 @@ class OutputErrorProblem(NamedTuple):
         return cls(
             u=grid.u,
             y=np.where(sampled, grid.y, 0.0) / scale,
-            sampled=sampled,
+            weight=sampled.astype(float),
             first=first,
             lags=lags,
             lead=grid.lead,
@@ -79,6 +80,11 @@ class OutputErrorProblem(NamedTuple):
             drift=grid.drift,
             scale=scale,
         )
+
+    @property
+    def sampled(self) -> Bool[np.ndarray, "S T N ny"]:
+        """Where there is a sample."""
+        return self.weight > 0
 
     def rescale(self, noise: Float[np.ndarray, " ny"]) -> "OutputErrorProblem":
         """The same with each output in units of its noise, which was `noise` units before."""
@@ -89,6 +95,7 @@ class Linearization(NamedTuple):
     """What the numerators and free starts leave of the outputs at some c, and its derivative."""
 
     residual: Float[np.ndarray, "S T N ny C"]
+    """Times the weights of the problem, as the derivative is."""
     jacobian: Float[np.ndarray, "d S T N ny C"]
     freedom: Int[np.ndarray, "N ny"]
     """Samples less unknowns."""
@@ -139,8 +146,8 @@ def linearize(
         to_lags = problem.to_lags[n]
         inputs = lagged_inputs(v, n, problem.lags, problem.lead) @ to_lags
         starts = start_responses(c, problem.first[:, n], T, min(problem.free, T))
-        for sampled, outputs in sampled_alike(problem.sampled[:, :, n]):
-            regression = SectionRegression.make(inputs, starts, problem.drift, sampled)
+        for weight, outputs in weighted_alike(problem.weight[:, :, n]):
+            regression = SectionRegression.make(inputs, starts, problem.drift, weight)
             shape = (len(outputs), y.shape[4])
             x = y[:, :, n, outputs].reshape(S, T, -1)
             a, left = regression.solve(x)

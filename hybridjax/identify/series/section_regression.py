@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Inexact
 
 
 # Singular values of regressors below this part of the largest one are rounding errors. Doubled:
@@ -23,13 +23,14 @@ class SectionRegression(NamedTuple):
     inputs: Float[np.ndarray, "S T r"]
     starts: Float[np.ndarray, "S T K"]
     """Responses to unknown starts."""
-    sampled: Bool[np.ndarray, "S T 1"]
+    weight: Inexact[np.ndarray, "S T 1"] | Bool[np.ndarray, "S T 1"]
+    """What rows are multiplied by: roots of their weights, zero where there is no sample."""
     basis: Float[np.ndarray, "S T k"]
-    """Orthonormal basis of the sampled rows of starts and drift, record by record."""
+    """Orthonormal basis of the weighted rows of starts and drift, record by record."""
     to_starts: Float[np.ndarray, "S k K"]
     """Takes coefficients of the basis to those of the starts."""
     remainder: Float[np.ndarray, "rows r"]
-    """The sampled rows of the inputs, less what starts and drift explain."""
+    """The weighted rows of the inputs, less what starts and drift explain."""
     root: Float[np.ndarray, "r k"]
     """root @ root.T is the inverse of the Gram matrix of `remainder`."""
 
@@ -39,9 +40,9 @@ class SectionRegression(NamedTuple):
         inputs: Float[np.ndarray, "S T r"],
         starts: Float[np.ndarray, "S T K"],
         drift: Float[np.ndarray, "S T k"],
-        sampled: Bool[np.ndarray, "S T"],
+        weight: Inexact[np.ndarray, "S T"] | Bool[np.ndarray, "S T"],
     ) -> "SectionRegression":
-        rows = sampled[:, :, None]
+        rows = weight[:, :, None]
         each = rows * np.concatenate([starts, drift], axis=2)
         basis, s, right = np.linalg.svd(each, full_matrices=False)
         kept = s > RANK * s.max(initial=0)
@@ -60,7 +61,7 @@ class SectionRegression(NamedTuple):
     def freedom(self) -> int:
         """Samples less unknowns."""
         used = self.root.shape[1] + (self.basis**2).sum()
-        return int(self.sampled.sum()) - int(round(float(used)))
+        return int((self.weight > 0).sum()) - int(round(float(used)))
 
     @property
     def leverage(self) -> Float[np.ndarray, "S T"]:
@@ -71,8 +72,8 @@ class SectionRegression(NamedTuple):
     def solve(
         self, x: Float[np.ndarray, "S T C"]
     ) -> tuple[Float[np.ndarray, "r C"], Float[np.ndarray, "S T C"]]:
-        """Coefficients of the inputs for C outputs, and what is left of these where sampled."""
-        a, left = np.zeros((self.remainder.shape[1], x.shape[2])), self.sampled * x
+        """Coefficients of the inputs for C outputs, and what is left of these, weighted."""
+        a, left = np.zeros((self.remainder.shape[1], x.shape[2])), self.weight * x
         for _ in range(2):  # the second time for accuracy
             left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
             more = self.root @ (self.root.T @ (self.remainder.T @ left.reshape(-1, x.shape[2])))
@@ -85,17 +86,15 @@ class SectionRegression(NamedTuple):
     ) -> Float[np.ndarray, "S T C"]:
         """What inputs with these coefficients, and the starts that fit x best, make of all rows."""
         forced = self.inputs @ a
-        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ (self.sampled * (x - forced)))
+        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ (self.weight * (x - forced)))
         return forced + self.starts @ free
 
 
-def sampled_alike(
-    sampled: Bool[np.ndarray, "S T ny"],
-) -> Iterator[tuple[Bool[np.ndarray, "S T"], list[int]]]:
-    """The rows in which outputs are sampled, and the outputs that are sampled in these."""
-    left = list(range(sampled.shape[2]))
+def weighted_alike(weight: np.ndarray) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Of weights (S, T, ny), those (S, T) that differ, and the outputs that have them."""
+    left = list(range(weight.shape[2]))
     while left:
-        rows = sampled[..., left[0]]
-        same = [i for i in left if np.array_equal(sampled[..., i], rows)]
+        rows = weight[..., left[0]]
+        same = [i for i in left if np.array_equal(weight[..., i], rows)]
         yield rows, same
         left = [i for i in left if i not in same]

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance, correlated_cycles, newey_west, sandwich
+from ..multipliers.covariance import Covariance, correlated_cycles, sandwich, serial_covariance
 from ..multipliers.denominator import Denominator
 from .shared_state import (
     SharedStateModel,
@@ -181,7 +181,7 @@ def denominator_of(fit: SharedStateFit, errors: Literal["residuals", "white"]) -
     mine = slopes @ (to_c @ hessian @ root).T
     score = np.einsum("stad,sta->std", mine, error)
     parts = np.einsum("stad,stae->stde", mine, mine)
-    gradient = newey_west(score, correlated_cycles(np.linalg.eigvals(model.A), T))
+    gradient = serial_covariance(score, correlated_cycles(np.linalg.eigvals(model.A), T))
     scaled = sandwich(np.eye(d), gradient.matrix, parts.reshape(-1, d, d))
     covariance = Covariance(half @ scaled.matrix @ half.T, scaled.freedom / gradient.terms)
     return Denominator(c, covariance, converged)

@@ -11,6 +11,7 @@ from ...sections.crossing import Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording
 from ..smoothing import FEWEST, bridgeable, gaps, spline
+from ..spikes import without_spikes
 from .tracker import track
 from .winding import LONGEST_GAP, Phase, Winding
 
@@ -73,13 +74,14 @@ def kinematic_angles(
     center, scale = _plane(recording, family)
     samples = []
     for trial in recording.trials:
-        both = np.isfinite(trial.values[:, columns]).all(axis=1)
+        signals = np.stack([without_spikes(trial.values[:, k]) for k in columns], axis=1)
+        both = np.isfinite(signals).all(axis=1)
         if both.sum() < FEWEST:
             raise DefinitionError(
                 f"trial '{trial.name}' has {int(both.sum())} samples of {names[0]} and "
                 f"{names[1]}: too few for a phase."
             )
-        samples.append((trial.time[both], (trial.values[both][:, columns] - center) / scale))
+        samples.append((trial.time[both], (signals[both] - center) / scale))
     anchor = family.anchor
     first = 0.0 if isinstance(anchor, Crossing) else float(anchor)
     angles = [Angle(time, _angle(z, first)) for time, z in samples]

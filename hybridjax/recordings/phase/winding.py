@@ -1,5 +1,7 @@
 """The phase of a recording."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -120,6 +122,18 @@ class Phase(eqx.Module):
             f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
             f"{100 * self.drift:.2g} % per cycle{notes})"
         )
+
+
+def count_on(
+    parts: Sequence[Winding],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Times and phases of a trial's stretches one after the other, each from a new cycle on."""
+    times, phases, next_cycle = [np.zeros(0)], [np.zeros(0)], 0.0
+    for part in parts:
+        times.append(part.time)
+        phases.append(part.phase - np.floor(part.phase[0]) + next_cycle)
+        next_cycle = np.ceil(phases[-1][-1])
+    return np.concatenate(times), np.concatenate(phases)
 
 
 def _periods(parts: tuple[Winding, ...]) -> Float[np.ndarray, " _"]:
