@@ -1,6 +1,6 @@
 """What the data cannot carry, in plain words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import equinox as eqx
@@ -16,6 +16,7 @@ from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
+from .inspection.finding import Finding
 from .spectra import input_band, input_spectrum
 
 
@@ -76,12 +77,13 @@ class Advice(eqx.Module):
         return "\n".join(self.warnings) or "Nothing speaks against the fit."
 
 
-def advise(data: SectionData, fit: SeriesFit) -> Advice:
+def advise(data: SectionData, fit: SeriesFit, findings: Sequence[Finding] = ()) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
     Too few strides for the unknowns, more multipliers than the data carry, inputs without power
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
-    intervals that reach the unit circle, an iteration that did not end.
+    intervals that reach the unit circle, an iteration that did not end. The `findings` of an
+    inspection come first.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
@@ -94,7 +96,7 @@ def advise(data: SectionData, fit: SeriesFit) -> Advice:
     plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     band = input_band(data)
-    warnings = []
+    warnings = list(map(repr, findings))
     if sampled - unknown < _FEW_LEFT_OVER * sampled:
         warnings.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "

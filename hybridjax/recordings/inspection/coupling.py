@@ -1,0 +1,226 @@
+"""Whether the outputs answer the input, and do so in all parts of a recording."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ...experiments.record import Record
+from ..data import SectionData
+from .finding import Finding
+
+
+# Samples of a cycle from which the next cycle is predicted, at most. Doubled: more cycles are needed
+# to learn it.
+_SECTIONS = 8
+# Cycles of a part, at least, and parts of a record, at most. Doubled: what happens in a short while
+# is not seen; or it is, where recordings are long.
+_SHORTEST, _PARTS = 16, 4
+# Cycles per unknown. Doubled: nothing is said of short recordings.
+_ENOUGH = 3
+# Of the mean variance of the regressors, what is added to each of them. Doubled: inputs of narrow
+# bands are told apart less well.
+_RIDGE = 1e-4
+# Of the median rms of an input, that of a part with pushes. Doubled: parts with weak pushes do not
+# count.
+_PUSHED = 0.1
+# Outputs are cut off at so many robust standard deviations (1.4826 median moduli for a normal
+# distribution), and these are at least this part of the rms. Doubled: spikes matter more.
+_LARGEST, _MAD, _LEAST = 5.0, 1.4826, 0.1
+# Standard errors that are beyond doubt. Doubled: weaker answers pass for none.
+_CLEAR = 4.0
+# Of the usual gain, what is odd; and what is none. Doubled: what is displaced by little is
+# reported; or what has a weak answer.
+_ODD, _NONE = 0.8, 0.4
+# What is left unexplained where the input is displaced by some sections, if it is displaced, of what
+# is otherwise. Doubled: more is reported, also by chance.
+_BETTER = 0.7
+# How many times the usual power is left unexplained where something else acted. Doubled: weaker
+# disturbances pass.
+_DISTURBED = 9.0
+
+
+class _Part(NamedTuple):
+    """A part of a record, in whole cycles from section 0; outputs at K of the N sections."""
+
+    trial: int
+    start: float
+    end: float
+    u: Float[np.ndarray, "T N nu"]
+    y: Float[np.ndarray, "T Kny"]
+    ahead: int
+    """Cycles by which an input may come later than what it explains, by the lead of the record."""
+
+    def before(self) -> Float[np.ndarray, "t Kny"]:
+        """Each cycle's last one."""
+        return self.y[: len(self.y) - 1 - self.ahead]
+
+    def after(self) -> Float[np.ndarray, "t Kny"]:
+        """The cycles that are predicted."""
+        return self.y[1 : len(self.y) - self.ahead]
+
+    def inputs(self, i: int, displaced: int = 0) -> Float[np.ndarray, "t k"]:
+        """An input in the cycles that explain these, displaced by some sections."""
+        T, N = self.u.shape[:2]
+        K = min(N, _SECTIONS)
+        u = np.roll(self.u[..., i].reshape(-1), displaced).reshape(T, N)
+        u = np.stack([x.mean(axis=1) for x in np.array_split(u, K, axis=1)], axis=1)
+        return np.concatenate([u[c : c + T - 1 - self.ahead] for c in range(2 + self.ahead)], 1)
+
+
+def unanswered(data: SectionData, names: tuple[str, ...]) -> list[Finding]:
+    """Inputs that the outputs do not answer: in all trials, or in parts of them.
+
+    Each cycle is predicted from the one before and from the inputs, linearly, as learned from the
+    other trials (or the other parts of a single one). A part's gain is how much of what is
+    predicted from an input happens: about 1. An input of another trial has a gain of 0, one with
+    the other sign one of -1, and the gain of one that is displaced in time grows where it is put
+    back. Standard errors come from the residuals, cycle by cycle.
+
+    **Arguments:** `names`: of the trials.
+    """
+    parts = [p for r, record in enumerate(data.records) for p in _parts(data, r, record)]
+    found = []
+    for i, name in enumerate(data.inputs):
+        size = [float(p.u[..., i].std()) for p in parts]
+        pushed = [p for p, x in zip(parts, size, strict=True) if x > _PUSHED * np.median(size)]
+        found += _one_input(name, i, pushed, names)
+    return found
+
+
+def _one_input(name: str, i: int, parts: list[_Part], names: tuple[str, ...]) -> list[Finding]:
+    answers = _answers(parts, i)
+    if answers is None:
+        return []
+    gain, error = np.array([a.gain() for a in answers]).T
+    weight = error**-2.0
+    usual = float(np.median(gain))
+    together = abs(weight @ gain) / np.sqrt(weight.sum())
+    if together < _CLEAR and np.mean((gain / error) ** 2) < _CLEAR:
+        text = (
+            f"the outputs do not answer {name}: look whether it was recorded in these trials, and "
+            "at the same times."
+        )
+        return [Finding("no answer", "warned", text)]
+    rest = np.array([a.unexplained() for a in answers])
+    disturbed = (rest[:, 0] > _DISTURBED * np.median(rest[:, 0])) & (rest[:, 0] > rest[:, 1])
+    spans: dict[tuple[int, str], list[float]] = {}
+    for a, g, e, other in zip(answers, gain / usual, error / usual, disturbed, strict=True):
+        verdict = _verdict(a, g, _CLEAR * e, other)
+        if verdict:
+            span = spans.setdefault((a.part.trial, verdict), [a.part.start, a.part.end])
+            span[1] = a.part.end
+    return [
+        _finding(name, verdict, f"trial '{names[k]}' at {start:.4g}-{end:.4g} s")
+        for (k, verdict), (start, end) in spans.items()
+    ]
+
+
+def _verdict(a: "_Answer", gain: float, unsure: float, disturbed: bool) -> str:
+    """What is odd about a part, whose gain is relative to the usual one; "" if nothing is."""
+    if gain < -max(_NONE, unsure):
+        return "sign"
+    N = a.part.u.shape[1]
+    moves = [m for m in range(-N // 2, N // 2 + 1) if m]
+    left = [a.unexplained(m)[0] for m in moves]
+    best = int(np.argmin(left))
+    if left[best] < _BETTER * a.unexplained()[0]:
+        return "late" if moves[best] < 0 else "early"
+    if gain < _NONE and gain + unsure < _ODD:
+        return "none"
+    return "disturbed" if disturbed else ""
+
+
+def _finding(name: str, verdict: str, where: str) -> Finding:
+    if verdict == "sign":
+        text = f"the outputs answer {name} with the other sign in {where}: turn it."
+        return Finding("another sign", "refused", text)
+    if verdict in ("late", "early"):
+        text = (
+            f"{name} seems to be {verdict} in {where}, compared with the rest: look at the clocks "
+            "of the instruments."
+        )
+        return Finding("displaced input", "warned", text)
+    if verdict == "none":
+        text = (
+            f"the outputs do not answer {name} in {where}, but do elsewhere: it may be that of "
+            "another trial."
+        )
+        return Finding("foreign input", "warned", text)
+    text = (
+        f"something else than {name} moved the outputs in {where}: a push that was not recorded, a "
+        "stumble, a sensor that failed."
+    )
+    return Finding("disturbed", "warned", text)
+
+
+class _Answer(NamedTuple):
+    """What the outputs of a part do beyond what the cycle before and the other inputs explain, and
+    how an input is learned to explain it."""
+
+    part: _Part
+    i: int
+    rest: Float[np.ndarray, "t Kny"]
+    learned: Float[np.ndarray, "k Kny"]
+
+    def gain(self, displaced: int = 0) -> tuple[float, float]:
+        """How much of what is predicted from the input happens, and its standard error."""
+        predicted = self.part.inputs(self.i, displaced) @ self.learned
+        power = float((predicted**2).sum())
+        gain = float((self.rest * predicted).sum()) / power
+        each = ((self.rest - gain * predicted) * predicted).sum(axis=1)
+        return gain, float(np.sqrt((each**2).sum())) / power
+
+    def unexplained(self, displaced: int = 0) -> tuple[float, float]:
+        """The mean square of what is not predicted, and of what is predicted from the input."""
+        predicted = self.part.inputs(self.i, displaced) @ self.learned
+        return float(((self.rest - predicted) ** 2).mean()), float((predicted**2).mean())
+
+
+def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
+    """Each part's, learned from other trials; None if there are too few cycles to learn from."""
+    sides, squares, products = [], [], []
+    for p in parts:
+        x = np.concatenate([p.before(), *(p.inputs(k) for k in range(p.u.shape[2]))], axis=1)
+        sides.append(x)
+        squares.append(x.T @ x)
+        products.append(x.T @ p.after())
+    answers = []
+    for n, part in enumerate(parts):
+        others = [k for k, p in enumerate(parts) if p.trial != part.trial]
+        others = others or [k for k in range(len(parts)) if k != n]
+        unknown = sides[n].shape[1]
+        if sum(len(sides[k]) for k in others) < _ENOUGH * unknown:
+            return None
+        square = sum(squares[k] for k in others)
+        square = square + _RIDGE * np.trace(square) / unknown * np.eye(unknown)
+        b = np.linalg.solve(square, sum(products[k] for k in others))
+        own, wide = part.y.shape[1], part.inputs(i).shape[1]
+        rows = slice(own + i * wide, own + (i + 1) * wide)
+        rest = part.after() - sides[n] @ b + sides[n][:, rows] @ b[rows]
+        answers.append(_Answer(part, i, rest, b[rows]))
+    return answers or None
+
+
+def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
+    """Without scales: inputs in their rms, outputs in robust standard deviations."""
+    N = data.n_sections
+    first = -record.first_section % N
+    cycles = (len(record.u) - first) // N
+    number = min(_PARTS, cycles // _SHORTEST)
+    edges = np.linspace(0, cycles, number + 1).astype(int) if number else []
+    size_u, size_y = data.rms()
+    every = np.concatenate([x.y for x in data.records])
+    size_y = np.maximum(_MAD * np.nanmedian(np.abs(every), axis=0), _LEAST * size_y)
+    at = np.linspace(0, N, min(N, _SECTIONS), endpoint=False).astype(int)
+    u = np.nan_to_num(record.u / size_u)
+    y = np.nan_to_num(np.clip(record.y / size_y, -_LARGEST, _LARGEST))
+    parts = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        rows = slice(first + a * N, first + b * N)
+        t = data.times[r][rows]
+        shape = (b - a, N, -1)
+        ys = y[rows].reshape(shape)[:, at].reshape(b - a, -1)
+        ahead = -(-record.lead // N)
+        parts.append(_Part(data.trials[r], t[0], t[-1], u[rows].reshape(shape), ys, ahead))
+    return parts
