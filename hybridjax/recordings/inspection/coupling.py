@@ -3,14 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ...experiments.record import Record
 from ..data import SectionData
-from .finding import Finding
+from .finding import Finding, listed
 
 
-# Samples of a cycle from which the next cycle is predicted, at most. Doubled: more cycles are needed
+# Samples of a cycle from which the next one is predicted, at most. Doubled: more cycles are needed
 # to learn it.
 _SECTIONS = 8
 # Cycles of a part, at least, and parts of a record, at most. Doubled: what happens in a short while
@@ -26,18 +26,18 @@ _RIDGE = 1e-4
 _PUSHED = 0.1
 # Outputs are cut off at so many robust standard deviations (1.4826 median moduli for a normal
 # distribution), and these are at least this part of the rms. Doubled: spikes matter more.
-_LARGEST, _MAD, _LEAST = 5.0, 1.4826, 0.1
+_LARGEST, _MAD, _LEAST = 8.0, 1.4826, 0.1
 # Standard errors that are beyond doubt. Doubled: weaker answers pass for none.
 _CLEAR = 4.0
 # Of the usual gain, what is odd; and what is none. Doubled: what is displaced by little is
 # reported; or what has a weak answer.
 _ODD, _NONE = 0.8, 0.4
-# What is left unexplained where the input is displaced by some sections, if it is displaced, of what
-# is otherwise. Doubled: more is reported, also by chance.
-_BETTER = 0.7
-# How many times the usual power is left unexplained where something else acted. Doubled: weaker
-# disturbances pass.
-_DISTURBED = 9.0
+# Of what is left unexplained, what is left where the input is displaced by some sections, if that
+# is right. Doubled: more is reported, also by chance.
+_BETTER = 0.5
+# How many times the usual power is left unexplained where something else acted, and what share of
+# what the input explains. Doubled: weaker disturbances pass.
+_DISTURBED, _MUCH = 9.0, 0.25
 
 
 class _Part(NamedTuple):
@@ -48,24 +48,17 @@ class _Part(NamedTuple):
     end: float
     u: Float[np.ndarray, "T N nu"]
     y: Float[np.ndarray, "T Kny"]
+    rows: Int[np.ndarray, " t"]
+    """Cycles that are predicted: all that is needed for them is known."""
     ahead: int
     """Cycles by which an input may come later than what it explains, by the lead of the record."""
 
-    def before(self) -> Float[np.ndarray, "t Kny"]:
-        """Each cycle's last one."""
-        return self.y[: len(self.y) - 1 - self.ahead]
-
-    def after(self) -> Float[np.ndarray, "t Kny"]:
-        """The cycles that are predicted."""
-        return self.y[1 : len(self.y) - self.ahead]
-
     def inputs(self, i: int, displaced: int = 0) -> Float[np.ndarray, "t k"]:
-        """An input in the cycles that explain these, displaced by some sections."""
+        """What explains these cycles of an input that is displaced by some sections."""
         T, N = self.u.shape[:2]
-        K = min(N, _SECTIONS)
         u = np.roll(self.u[..., i].reshape(-1), displaced).reshape(T, N)
-        u = np.stack([x.mean(axis=1) for x in np.array_split(u, K, axis=1)], axis=1)
-        return np.concatenate([u[c : c + T - 1 - self.ahead] for c in range(2 + self.ahead)], 1)
+        u = np.stack([x.mean(axis=1) for x in np.array_split(u, min(N, _SECTIONS), axis=1)], 1)
+        return _deviations([u[self.rows + c] for c in range(-1, self.ahead + 1)])
 
 
 def unanswered(data: SectionData, names: tuple[str, ...]) -> list[Finding]:
@@ -102,18 +95,15 @@ def _one_input(name: str, i: int, parts: list[_Part], names: tuple[str, ...]) ->
             "at the same times."
         )
         return [Finding("no answer", "warned", text)]
-    rest = np.array([a.unexplained() for a in answers])
-    disturbed = (rest[:, 0] > _DISTURBED * np.median(rest[:, 0])) & (rest[:, 0] > rest[:, 1])
-    spans: dict[tuple[int, str], list[float]] = {}
+    left, explained = np.array([a.unexplained() for a in answers]).T
+    disturbed = left > np.maximum(_DISTURBED * np.median(left), _MUCH * explained)
+    spans: dict[str, list[str]] = {}
     for a, g, e, other in zip(answers, gain / usual, error / usual, disturbed, strict=True):
         verdict = _verdict(a, g, _CLEAR * e, other)
         if verdict:
-            span = spans.setdefault((a.part.trial, verdict), [a.part.start, a.part.end])
-            span[1] = a.part.end
-    return [
-        _finding(name, verdict, f"trial '{names[k]}' at {start:.4g}-{end:.4g} s")
-        for (k, verdict), (start, end) in spans.items()
-    ]
+            where = f"trial '{names[a.part.trial]}', {a.part.start:.4g}-{a.part.end:.4g} s"
+            spans.setdefault(verdict, []).append(where)
+    return [_finding(name, verdict, where) for verdict, where in spans.items()]
 
 
 def _verdict(a: "_Answer", gain: float, unsure: float, disturbed: bool) -> str:
@@ -122,33 +112,34 @@ def _verdict(a: "_Answer", gain: float, unsure: float, disturbed: bool) -> str:
         return "sign"
     N = a.part.u.shape[1]
     moves = [m for m in range(-N // 2, N // 2 + 1) if m]
-    left = [a.unexplained(m)[0] for m in moves]
-    best = int(np.argmin(left))
-    if left[best] < _BETTER * a.unexplained()[0]:
-        return "late" if moves[best] < 0 else "early"
+    best = min(moves, key=lambda m: a.unexplained(m)[0])
+    moved, error = a.gain(best)
+    if a.unexplained(best)[0] < _BETTER * a.unexplained()[0] and moved > _CLEAR * error:
+        return "displaced"
     if gain < _NONE and gain + unsure < _ODD:
         return "none"
     return "disturbed" if disturbed else ""
 
 
-def _finding(name: str, verdict: str, where: str) -> Finding:
+def _finding(name: str, verdict: str, where: list[str]) -> Finding:
+    place = listed(where)
     if verdict == "sign":
-        text = f"the outputs answer {name} with the other sign in {where}: turn it."
+        text = f"the outputs answer {name} with the other sign ({place}): turn it."
         return Finding("another sign", "refused", text)
-    if verdict in ("late", "early"):
+    if verdict == "displaced":
         text = (
-            f"{name} seems to be {verdict} in {where}, compared with the rest: look at the clocks "
-            "of the instruments."
+            f"the outputs answer {name} earlier or later than elsewhere ({place}): look at the "
+            "clocks of the instruments."
         )
         return Finding("displaced input", "warned", text)
     if verdict == "none":
         text = (
-            f"the outputs do not answer {name} in {where}, but do elsewhere: it may be that of "
+            f"the outputs do not answer {name}, but do elsewhere ({place}): it may be that of "
             "another trial."
         )
         return Finding("foreign input", "warned", text)
     text = (
-        f"something else than {name} moved the outputs in {where}: a push that was not recorded, a "
+        f"something else than {name} moved the outputs ({place}): a push that was not recorded, a "
         "stumble, a sensor that failed."
     )
     return Finding("disturbed", "warned", text)
@@ -181,10 +172,11 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
     """Each part's, learned from other trials; None if there are too few cycles to learn from."""
     sides, squares, products = [], [], []
     for p in parts:
-        x = np.concatenate([p.before(), *(p.inputs(k) for k in range(p.u.shape[2]))], axis=1)
+        inputs = [p.inputs(k) for k in range(p.u.shape[2])]
+        x = np.concatenate([_deviations([p.y[p.rows - 1]]), *inputs], axis=1)
         sides.append(x)
         squares.append(x.T @ x)
-        products.append(x.T @ p.after())
+        products.append(x.T @ _deviations([p.y[p.rows]]))
     answers = []
     for n, part in enumerate(parts):
         others = [k for k, p in enumerate(parts) if p.trial != part.trial]
@@ -197,9 +189,15 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
         b = np.linalg.solve(square, sum(products[k] for k in others))
         own, wide = part.y.shape[1], part.inputs(i).shape[1]
         rows = slice(own + i * wide, own + (i + 1) * wide)
-        rest = part.after() - sides[n] @ b + sides[n][:, rows] @ b[rows]
+        rest = _deviations([part.y[part.rows]]) - sides[n] @ b + sides[n][:, rows] @ b[rows]
         answers.append(_Answer(part, i, rest, b[rows]))
     return answers or None
+
+
+def _deviations(columns: list[Float[np.ndarray, "t _"]]) -> Float[np.ndarray, "t k"]:
+    """Side by side, without their means: each part has a level of its own."""
+    x = np.concatenate(columns, axis=1)
+    return x - x.mean(axis=0)
 
 
 def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
@@ -213,14 +211,19 @@ def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
     every = np.concatenate([x.y for x in data.records])
     size_y = np.maximum(_MAD * np.nanmedian(np.abs(every), axis=0), _LEAST * size_y)
     at = np.linspace(0, N, min(N, _SECTIONS), endpoint=False).astype(int)
-    u = np.nan_to_num(record.u / size_u)
-    y = np.nan_to_num(np.clip(record.y / size_y, -_LARGEST, _LARGEST))
+    ahead = -(-record.lead // N)
     parts = []
     for a, b in zip(edges[:-1], edges[1:], strict=True):
-        rows = slice(first + a * N, first + b * N)
-        t = data.times[r][rows]
-        shape = (b - a, N, -1)
-        ys = y[rows].reshape(shape)[:, at].reshape(b - a, -1)
-        ahead = -(-record.lead // N)
-        parts.append(_Part(data.trials[r], t[0], t[-1], u[rows].reshape(shape), ys, ahead))
+        where = slice(first + a * N, first + b * N)
+        u = (record.u[where] / size_u).reshape(b - a, N, -1)
+        y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
+        y = np.clip(y, -_LARGEST, _LARGEST)
+        known = np.isfinite(u).all(axis=(1, 2))
+        rows = np.arange(1, b - a - ahead)
+        used = [known[rows + c] for c in range(-1, ahead + 1)]
+        used += [np.isfinite(y[rows + c]).all(axis=1) for c in (-1, 0)]
+        rows = rows[np.all(used, axis=0)]
+        t = data.times[r][where]
+        part = _Part(data.trials[r], t[0], t[-1], *map(np.nan_to_num, (u, y)), rows, ahead)
+        parts += [part] if len(rows) >= _SHORTEST / 2 else []
     return parts

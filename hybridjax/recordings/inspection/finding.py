@@ -1,6 +1,6 @@
 """What an inspection finds, and where."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -53,6 +53,11 @@ def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " n"]]) -> st
         edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
         for a, b in edges.reshape(-1, 2):
             found.append(f"trial '{trial.name}', {trial.time[a]:.2f}-{trial.time[b - 1]:.2f} s")
+    return listed(found)
+
+
+def listed(found: Sequence[str]) -> str:
+    """The first few places, and how many more there are."""
     more = f"; and {len(found) - _FEW} more" if len(found) > _FEW else ""
     return "; ".join(found[:_FEW]) + more
 

@@ -74,8 +74,8 @@ def _finding(a: Trial, b: Trial, same: Bool[np.ndarray, " n"]) -> Finding:
     return Finding(
         "overlap",
         "left out",
-        f"{same.sum()} samples ({places([b], [same])}) are in trial '{a.name}' too, and count once; cut "
-        "one of the two.",
+        f"{same.sum()} samples ({places([b], [same])}) are in trial '{a.name}' too, and "
+        "count once; cut one of the two.",
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..recording import Recording
-from .finding import Finding
+from .finding import Finding, listed
 
 
 # The share of the samples at either end that says nothing of a signal's range. Doubled: outliers
@@ -94,8 +94,8 @@ def _swapped(
 
 
 def clocks(recording: Recording) -> list[Finding]:
-    """Time in another unit in one trial, and jumps of a clock that is regular otherwise."""
-    found = []
+    """Time in another unit in one trial, and jumps of clocks that are regular otherwise."""
+    found, jumps = [], []
     steps = [float(np.median(np.diff(t.time))) for t in recording.trials]
     for s, trial in enumerate(recording.trials):
         rest = steps[:s] + steps[s + 1 :]
@@ -108,13 +108,15 @@ def clocks(recording: Recording) -> list[Finding]:
             )
             found.append(Finding("another unit of time", "refused", text))
         step = np.diff(trial.time) / steps[s]
-        jumps = np.flatnonzero(step > _JUMP)
-        if len(jumps) and (np.abs(step - 1) < _REGULAR).mean() > _NEARLY_ALL:
-            first = jumps[0]
-            text = (
-                f"the clock of trial '{trial.name}' jumps {len(jumps)} times, first by "
-                f"{steps[s] * step[first]:.3g} at {trial.time[first]:.2f} s: after a pause this is "
-                "right; if the clock was set, make a trial of each part."
-            )
-            found.append(Finding("jump of the clock", "warned", text))
+        if (np.abs(step - 1) < _REGULAR).mean() > _NEARLY_ALL:
+            jumps += [
+                f"trial '{trial.name}', by {steps[s] * step[k]:.3g} at {trial.time[k]:.2f} s"
+                for k in np.flatnonzero(step > _JUMP)
+            ]
+    if jumps:
+        text = (
+            f"the clock jumps ({listed(jumps)}): after a pause this is right; if the clock was "
+            "set, make a trial of each part."
+        )
+        found.append(Finding("jump of the clock", "warned", text))
     return found

@@ -1,10 +1,11 @@
 """What goes wrong in laboratories, by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
+from ...errors import DefinitionError
 from ...recordings.recording import Recording
 from .change import Names
 from .clocks import (
@@ -52,7 +53,9 @@ from .trials import (
 )
 
 
-MISHAPS: dict[str, Callable[[Recording, Names, np.random.Generator], Recording]] = {
+Mishap = Callable[[Recording, Names, np.random.Generator], Recording]
+
+MISHAPS: dict[str, Mishap] = {
     # sensors, amplifiers, converters
     "white noise": partial(noise, size=0.01),
     "rounded to 12 bits": partial(rounding, bits=12),
@@ -95,7 +98,7 @@ MISHAPS: dict[str, Callable[[Recording, Names, np.random.Generator], Recording]]
     "push not plugged in": no_plug,
     "the same trial thrice": thrice,
     "overlapping trials": overlap,
-    # clocks and events
+    # clocks
     "a third of the samples not there": partial(thinning, share=1 / 3),
     "few samples": partial(slow_sampling, every=8),
     "jitter of the time stamps": partial(jitter, share=0.05),
@@ -109,10 +112,40 @@ MISHAPS: dict[str, Callable[[Recording, Names, np.random.Generator], Recording]]
     "push early": partial(late_push, samples=-10),
     "push late in one trial": partial(late_push, samples=25, only=(1,)),
     "clock of the push is fast": partial(clock_of_push, share=0.005),
+}
+"""What may happen to a recording, by name; sizes are in standard deviations of each signal."""
+
+EVENT_MISHAPS: dict[str, Mishap] = {
     "events lost and doubled": partial(misjudged_events, lost=0.05, doubled=0.05),
-    "events inexact": partial(misjudged_events, off=0.002),
+    "events inexact": partial(misjudged_events, off=0.0005),
     "another event in one trial": partial(other_event, cycles=0.4),
 }
-"""Mishaps by name: functions of a recording (three trials or more), its `Names` and a generator of
-random numbers, that return what a poor laboratory would have recorded. Sizes are in standard
-deviations of each signal."""
+"""What may happen to recorded events, by name."""
+
+
+def mishandle(
+    recording: Recording,
+    mishap: str,
+    *,
+    input: str,
+    outputs: Sequence[str],
+    event: str,
+    seed: int = 0,
+) -> Recording:
+    """What a poor laboratory would have recorded.
+
+    **Arguments:**
+
+    - `recording`: of three trials or more.
+    - `mishap`: its name in `hj.testing.MISHAPS` or `hj.testing.EVENT_MISHAPS`.
+    - `input`, two or more `outputs`: names of signals. `event`: of one that comes once in each
+      cycle. `seed`: of what happens at random.
+
+    **Raises:** `DefinitionError` for an unknown mishap, and where the result is no recording: a
+    clock that runs backwards.
+    """
+    known = MISHAPS | EVENT_MISHAPS
+    if mishap not in known:
+        raise DefinitionError(f"there is no mishap '{mishap}'; there are {', '.join(known)}.")
+    names = Names(input, tuple(outputs), event)
+    return known[mishap](recording, names, np.random.default_rng(seed))
