@@ -12,7 +12,7 @@ from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.fit import assemble, fit_series
 from ..identify.series.output_error import OutputErrorProblem, linearize
 from ..identify.series.series_fit import SeriesFit
-from ..identify.series.simulation import simulate_record
+from ..identify.series.simulation import can_be_compared, simulate_record
 from ..identify.series.validation import Validation, validate
 from .data import SectionData
 
@@ -20,6 +20,9 @@ from .data import SectionData
 # Cycles to choose an order from, and to try it on. Doubled: both take twice as long, and weaker
 # multipliers are seen.
 CYCLES_LOOKED_AT = 1000
+# Cycles at the end of a record that tell anything beyond how they begin. Doubled: more records are
+# fitted, or held out, whole.
+_SHORTEST_END = 12
 # Relative difference of two misfits that are as good as equal. Doubled: smaller orders are chosen.
 _AS_GOOD = 0.02
 
@@ -27,8 +30,8 @@ _AS_GOOD = 0.02
 def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     """The number of multipliers that predicts best what it was not fitted to.
 
-    For each number a first, consistent estimate (total least squares) is made from all but the last
-    `share` of every record, and simulated on the rest. The smallest number counts whose misfit is
+    For each number a first, consistent estimate (total least squares) is made from all but what is
+    held out (see `hold_out`), and simulated on that. The smallest number counts whose misfit is
     within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
@@ -36,7 +39,7 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
     early, late = _split(data, share)
     grid = CycleGrid.from_data(early)
     rest = uninterrupted_records(late)
-    misfits = []
+    fits = []
     for d in range(1, most + 1):
         problem = OutputErrorProblem.from_grid(grid, d, grid.n_sections, free_start=True)
         c = total_least_squares(delayed_outputs(problem, d))
@@ -44,13 +47,19 @@ def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
         if (found.freedom <= 2 * d).any():
             break
         fit = assemble(grid, problem, found, Denominator.of_unknown_accuracy(c))
-        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
-        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
-    if not misfits:
+        long = [r for r in rest if can_be_compared(fit, r, free_start=True)]
+        if not long:
+            break
+        fits, rest = [*fits, fit], long
+    if not fits:
         raise DefinitionError(
             f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
             "sections: record more, or take fewer sections."
         )
+    misfits = []
+    for fit in fits:
+        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
+        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
     return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
 
 
@@ -64,7 +73,8 @@ class HeldOut(NamedTuple):
 def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
     """Fit all but the last `share` of every record, and simulate that.
 
-    Of long recordings the first 1000 cycles are looked at.
+    Of records whose end would be shorter than twelve cycles, a `share` is held out whole. Of long
+    recordings the first 1000 cycles are looked at.
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
@@ -76,11 +86,17 @@ def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
 
 
 def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
-    early, late = [], []
     enough = min(1.0, CYCLES_LOOKED_AT / data.cycles)
-    for r in data.records:
-        end = round(len(r.u) * enough)
-        cut = round(end * (1 - share))
-        early.append(r.part(0, cut))
-        late.append(r.part(cut, end))
+    ends = [round(len(r.u) * enough) for r in data.records]
+    short = [k for k, n in enumerate(ends) if n * share < _SHORTEST_END * data.n_sections]
+    every = round(1 / share)
+    whole = short[every - 1 :: every]
+    fitted_whole = short if whole or len(short) < len(ends) else []
+    early, late = [], []
+    for k, (r, end) in enumerate(zip(data.records, ends, strict=True)):
+        cut = 0 if k in whole else end if k in fitted_whole else round(end * (1 - share))
+        if cut:
+            early.append(r.part(0, cut))
+        if cut < end:
+            late.append(r.part(cut, end))
     return early, late

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
-from .smoothing import spline
+from .smoothing import bridgeable, spline
 
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
@@ -173,13 +173,14 @@ class Recording(eqx.Module):
 
         Jumps against the direction (an angle that begins anew) are no events, jumps along it are.
         What crosses a level several times within a cycle, in noise, makes doubled events, which
-        `estimate_phase` leaves out.
+        `estimate_phase` leaves out. Crossings in gaps that are longer than three samples, and than
+        half a wavelength at the bandwidth, are not known, and make no events.
 
         **Arguments:** `event`: its name. `crossing`: of a signal, by name. `bandwidth`: in Hz, of
         the smoothing spline whose crossings are taken; by default it interpolates.
 
-        **Raises:** `DefinitionError` for a signal that is not there or never crosses the level, and
-        a crossing of a function or in charts, which recordings do not have.
+        **Raises:** `DefinitionError` for a signal that is not there or never seen to cross the
+        level, and a crossing of a function or in charts, which recordings do not have.
         """
         signal, level = signal_of(crossing), float(crossing.value)
         column, trials = self.column(signal), []
@@ -187,10 +188,12 @@ class Recording(eqx.Module):
         for trial in self.trials:
             curve = spline(trial.time, trial.values[:, column], bandwidth)
             t, y = curve.time, sign * (curve.values - level)
-            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+            longest = bridgeable(t, np.isfinite(t), 0.5 / bandwidth)
+            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
             if not len(at):
                 raise DefinitionError(
-                    f"trial '{trial.name}': {signal} never crosses {level:g}, {crossing.direction}."
+                    f"trial '{trial.name}': {signal} is never seen to cross {level:g}, "
+                    f"{crossing.direction}."
                 )
             low, high = t[at], t[at + 1]
             for _ in range(_BISECTIONS):

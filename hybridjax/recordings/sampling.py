@@ -5,7 +5,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..errors import DefinitionError
 from ..experiments.record import Record
@@ -14,13 +14,12 @@ from .drift import check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
-from .smoothing import gaps, inside, means, nearest, spline
+from .smoothing import bridgeable, gaps, inside, means, nearest, spline
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
-# so many samples (three, and rounding). Doubled: samples are made up in the middle of gaps twice as
-# long.
-_GAP_SECTIONS, _GAP_SAMPLES = 1.0, 3.001
+# three samples. Doubled: samples are made up in the middle of gaps twice as long.
+_GAP_SECTIONS = 1.0
 # The number of sections where neither the call nor the phase says it. Doubled: half the time from
 # section to section, twice the bandwidth.
 _N_SECTIONS = 32
@@ -63,7 +62,9 @@ def section_data(
       phase: take it out of the signals before (`without_drift`), as `identify_recording`
       does.
     - `max_gap`: the longest time without a sample that a spline may bridge; by default the
-      mean time between sections, but not less than three samples.
+      mean time between sections, but not less than three samples of a signal. Outputs are NaN at
+      sections in longer gaps, of their own or of the signals of an angle that is the phase; inputs
+      if their interval touches a gap of their own.
 
     **Raises:** `DefinitionError` for names that are not there, constant signals, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
@@ -85,11 +86,7 @@ def section_data(
     found, trials = [], []
     for number, trial in enumerate(recording.trials):
         sampler = _Sampler(recording, trial, inputs, outputs, bandwidth, sampled)
-        longest = max_gap
-        if longest is None:
-            step = float(np.median(np.diff(trial.time)))
-            longest = max(_GAP_SECTIONS * phase.period / N, _GAP_SAMPLES * step)
-        parts = [sampler(s, N, longest) for s in phase.stretches[number]]
+        parts = [sampler(s, N, phase.period, max_gap) for s in phase.stretches[number]]
         parts = [p for p in parts if p is not None]
         if timing is not None:
             parts = _with_times(parts, N, phase.period, timing)
@@ -157,10 +154,12 @@ def _number_of_sections(given: int | None, phase: Phase) -> int:
 
 
 class _Part(eqx.Module):
-    """Samples of one stretch, at sections k[0], k[0] + 1, ... of its count."""
+    """Samples of one stretch, at sections k[0], k[0] + 1, ... of its count; whether the phase was
+    seen there."""
 
     k: Int[np.ndarray, " n"]
     t: Float[np.ndarray, " n"]
+    seen: Bool[np.ndarray, " n"]
     u: Float[np.ndarray, "n nu"]
     y: Float[np.ndarray, "n ny"]
 
@@ -182,30 +181,41 @@ class _Sampler:
         self.outputs = [trial.values[:, recording.column(name)] for name in outputs]
         self.curves = [spline(trial.time, x, bandwidth) for x in self.outputs]
 
-    def __call__(self, winding: Winding, n_sections: int, longest: int | float) -> _Part | None:
-        """At the sections of one stretch, if that holds a whole cycle; NaN in gaps that are longer
-        than `longest`."""
+    def __call__(
+        self, winding: Winding, n_sections: int, period: float, max_gap: int | float | None
+    ) -> _Part | None:
+        """At the sections of one stretch, if that holds a whole cycle; NaN in gaps."""
         first, last = winding.phase[[0, -1]] * n_sections
         k = np.arange(np.ceil(first - _ROUNDING), np.floor(last + _ROUNDING) + 1).astype(int)
         if len(k) <= n_sections:
             return None
         t = winding.when(k / n_sections)
-        u = np.stack([self._input(x, t, longest) for x in self.inputs], axis=1)
+        section = _GAP_SECTIONS * period / n_sections
+
+        def holes(x):
+            known = np.isfinite(x)
+            longest = bridgeable(self.time, known, section) if max_gap is None else max_gap
+            return gaps(self.time, known, longest)
+
+        unseen = np.diff(winding.gaps, axis=1)[:, 0] > (section if max_gap is None else max_gap)
+        seen = ~inside(winding.gaps[unseen], t[:-1], t[:-1])
+        u = np.stack([self._input(x, t, holes(x)) for x in self.inputs], axis=1)
         y = np.stack([curve(t[:-1]) for curve in self.curves], axis=1)
         for i, x in enumerate(self.outputs):
-            holes = gaps(self.time, np.isfinite(x), longest)
-            y[inside(holes, t[:-1], t[:-1]), i] = np.nan
-        return _Part(k[:-1], t[:-1], u, y)
+            y[inside(holes(x), t[:-1], t[:-1]) | ~seen, i] = np.nan
+        return _Part(k[:-1], t[:-1], seen, u, y)
 
     def _input(
-        self, x: Float[np.ndarray, " n"], t: Float[np.ndarray, " m1"], longest: int | float
+        self,
+        x: Float[np.ndarray, " n"],
+        t: Float[np.ndarray, " m1"],
+        holes: Float[np.ndarray, "g 2"],
     ) -> Float[np.ndarray, " m"]:
-        seen = np.isfinite(x)
         if self.sampled == "middle":
             u = nearest(self.time, x, (t[:-1] + t[1:]) / 2)
         else:
             u = means(self.time, x, t)
-        u[inside(gaps(self.time, seen, longest), t[:-1], t[1:])] = np.nan
+        u[inside(holes, t[:-1], t[1:])] = np.nan
         return u
 
 
@@ -214,10 +224,8 @@ def _with_times(
 ) -> list[_Part]:
     """The time of crossing as one more output."""
     if timing == "duration":
-        return [
-            eqx.tree_at(lambda p: p.y, p, np.column_stack([p.y, np.diff(p.t, prepend=np.nan)]))
-            for p in parts
-        ]
+        durations = [np.diff(np.where(p.seen, p.t, np.nan), prepend=np.nan) for p in parts]
+        return [_with_output(p, d) for p, d in zip(parts, durations, strict=True)]
     # A line through the times of each section, t = T cycle + a[section], all with the same slope T;
     # cycles are counted through gaps.
     cycles = [
@@ -231,10 +239,12 @@ def _with_times(
     z = t - (np.bincount(section, t, N) / count)[section]
     deviation = z - (x @ z) / (x @ x) * x
     edges = np.cumsum([len(p.k) for p in parts])[:-1]
-    return [
-        eqx.tree_at(lambda p: p.y, p, np.column_stack([p.y, d]))
-        for p, d in zip(parts, np.split(deviation, edges), strict=True)
-    ]
+    deviations = zip(parts, np.split(deviation, edges), strict=True)
+    return [_with_output(p, np.where(p.seen, d, np.nan)) for p, d in deviations]
+
+
+def _with_output(part: _Part, values: Float[np.ndarray, " n"]) -> _Part:
+    return eqx.tree_at(lambda p: p.y, part, np.column_stack([part.y, values]))
 
 
 def _deviations(parts: list[_Part], N: int) -> list[tuple[_Part, Float[np.ndarray, "N nuy"]]]:

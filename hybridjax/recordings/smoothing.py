@@ -10,6 +10,9 @@ from ..errors import DefinitionError
 
 # Samples that a spline is drawn through, at least. Doubled: shorter stretches are left out.
 FEWEST = 5
+# Times between samples that are no gap yet: three, and rounding. Doubled: splines bridge gaps that
+# are twice as long where samples are scarce.
+_GAP_SAMPLES = 3.001
 
 
 class Spline(eqx.Module):
@@ -58,6 +61,14 @@ def spline(
     for k in range(3):
         smooth[k : len(values) - 2 + k] -= weight * q[k] * curvature
     return Spline(time, smooth, np.pad(curvature, 1) / step**2)
+
+
+def bridgeable(
+    time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: int | float = 0.0
+) -> float:
+    """The longest time without a sample that a spline bridges: `longest`, but not less than three
+    samples."""
+    return max(longest, _GAP_SAMPLES * float(np.median(np.diff(time[seen]))))
 
 
 def gaps(

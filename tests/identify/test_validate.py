@@ -126,3 +126,33 @@ def test_bad_requests(small, hopper):
         hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))
     with pytest.raises(hj.DefinitionError, match="lags must be at least 1"):
         hj.validate(small, data, lags=0)
+
+
+def test_records_shorter_than_the_lags(small):
+    """Short pieces count where they can: not where an unknown start explains all of them."""
+    whole = record(small, 4 * 100, 0, 0.3)
+    pieces = [whole.part(0, 103), whole.part(103, 106), whole.part(106, 400)]
+    found = hj.validate(small, pieces)
+    assert found.left_out == 1 and repr(found).endswith("compared, left out: 1")
+    np.testing.assert_array_equal(found.measured, whole.y[106:])
+    assert found.white and found.independent
+    assert hj.validate(small, pieces, start="cycle").left_out == 0
+    synthetic = hj.testing.synthetic_ldtp()
+    u = np.random.default_rng(0).normal(size=(605, 2))
+    y = np.asarray(synthetic.simulate(u)) + np.random.default_rng(1).normal(size=(605, 2))
+    both = hj.Record(u, y, n_sections=6)
+    assert hj.validate(synthetic, [both.part(0, 600), both.part(600, 605)]).independent
+    with pytest.raises(hj.DefinitionError, match="longest of 2 uninterrupted records has 0.75"):
+        hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
+    many = [whole.part(k, k + 2) for k in range(0, 400, 2)]
+    with pytest.raises(hj.DefinitionError, match="too short for 3 lags"):
+        hj.validate(small, many, start="cycle", lags=3)
+    assert hj.validate(small, many, start="cycle").autocorrelation.shape[1] == 1
+
+
+def test_nothing_is_simulated_beyond_the_known_inputs(small):
+    data = record(small, 4 * 100, 0, 0.3)
+    ahead = hj.Record(data.u, data.y, n_sections=4, outputs=data.outputs, lead=5)
+    found = hj.validate(small, ahead)
+    assert found.simulated.shape == found.measured.shape == (395, 2)
+    assert np.isfinite(found.measured).all()

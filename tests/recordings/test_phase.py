@@ -141,7 +141,7 @@ def test_irregular_events(seed, jitter, causal):
 def test_marked_events(wave):
     found = wave.mark("up", hj.Crossing("v", "rising")).trials[0].events["up"]
     np.testing.assert_allclose(found, np.arange(20) + 0.5, atol=1e-7)
-    with pytest.raises(hj.DefinitionError, match="v never crosses 3, rising"):
+    with pytest.raises(hj.DefinitionError, match="v is never seen to cross 3, rising"):
         wave.mark("up", hj.Crossing("v", "rising", value=3.0))
 
 
@@ -156,7 +156,7 @@ def test_what_is_no_phase(wave):
         (dataclasses.replace(CIRCLE, velocity="c"), "needs a c that varies"),
         (dataclasses.replace(CIRCLE, velocity="q"), "no signal 'q'"),
         (hj.AtEvent("strike"), "no event 'strike'; its events are: none"),
-        (hj.Crossing("x", "falling", value=3.0), "x never crosses 3, falling"),
+        (hj.Crossing("x", "falling", value=3.0), "x is never seen to cross 3, falling"),
         (hj.Crossing(lambda t, q: q[0], "falling"), "names a signal, and no charts"),
         (hj.Crossing("x", "falling", charts=("a",)), "names a signal, and no charts"),
         (lambda t, s: t[1:], "returned the shape"),
@@ -196,3 +196,40 @@ def test_means_of_a_line_between_samples():
     t = np.array([0.0, 1.0, 3.0])
     found = means(t, np.array([0.0, 2.0, 2.0]), np.array([0.0, 0.5, 2.0, 3.0]))
     np.testing.assert_allclose(found, [0.5, (0.75 + 2) / 1.5, 2.0])
+
+
+def test_a_crossing_in_a_gap_is_not_known(wave):
+    """Both cycles that it bounds are left out; a gap elsewhere, and single samples, do no harm."""
+    t, (_, x, v) = wave.trials[0].time, wave.trials[0].values.T
+    top = hj.Crossing("v", "falling")  # at whole seconds
+
+    def cycles(start, end):
+        hidden = np.where((t > start) & (t < end), np.nan, v)
+        return hj.recordings.estimate_phase(hj.Recording(t, {"x": x, "v": hidden}), top)
+
+    for gap in [(6.96, 7.04), (6.82, 7.02), (6.9, 7.1)]:
+        found = cycles(*gap)
+        assert found.missed == 2 and len(found.stretches[0]) == 2
+        for k in (0, 1):
+            inner = whole(found, k)
+            np.testing.assert_allclose(inner, np.round(inner), atol=1e-3)
+    for gap in [(7.3, 7.5), (6.995, 7.005)]:
+        found = cycles(*gap)
+        assert found.missed == 0 and len(found.stretches[0]) == 1
+    hidden = np.where(np.abs(t - np.round(t)) < 0.05, np.nan, v)
+    with pytest.raises(hj.DefinitionError, match="v is never seen to cross 0, falling"):
+        hj.Recording(t, {"v": hidden}).mark("top", top)
+
+
+def test_a_pause_of_the_instruments_ends_a_stretch(wave):
+    """Even where the events before and after it are about a period apart."""
+    t, v = wave.trials[0].time, wave.trials[0].values[:, 2]
+    kept = (t < 7.4) | (t > 9.6)
+    later = np.where(t > 8, t - 1.0, t)[kept]  # what happened in the pause took 1.2 s, not 2.2
+    recording = hj.Recording(
+        later, {"v": v[kept]}, events={"top": np.array([*range(8), *range(9, 19)]) + 0.0}
+    )
+    for definition in (hj.Crossing("v", "falling"), hj.AtEvent("top")):
+        found = hj.recordings.estimate_phase(recording, definition)
+        assert len(found.stretches[0]) == 2 and found.stretches[0][0].time[-1] < 7.4
+        assert found.stretches[0][1].time[0] > 8.6

@@ -51,6 +51,46 @@ def test_gaps_are_masked_and_cut(wave):
     assert 0 < data.missing < 0.1
 
 
+def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
+    """Where the phase was not seen, sections are not known to be sections, nor their times."""
+    t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
+    hidden = np.where((t > 4.3) & (t < 4.5), np.nan, v)
+    recording = hj.Recording(t, {"f": f, "x": x, "v": hidden, "w": np.cos(4 * np.pi * t)})
+    for timing, late in (("clock", 0), ("duration", 1 / 8)):
+        data = sample(recording, outputs=("x", "w"), timing=timing)
+        (record,), (times,) = data.records, data.times
+        lost = (times > 4.3) & (times < 4.5)
+        assert lost.sum() == 2
+        np.testing.assert_array_equal(np.isnan(record.y[:, :2]).all(axis=1), lost)
+        after = (times > 4.3) & (times < 4.5 + late)
+        after[0] = timing == "duration"
+        np.testing.assert_array_equal(np.isnan(record.y[:, 2]), after)
+        assert not np.isnan(record.u).any()
+
+
+def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
+    """Two tenths of a cycle, five times, where cycles begin: sections are left out, or right."""
+    t, values = rhythm.trials[0].time, rhythm.trials[0].values
+    names, top = rhythm.signals, hj.Crossing("v", "falling")
+    rng, hidden = np.random.default_rng(0), values.copy()
+    for at in rng.choice(np.arange(10, 190), 5, replace=False):
+        start = at - rng.uniform(0.02, 0.18)
+        hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
+    options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
+    clean, dirty = (
+        sample(hj.Recording(t, dict(zip(names, x.T, strict=True))), top, **options)
+        for x in (values, hidden)
+    )
+    assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
+    (before,) = clean.times
+    for record, times in zip(dirty.records, dirty.times, strict=True):
+        first = int(np.argmin(np.abs(before - times[0])))
+        true = slice(first, first + len(times))
+        np.testing.assert_allclose(times, before[true], atol=2e-3)
+        error = record.y - clean.records[0].y[true]
+        assert np.nanstd(error) < 0.1 * clean.records[0].y.std()
+
+
 def test_slow_drift_is_taken_out(wave):
     t, values = wave.trials[0].time, wave.trials[0].values
     drifting = dict(zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True))

@@ -12,6 +12,23 @@ from .cycle_grid import count_cycles, drift_waves
 from .series_fit import SeriesFit
 
 
+# Samples for each unknown of its start and drift, which a record must have more of to say anything
+# of a model. Doubled: records twice as long are left out.
+_SAMPLES_PER_UNKNOWN = 3
+
+
+def can_be_compared(model: LDTP | SeriesFit, record: Record, free_start: bool) -> bool:
+    """Whether a record says more than where it started and how it drifts, which are fitted to it:
+    short pieces agree with any model."""
+    N, ny = record.n_sections, record.y.shape[1]
+    unknown = N * ny * drift_waves(record).shape[1]
+    if free_start and isinstance(model, SeriesFit):
+        unknown += N * ny * _free_cycles(model)
+    elif free_start:
+        unknown += int(model.dims[record.first_section])
+    return int(np.isfinite(record.y).sum()) > _SAMPLES_PER_UNKNOWN * unknown
+
+
 def simulate_record(
     model: LDTP | SeriesFit, record: Record, free_start: bool
 ) -> Float[np.ndarray, "n ny"]:
@@ -27,7 +44,7 @@ def simulate_record(
 
 def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
     N, R, ny, nu = fit.numerators.shape
-    d, n, first_section = len(fit.coefficients), len(record.u), record.first_section
+    n, first_section = len(record.u), record.first_section
     T = count_cycles(record)
     u, y = np.zeros((1, T * N, nu)), np.full((T * N, ny), np.nan)
     rows = slice(first_section, first_section + n)
@@ -35,7 +52,7 @@ def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.
     v = divide_by_chi(fit.coefficients, u.reshape(1, T, N, nu))
     y, out = y.reshape(T, N, ny), np.zeros((T, N, ny))
     # As in the fit: what came before acts on so many cycles on its own.
-    free = d + -(-(R - 1 - fit.lead - d * N) // N) if free_start else 0
+    free = _free_cycles(fit) if free_start else 0
     drift = drift_waves(record)
     for k in range(N):
         b = fit.numerators[k].transpose(0, 2, 1).reshape(R * nu, ny)
@@ -49,6 +66,13 @@ def _simulate_fit(fit: SeriesFit, record: Record, free_start: bool) -> Float[np.
                 left = (y[:, k, i] - out[:, k, i])[seen]
                 out[:, k, i] += unknown @ np.linalg.lstsq(unknown[seen], left)[0]
     return out.reshape(T * N, ny)[rows]
+
+
+def _free_cycles(fit: SeriesFit) -> int:
+    """At the start of a record, the cycles on which what came before acts on its own."""
+    N, R = fit.numerators.shape[:2]
+    d = len(fit.coefficients)
+    return d + -(-(R - 1 - fit.lead - d * N) // N)
 
 
 def _simulate_ldtp(model: LDTP, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:

@@ -14,7 +14,7 @@ from ...experiments.record import Record, RecordedData, uninterrupted_records
 from ...linear.ldtp import LDTP
 from .fit import check_start
 from .series_fit import SeriesFit
-from .simulation import simulate_record
+from .simulation import can_be_compared, simulate_record
 
 
 # Samples of a section, below which a correlation says nothing. Doubled: more records are refused.
@@ -44,8 +44,9 @@ class Validation(eqx.Module):
     - `autocorrelation` (N, lags, ny): of the residual at each section with those 1, 2, ... samples
       earlier. `cross_correlation` (N, lags, ny, nu): of the residual with the inputs 0, 1, ...
       samples earlier. Both in units of their standard deviation where there is no correlation.
-    - `measured`, `simulated` (n, ny): the first record, whose first sample lies on
+    - `measured`, `simulated` (n, ny): the longest record, whose first sample lies on
       `first_section`.
+    - `left_out`: records that are too short to say more than where they started.
     - `n_sections`, `inputs`, `outputs`.
     """
 
@@ -59,6 +60,7 @@ class Validation(eqx.Module):
     simulated: Float[np.ndarray, "n ny"]
     level: float = eqx.field(static=True)
     first_section: int = eqx.field(static=True)
+    left_out: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
@@ -85,6 +87,8 @@ class Validation(eqx.Module):
             f"correlated in time: {verdict[self.white]}; with the input: "
             f"{verdict[self.independent]} (level {self.level:g})"
         )
+        if self.left_out:
+            rows.append(f"records too short to be compared, left out: {self.left_out}")
         return "\n".join(rows)
 
 
@@ -106,6 +110,9 @@ def validate(
     part of the residuals that lagged inputs explain, compared with the rest (an F ratio for each
     section), whatever the spectrum of the input; its level holds for residuals that are white.
 
+    Records with three samples or fewer for each unknown of their start and drift are left out: they
+    agree with any model.
+
     **Arguments:**
 
     - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is.
@@ -116,15 +123,22 @@ def validate(
     - `lags`: how many are looked at; default one period, less for few cycles.
     - `level`: of the tests.
 
-    **Raises:** `DefinitionError` if model and data have different N or names, or there are too few
-    cycles for any lag.
+    **Raises:** `DefinitionError` if model and data have different N or names, there are too few
+    cycles, or all records are too short to be compared or for so many lags.
     """
     if not 0 < level < 1:
         raise DefinitionError(f"level must lie between 0 and 1, not {level}.")
     free_start = check_start(start) == "free"
-    records = uninterrupted_records(data)
-    N, outputs = records[0].n_sections, records[0].outputs
-    require_same_kind(model, records[0])
+    everything = uninterrupted_records(data)
+    N, outputs = everything[0].n_sections, everything[0].outputs
+    require_same_kind(model, everything[0])
+    records = [r for r in everything if can_be_compared(model, r, free_start)]
+    if not records:
+        longest = max(len(r.u) for r in everything) / N
+        raise DefinitionError(
+            f"the longest of {len(everything)} uninterrupted records has {longest:.3g} cycles: too "
+            "few to tell the model from an unknown start."
+        )
     simulated = [simulate_record(model, record, free_start) for record in records]
     seen = np.concatenate([np.isfinite(r.y) for r in records])
     y = np.concatenate([r.y for r in records])
@@ -142,11 +156,21 @@ def validate(
             f"a section was sampled {fewest} times only; the tests need {_FEWEST_SAMPLES} or more "
             "cycles."
         )
-    lags = min(N, int(fewest) // _SAMPLES_PER_LAG) if lags is None else lags
+    if lags is None:
+        most = min(N, int(fewest) // _SAMPLES_PER_LAG)
+        enough = [_with_past(records, lag).min() >= _FEWEST_SAMPLES for lag in range(1, most + 1)]
+        lags = max(int(sum(enough)), 1)
     if lags < 1:
         raise DefinitionError(f"lags must be at least 1, not {lags}.")
+    if (_with_past(records, lags).max(axis=0) < _FEWEST_SAMPLES).any():
+        raise DefinitionError(
+            f"the records are too short for {lags} lags: no section was sampled {_FEWEST_SAMPLES} "
+            "times with so many samples before it in its record."
+        )
     auto, white = _whiteness(records, e, N, lags)
     cross, independent = _independence(records, e, N, lags)
+    longest = max(range(len(records)), key=lambda k: len(records[k].u))
+    shown = slice(0, len(records[longest].u) - records[longest].lead)  # later inputs are unknown
     return Validation(
         fit=100 * (1 - noise / spread),
         noise=noise,
@@ -154,10 +178,11 @@ def validate(
         independence=independent,
         autocorrelation=auto,
         cross_correlation=cross,
-        measured=records[0].y,
-        simulated=simulated[0],
+        measured=records[longest].y[shown],
+        simulated=simulated[longest][shown],
         level=level,
-        first_section=records[0].first_section,
+        first_section=records[longest].first_section,
+        left_out=len(everything) - len(records),
         n_sections=N,
         inputs=records[0].inputs,
         outputs=outputs,
@@ -177,10 +202,17 @@ def _sections(records: Sequence[Record]) -> Int[np.ndarray, " n"]:
     return np.concatenate([(r.first_section + np.arange(len(r.u))) % r.n_sections for r in records])
 
 
+def _with_past(records: Sequence[Record], lags: int) -> Int[np.ndarray, "N ny"]:
+    """How often each output was sampled at each section, with so many samples before it."""
+    late = [np.isfinite(r.y) & (np.arange(len(r.y)) >= lags)[:, None] for r in records]
+    section, late = _sections(records), np.concatenate(late)
+    return np.stack([late[section == n].sum(axis=0) for n in range(records[0].n_sections)])
+
+
 def _earlier(x: np.ndarray, lag: int) -> np.ndarray:
     """x, `lag` samples earlier; NaN before its start."""
     out = np.full_like(x, np.nan)
-    out[lag:] = x[: len(x) - lag] if lag else x
+    out[lag:] = x[: max(len(x) - lag, 0)]
     return out
 
 

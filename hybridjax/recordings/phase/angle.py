@@ -10,16 +10,13 @@ from ...errors import DefinitionError
 from ...sections.crossing import Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording
-from ..smoothing import FEWEST, spline
+from ..smoothing import FEWEST, bridgeable, gaps, spline
 from .tracker import track
-from .winding import Phase, Winding
+from .winding import LONGEST_GAP, Phase, Winding
 
 
 AngleFunction = Callable[[Float[np.ndarray, " n"], Mapping[str, Float[np.ndarray, " n"]]], Any]
 
-# The longest gap, in cycles, across which turns are counted. Doubled: stretches go on across gaps
-# of half a cycle, where a turn may be lost unseen.
-_LONGEST_GAP = 0.25
 # Bandwidth of the two signals, in cycles per cycle. Doubled: the phase is sharper and noisier.
 _ANGLE_HARMONICS = 32
 # The share of the samples at either end that says nothing of a signal's range. Doubled: outliers
@@ -52,7 +49,7 @@ def from_angles(angles: Sequence[Angle], n_sections: int | None, causal: bool) -
     backwards, total, stretches = 0, 0, []
     for time, angle in angles:
         parts = []
-        edges = np.flatnonzero(np.diff(time) > _LONGEST_GAP / abs(rate)) + 1
+        edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
         for part in np.split(np.arange(len(time)), edges):
             if len(part) < FEWEST:
                 continue
@@ -172,10 +169,12 @@ def _turns_per_time(angles: Sequence[Angle]) -> float:
 
 
 def _monotone(time: Float[np.ndarray, " n"], phase: Float[np.ndarray, " n"]) -> Winding | None:
+    seen = np.isfinite(time)
+    unseen = gaps(time, seen, bridgeable(time, seen))
     low = np.maximum.accumulate(phase)
     high = np.minimum.accumulate(phase[::-1])[::-1]
     phase = (low + high) / 2
     rising = np.concatenate([[True], np.diff(phase) > _GROWTH])
     if rising.sum() < 2:
         return None
-    return Winding(time[rising], phase[rising], linear=False)
+    return Winding(time[rising], phase[rising], linear=False, gaps=unseen)

@@ -6,7 +6,8 @@ from jaxtyping import Float
 from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
 from ..recording import Recording
-from .winding import Phase, Winding
+from ..smoothing import bridgeable, gaps, inside
+from .winding import LONGEST_GAP, Phase, Winding
 
 
 # Bandwidth of a signal whose crossings are taken, in cycles per cycle. Doubled: crossings are less
@@ -63,9 +64,12 @@ def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
                 good.append(x)
         kept.append(np.array(good))
     missed, stretches = 0, []
-    for t in kept:
-        wide = np.flatnonzero(np.diff(t) > _MISSED * period) + 1
-        missed += sum(round(float(t[k] - t[k - 1]) / period) for k in wide)
+    for trial, t in zip(recording.trials, kept, strict=True):
+        sampled = np.isfinite(trial.time)
+        pauses = gaps(trial.time, sampled, bridgeable(trial.time, sampled, LONGEST_GAP * period))
+        unseen = (np.diff(t) > _MISSED * period) | inside(pauses, t[:-1], t[1:])
+        wide = np.flatnonzero(unseen) + 1
+        missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
         parts = [part for part in np.split(t, wide) if len(part) > 1]
         if causal:
             stretches.append(tuple(_extrapolated(p) for p in parts if len(p) > 2))

@@ -34,8 +34,9 @@ def estimate_phase(
         - `AtEvent`: grows by one from each recorded event to the next, linearly in between. Events
           that follow the one before by less than half of the median period are taken for doubled
           and left out; where an interval is longer than 1.5 median periods one was missed, and
-          these cycles are left out. Since this phase, and that of a `Crossing`, depends on the
-          event that comes next, so do the outputs sampled at it.
+          these cycles are left out. A crossing in a gap counts as missed. Since this phase, and
+          that of a `Crossing`, depends on the event that comes next, so do the outputs sampled at
+          it.
         - a function of the times (n,) and the signals by name, that returns an angle (n,) in rad,
           with or without its whole turns, NaN where it is not known.
     - `bandwidth`: in Hz, of the splines through the signals of a `KinematicPhase` (by default 32
@@ -45,7 +46,8 @@ def estimate_phase(
       (fit it with `overhang=2 * n_sections`).
 
     Angles that run backwards in noise are replaced by the mean of the two monotone envelopes, one
-    from below and one from above. Stretches end at gaps longer than a quarter of a cycle.
+    from below and one from above. Stretches end at gaps longer than a quarter of a cycle: of the
+    signals of an angle, and of all signals where the phase comes from crossings or events.
 
     **Raises:** `DefinitionError` for signals or events that are not there, sections that a
     recording cannot have (functions of a state, charts), a phase that does not wind, or a recording

@@ -8,16 +8,23 @@ from scipy.interpolate import PchipInterpolator
 from ...errors import DefinitionError
 
 
+# The longest gap, in cycles, across which turns are counted. Doubled: stretches go on across gaps
+# of half a cycle, where a turn may be lost unseen.
+LONGEST_GAP = 0.25
+
+
 class Winding(eqx.Module):
     """The phase of one stretch of a trial.
 
     **Fields:** `time` (n,), `phase` (n,) in cycles: both strictly increasing. `linear`: whether
-    the phase is linear in between, or smooth.
+    the phase is linear in between, or smooth. `gaps` (g, 2): start and end of the times at which
+    it was not seen, but interpolated.
     """
 
     time: Float[np.ndarray, " n"]
     phase: Float[np.ndarray, " n"]
     linear: bool = eqx.field(static=True)
+    gaps: Float[np.ndarray, "g 2"] = eqx.field(default_factory=lambda: np.zeros((0, 2)))
 
     def when(self, phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """The times at which the phase has these values, by inverse interpolation."""
