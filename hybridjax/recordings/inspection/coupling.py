@@ -5,14 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...experiments.record import Record
 from ..data import SectionData
 from .finding import Finding, listed
 
 
-# Samples of a cycle from which the next one is predicted, at most. Doubled: more cycles are needed
-# to learn it.
-_SECTIONS = 8
+# Samples of a cycle from which the next one is predicted: the first number for which there are
+# enough cycles. Doubled: more cycles are needed.
+_SECTIONS = 8, 4, 2
 # Cycles of a part, at least, and parts of a record, at most. Doubled: what happens in a short while
 # is not seen; or it is, where recordings are long.
 _SHORTEST, _PARTS = 16, 4
@@ -48,6 +47,8 @@ class _Part(NamedTuple):
     end: float
     u: Float[np.ndarray, "T N nu"]
     y: Float[np.ndarray, "T Kny"]
+    sections: int
+    """K."""
     rows: Int[np.ndarray, " t"]
     """Cycles that are predicted: all that is needed for them is known."""
     ahead: int
@@ -57,7 +58,7 @@ class _Part(NamedTuple):
         """What explains these cycles of an input that is displaced by some sections."""
         T, N = self.u.shape[:2]
         u = np.roll(self.u[..., i].reshape(-1), displaced).reshape(T, N)
-        u = np.stack([x.mean(axis=1) for x in np.array_split(u, min(N, _SECTIONS), axis=1)], 1)
+        u = np.stack([x.mean(axis=1) for x in np.array_split(u, self.sections, axis=1)], 1)
         return _deviations([u[self.rows + c] for c in range(-1, self.ahead + 1)])
 
 
@@ -72,19 +73,21 @@ def unanswered(data: SectionData, names: tuple[str, ...]) -> list[Finding]:
 
     **Arguments:** `names`: of the trials.
     """
-    parts = [p for r, record in enumerate(data.records) for p in _parts(data, r, record)]
     found = []
     for i, name in enumerate(data.inputs):
-        size = [float(p.u[..., i].std()) for p in parts]
-        pushed = [p for p, x in zip(parts, size, strict=True) if x > _PUSHED * np.median(size)]
-        found += _one_input(name, i, pushed, names)
+        for sections in _SECTIONS:
+            parts = [p for r in range(len(data.records)) for p in _parts(data, r, sections)]
+            size = [float(p.u[..., i].std()) for p in parts]
+            pushed = [p for p, x in zip(parts, size, strict=True) if x > _PUSHED * np.median(size)]
+            answers = _answers(pushed, i)
+            if answers:
+                found += _odd(name, answers, names)
+                break
     return found
 
 
-def _one_input(name: str, i: int, parts: list[_Part], names: tuple[str, ...]) -> list[Finding]:
-    answers = _answers(parts, i)
-    if answers is None:
-        return []
+def _odd(name: str, answers: list["_Answer"], names: tuple[str, ...]) -> list[Finding]:
+    """What is odd about the gains of an input."""
     gain, error = np.array([a.gain() for a in answers]).T
     weight = error**-2.0
     usual = float(np.median(gain))
@@ -98,8 +101,10 @@ def _one_input(name: str, i: int, parts: list[_Part], names: tuple[str, ...]) ->
     left, explained = np.array([a.unexplained() for a in answers]).T
     disturbed = left > np.maximum(_DISTURBED * np.median(left), _MUCH * explained)
     spans: dict[str, list[str]] = {}
-    for a, g, e, other in zip(answers, gain / usual, error / usual, disturbed, strict=True):
-        verdict = _verdict(a, g, _CLEAR * e, other)
+    for k, a in enumerate(answers):
+        verdict = _verdict(
+            a, float(gain[k]) / usual, _CLEAR * float(error[k]) / usual, bool(disturbed[k])
+        )
         if verdict:
             where = f"trial '{names[a.part.trial]}', {a.part.start:.4g}-{a.part.end:.4g} s"
             spans.setdefault(verdict, []).append(where)
@@ -168,8 +173,8 @@ class _Answer(NamedTuple):
         return float(((self.rest - predicted) ** 2).mean()), float((predicted**2).mean())
 
 
-def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
-    """Each part's, learned from other trials; None if there are too few cycles to learn from."""
+def _answers(parts: list[_Part], i: int) -> list[_Answer]:
+    """Each part's, learned from other trials; none if there are too few cycles to learn from."""
     sides, squares, products = [], [], []
     for p in parts:
         inputs = [p.inputs(k) for k in range(p.u.shape[2])]
@@ -183,7 +188,7 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
         others = others or [k for k in range(len(parts)) if k != n]
         unknown = sides[n].shape[1]
         if sum(len(sides[k]) for k in others) < _ENOUGH * unknown:
-            return None
+            return []
         square = sum(squares[k] for k in others)
         square = square + _RIDGE * np.trace(square) / unknown * np.eye(unknown)
         b = np.linalg.solve(square, sum(products[k] for k in others))
@@ -191,7 +196,7 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer] | None:
         rows = slice(own + i * wide, own + (i + 1) * wide)
         rest = _deviations([part.y[part.rows]]) - sides[n] @ b + sides[n][:, rows] @ b[rows]
         answers.append(_Answer(part, i, rest, b[rows]))
-    return answers or None
+    return answers
 
 
 def _deviations(columns: list[Float[np.ndarray, "t _"]]) -> Float[np.ndarray, "t k"]:
@@ -200,9 +205,10 @@ def _deviations(columns: list[Float[np.ndarray, "t _"]]) -> Float[np.ndarray, "t
     return x - x.mean(axis=0)
 
 
-def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
-    """Without scales: inputs in their rms, outputs in robust standard deviations."""
-    N = data.n_sections
+def _parts(data: SectionData, r: int, sections: int) -> list[_Part]:
+    """Of a record, without scales: inputs in their rms, outputs in robust standard deviations."""
+    record, N = data.records[r], data.n_sections
+    sections = min(N, sections)
     first = -record.first_section % N
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
@@ -210,7 +216,7 @@ def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
     size_u, size_y = data.rms()
     every = np.concatenate([x.y for x in data.records])
     size_y = np.maximum(_MAD * np.nanmedian(np.abs(every), axis=0), _LEAST * size_y)
-    at = np.linspace(0, N, min(N, _SECTIONS), endpoint=False).astype(int)
+    at = np.linspace(0, N, sections, endpoint=False).astype(int)
     ahead = -(-record.lead // N)
     parts = []
     for a, b in zip(edges[:-1], edges[1:], strict=True):
@@ -224,6 +230,7 @@ def _parts(data: SectionData, r: int, record: Record) -> list[_Part]:
         used += [np.isfinite(y[rows + c]).all(axis=1) for c in (-1, 0)]
         rows = rows[np.all(used, axis=0)]
         t = data.times[r][where]
-        part = _Part(data.trials[r], t[0], t[-1], *map(np.nan_to_num, (u, y)), rows, ahead)
+        u, y = np.nan_to_num(u), np.nan_to_num(y)
+        part = _Part(data.trials[r], float(t[0]), float(t[-1]), u, y, sections, rows, ahead)
         parts += [part] if len(rows) >= _SHORTEST / 2 else []
     return parts

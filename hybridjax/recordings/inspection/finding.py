@@ -46,7 +46,7 @@ class Inspection(eqx.Module):
         return "\n".join(map(repr, self.findings)) or "Nothing was found."
 
 
-def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " n"]]) -> str:
+def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:
     """Where samples are: `trial 'b', 3.10-3.42 s; and 4 more`."""
     found = []
     for trial, rows in zip(trials, bad, strict=True):

@@ -3,10 +3,11 @@
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..recording import Recording, Trial
 from .finding import Finding, places
+from .samples import Rows
 
 
 # Of the samples of two signals, the share that must be equal. (Not to be doubled: it lies below 1.)
@@ -38,9 +39,7 @@ def doubled_signals(recording: Recording, names: list[str]) -> list[Finding]:
     return found
 
 
-def repeated_samples(
-    recording: Recording, names: list[str]
-) -> tuple[list[Bool[np.ndarray, " n"]], list[Finding]]:
+def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list[Finding]]:
     """For each trial, the samples that an earlier trial holds already.
 
     A few samples in a row are looked for in the other trial, and where they are found once (and
@@ -90,13 +89,13 @@ def _shift(
             continue
         there = _where(x, probe, size)
         if len(there) == 1:
-            return int(there[0]) - at
+            return int(there[0] - at)
     return None
 
 
 def _where(
     x: Float[np.ndarray, "n k"], probe: Float[np.ndarray, "m k"], size: Float[np.ndarray, " k"]
-) -> np.ndarray:
+) -> Int[np.ndarray, " _"]:
     at = np.arange(len(x) - len(probe) + 1)
     for k, row in enumerate(probe):
         at = at[(np.abs(x[at + k] - row) <= size).all(axis=1)]

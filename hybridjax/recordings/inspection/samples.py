@@ -29,7 +29,7 @@ _WRAP = 0.5
 # Rounding of integers that were scaled, in levels. Doubled: nothing changes.
 _ROUNDING = 1e-3
 
-Rows = list[Bool[np.ndarray, " n"]]
+Rows = list[Bool[np.ndarray, " _"]]
 
 
 class Signal(NamedTuple):
@@ -37,7 +37,7 @@ class Signal(NamedTuple):
 
     name: str
     trials: tuple[Trial, ...]
-    values: list[Float[np.ndarray, " n"]]
+    values: list[Float[np.ndarray, " _"]]
     period: list[float]
     is_input: bool
 
@@ -122,7 +122,7 @@ def _placeholders(x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 def _stands_for_nothing(value: float) -> bool:
     """Whether a number is one that programs write for "no value": 999, -8888, -32768, 1e20, ..."""
-    size = abs(value)
+    size = abs(float(value))
     digits = f"{size:.0f}"
     if size == round(size) and len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
         return True

@@ -12,9 +12,12 @@ from .finding import Finding, listed
 # The share of the samples at either end that says nothing of a signal's range. Doubled: outliers
 # matter less.
 _TAIL = 0.1
-# Ratios of ranges that are alike, of which a power of ten may be wrong, and how near to one it then
-# is. Doubled: larger differences pass; other ratios are taken for units.
-_ALIKE, _UNIT, _NEAR_UNIT = 1.5, 8.0, 1.2
+# Ratios of ranges that are alike; and how near to a power of ten another unit makes them. Doubled:
+# larger differences pass; or, other ratios are taken for units.
+_ALIKE, _NEAR_UNIT = 1.5, 1.2
+# Powers of ten by which units of outputs, and of inputs, differ. (Not to be doubled: pushes may be
+# chosen to be ten times as strong.)
+_OUTPUT_UNITS, _INPUT_UNITS = (1, 2, 3, 6), (3, 6)
 # A zero is another one if it is off by this share of the range, and so many times more than others
 # are. Doubled: larger offsets pass.
 _OFFSET, _OFF = 0.1, 10.0
@@ -53,8 +56,10 @@ def other_settings(
             if not (width[s, k] > 0 and range_[k] > 0):
                 continue
             ratio = width[s, k] / range_[k]
-            unit = 10.0 ** np.round(np.log10(ratio))
-            if max(ratio, 1 / ratio) > _UNIT and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
+            power = round(np.log10(ratio))
+            unit = 10.0**power
+            units = _OUTPUT_UNITS if name in outputs else _INPUT_UNITS
+            if abs(power) in units and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
                 action = "refused" if name in outputs else "warned"
                 text = (
                     f"{name} varies {ratio:.3g} times as much in trial '{trial.name}' as in the "
