@@ -1,6 +1,6 @@
-"""Recordings to multipliers: errors, dirt, coverage, a walker, time and memory.
+"""Recordings to multipliers: errors, dirt, mishaps, coverage, a walker, time and memory.
 
-python benchmarks/recordings.py [errors] [parts] [dirt] [walker] [size] [coverage]
+python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [walker] [size] [coverage]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -195,6 +195,53 @@ def dirt(seeds=5, strides=500, noise=1e-4):
         )
 
 
+def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
+    """Whether each is right, refused, or named; a table for docs/recordings.md."""
+    print(
+        f"\n{trials} trials of {strides} strides at {rate} Hz, noise {noise:g}, {n_sections} "
+        f"sections; {seeds} seeds\n"
+    )
+    cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+    force = [
+        hj.testing.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=k)
+        for k in range(seeds * trials)
+    ]
+    made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
+    names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
+    verdicts = []
+    print("| mishap | rms error | said | verdict | what is said |\n|---|---|---|---|---|")
+    for kind in ["none", *hj.testing.MISHAPS, *hj.testing.EVENT_MISHAPS]:
+        found, said, verdict, causes = [], [], [], {}
+        for seed in range(seeds):
+            own = made.trials[seed * trials : (seed + 1) * trials]
+            one = noisy(eqx.tree_at(lambda r: r.trials, made, own), noise, seed)
+            try:
+                if kind != "none":
+                    one = hj.testing.mishandle(one, kind, seed=seed, **names)
+                phase = APEX if kind in hj.testing.EVENT_MISHAPS else hj.Crossing("vM", "falling")
+                result = hj.identify_recording(
+                    one, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections, order=2
+                )
+            except hj.DefinitionError as error:
+                verdict.append("refused")
+                causes[str(error)] = None
+                continue
+            right = result.fit.contains(cycle.multipliers, 0.999).all()
+            causes |= dict.fromkeys(f.cause for f in result.findings)
+            verdict.append("right" if right else "named" if result.findings else "SILENTLY WRONG")
+            found.append(distance(result.fit.multipliers, cycle.multipliers))
+            said.append(result.fit.standard_errors[0])
+        verdicts += verdict
+        numbers = [f"{rms(x):.1e}" if x else "" for x in (found, said)]
+        told = ", ".join(causes) if found else next(iter(causes))
+        print(
+            f"| {kind} | {' | '.join(numbers)} | {', '.join(dict.fromkeys(verdict))} | {told} |",
+            flush=True,
+        )
+    counts = {v: verdicts.count(v) for v in dict.fromkeys(verdicts)}
+    print("\n" + ", ".join(f"{n} {v}" for v, n in counts.items()), flush=True)
+
+
 def walker(seeds=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
@@ -283,7 +330,15 @@ def write_trials(files, minutes, rate):
 
 if __name__ == "__main__":
     hj.enable_x64()
-    for name in sys.argv[1:] or ("errors", "parts", "dirt", "walker", "size", "coverage"):
+    for name in sys.argv[1:] or (
+        "errors",
+        "parts",
+        "dirt",
+        "mishaps",
+        "walker",
+        "size",
+        "coverage",
+    ):
         start = time.process_time()
         globals()[name]()
         print(f"({time.process_time() - start:.0f} CPU s)")

@@ -13,6 +13,8 @@ from .held_out import (
 )
 from .identification import Identification as Identification
 from .impulse import ImpulseResponses as ImpulseResponses, impulse_responses as impulse_responses
+from .inspection.finding import Finding as Finding, Inspection as Inspection
+from .inspection.look import inspect as inspect, inspect_cycles as inspect_cycles
 from .phase.estimation import PhaseDefinition as PhaseDefinition, estimate_phase as estimate_phase
 from .phase.tracker import PhaseTracker as PhaseTracker
 from .phase.winding import Phase as Phase, Winding as Winding

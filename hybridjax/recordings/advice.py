@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.series_fit import SeriesFit
 from ..identify.series.validation import Validation
 from .data import SectionData
+from .inspection.finding import Finding
 from .spectra import input_band, input_spectrum
 
 
@@ -84,13 +86,18 @@ class Advice(eqx.Module):
 
 
 @checked
-def advise(data: SectionData, fit: SeriesFit, validation: Validation | None = None) -> Advice:
+def advise(
+    data: SectionData,
+    fit: SeriesFit,
+    validation: Validation | None = None,
+    findings: Sequence[Finding] = (),
+) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
     Too few strides for the unknowns, more multipliers than the data carry, inputs without power
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
     intervals that reach the unit circle, an iteration that did not end; and with a `validation` on
-    strides that were held out, what it finds left over.
+    strides that were held out, what it finds left over. The `findings` of an inspection come first.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
@@ -103,7 +110,7 @@ def advise(data: SectionData, fit: SeriesFit, validation: Validation | None = No
     plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
     band = input_band(data)
-    warnings = []
+    warnings = list(map(repr, findings))
     if sampled - unknown < _FEW_LEFT_OVER * sampled:
         warnings.append(
             f"Few strides: a section was sampled {sampled} times for {unknown} unknowns; "

@@ -15,6 +15,8 @@ from .data import SectionData
 from .drift import DriftCycles, without_drift
 from .held_out import CYCLES_LOOKED_AT, HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
+from .inspection.finding import Finding
+from .inspection.look import inspect, inspect_cycles, refuse
 from .phase.estimation import PhaseDefinition, estimate_phase, signals_of
 from .phase.winding import Phase
 from .recording import Recording
@@ -25,11 +27,13 @@ from .smoothing import Bandwidth
 class Identification(eqx.Module):
     """What was found in a recording, step by step.
 
-    **Fields:** `recording`; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a
-    fit to the first three quarters, tried on the last; `responses` to pushes; `advice`.
+    **Fields:** `recording`, without what `inspect` leaves out; `findings` of the inspection;
+    `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the first three
+    quarters, tried on the last; `responses` to pushes; `advice`.
     """
 
     recording: Recording
+    findings: tuple[Finding, ...]
     phase: Phase
     data: SectionData
     fit: SeriesFit
@@ -58,7 +62,7 @@ def identify_recording(
     drift: DriftCycles | None = None,
 ) -> Identification:
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
-    them.
+    them. First it is inspected (`hj.recordings.inspect`).
 
     **Arguments:** as for `section_data`, of which `max_gap` keeps its default, and
 
@@ -67,10 +71,14 @@ def identify_recording(
       taken out of the outputs, and of the signals that define the phase, before the phase is found;
       the fit allows for what is left.
 
-    **Raises:** `DefinitionError` as `estimate_phase`, `section_data` and `fit_series`;
-    `PrecisionError` in single precision.
+    **Raises:** `DefinitionError` for what the inspection refuses, and as `estimate_phase`,
+    `section_data` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()
+    say("inspection")
+    inspection = inspect(recording, inputs=inputs, outputs=outputs)
+    refuse(inspection.findings)
+    recording = inspection.recording
     say("phase")
     definition = None if isinstance(phase, Phase) else phase
     found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
@@ -91,6 +99,9 @@ def identify_recording(
         timing=timing,
         drift=drift,
     )
+    seen = inspect_cycles(recording, found, data)
+    refuse(seen)
+    findings = (*inspection.findings, *seen)
     say("order")
     order = choose_order(data) if order is None else order
     say("fit to the first three quarters")
@@ -102,10 +113,11 @@ def identify_recording(
     fit = fit_series(data, order, check=False, distortion=False if known else None)
     return Identification(
         recording=recording,
+        findings=findings,
         phase=found,
         data=data,
         fit=fit,
         held_out=held,
         responses=impulse_responses(fit, data),
-        advice=advise(data, fit, held.validation),
+        advice=advise(data, fit, held.validation, findings),
     )

@@ -1,0 +1,120 @@
+"""What is wrong with recordings is recognized, and nothing is where nothing is wrong."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import hybridjax as hj
+from hybridjax.testing import EVENT_MISHAPS, MISHAPS
+
+
+STRIDES, TRIALS, RATE = 60, 3, 64
+NAMES = {"input": "f", "outputs": ("x", "v"), "event": "top"}
+TOP = hj.Crossing("v", "falling", value=0.0)
+
+
+@functools.cache
+def made_up(seed, force=0.1, noise=1e-3):
+    """A rhythm of period 1; a deviation w' = -0.3 w + f is seen in x, and in v at some phases."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(STRIDES * RATE) / RATE
+    trials = []
+    for k in range(TRIALS):
+        f = hj.testing.random_force(STRIDES, RATE, 6, rms=force, seed=100 * seed + k)[:, 0]
+        w = signal.lfilter([0, 1 / RATE], [1, -np.exp(-0.3 / RATE)], f)
+        angle = 2 * np.pi * time
+        x = 2.0 + np.cos(angle) + w + noise * rng.normal(size=len(f))
+        v = -6 * np.sin(angle) + 4 * w * np.cos(angle) + noise * rng.normal(size=len(f))
+        one = hj.Recording(time, {"f": f, "x": x, "v": v}, name=f"trial {k}")
+        trials.append(one)
+    return hj.Recording.join(trials).mark("top", TOP, bandwidth=16)
+
+
+def findings(recording, phase=TOP):
+    """All of them, or the sentence of what is refused."""
+    names = {"inputs": "f", "outputs": ("x", "v")}
+    inspection = hj.recordings.inspect(recording, **names)
+    if any(f.action == "refused" for f in inspection.findings):
+        return inspection.findings
+    clean = inspection.recording
+    found = hj.recordings.estimate_phase(clean, phase)
+    data = hj.recordings.section_data(clean, found, n_sections=16, **names)
+    return inspection.findings + hj.recordings.inspect_cycles(clean, found, data)
+
+
+def causes(recording, phase=TOP):
+    return {f.cause for f in findings(recording, phase)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("force", "noise"), [(0.1, 1e-3), (0.3, 0.0)])
+def test_nothing_is_found_where_nothing_is_wrong(seed, force, noise):
+    assert findings(made_up(seed, force, noise)) == ()
+
+
+SAID = {
+    "slow drift": "drift",
+    "the zero wanders": "drift",
+    "clipped at the top": "clipped",
+    "clipped at both ends": "clipped",
+    "push clipped": "clipped",
+    "integers overflow": "overflow",
+    "-9999 for no value": "no value",
+    "0 for no value": "frozen",
+    "output frozen for a while": "frozen",
+    "output frozen": "an empty trial",
+    "push frozen for a while": "frozen",
+    "millimeters in one trial": "another unit",
+    "kilonewtons in one trial": "another unit",
+    "sign of an output in one trial": "another sign",
+    "sign of the push in one trial": "another sign",
+    "other zero in one trial": "another zero",
+    "sensor slips in one trial": "drift",
+    "columns swapped in one trial": "swapped columns",
+    "an output twice": "a signal twice",
+    "push of another trial": "foreign input",
+    "push unrelated in all": "no answer",
+    "push switched on late": "disturbed",
+    "the same trial thrice": "a trial twice",
+    "overlapping trials": "a trial twice",
+    "a pause": "jump of the clock",
+    "clock set forward": "jump of the clock",
+    "milliseconds in one trial": "another unit of time",
+    "slow clock in one trial": "another period",
+    "push late in one trial": "displaced input",
+    "clock of the push is fast": "displaced input",
+    "another event in one trial": "another event",
+}
+
+
+@pytest.mark.parametrize("mishap", SAID)
+def test_causes_are_named(mishap):
+    phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
+    assert SAID[mishap] in causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+
+
+HARMLESS = sorted({
+    "rounded to 12 bits", "slow sensors", "sensor saturates softly", "1 % of the samples lost",
+    "gap of five cycles", "gap of the push", "a third of the samples not there", "few samples",
+    "clock slows down", "push late", "push early", "events lost and doubled",
+})  # fmt: skip
+
+
+@pytest.mark.parametrize("mishap", HARMLESS)
+def test_nothing_is_said_of_what_does_no_harm(mishap):
+    phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
+    assert not causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+
+
+def test_all_mishaps_are_tried():
+    """Here, or (where noise is all that happens) by `python benchmarks/recordings.py mishaps`."""
+    noisy = {
+        "white noise", "hum of the mains", "push leaks into outputs", "jitter of the time stamps",
+        "other gain in one trial", "0.1 % spikes", "1 % spikes", "0.1 % spikes of the push",
+        "gaps over the crossing", "events inexact",
+    }  # fmt: skip
+    refused = {"push not plugged in", "clock set back"}
+    assert {*SAID, *HARMLESS, *noisy, *refused} == {*MISHAPS, *EVENT_MISHAPS}
+    assert len(MISHAPS | EVENT_MISHAPS) >= 40
