@@ -1,7 +1,6 @@
 """What the data cannot carry, in plain words."""
 
 import textwrap
-from collections.abc import Iterator
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
