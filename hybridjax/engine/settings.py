@@ -1,13 +1,15 @@
 """Accuracy and effort of the flow, and every accuracy that the package takes by default."""
 
 import functools as ft
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import StepCount
+from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
 from .._core.precision import at_precision, real
 from .._core.text import fields
 from ..errors import DefinitionError

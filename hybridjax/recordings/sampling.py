@@ -1,5 +1,6 @@
 """From sampled signals to data at the sections of a cycle."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx

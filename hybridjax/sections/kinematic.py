@@ -1,6 +1,6 @@
 """Sections at equally spaced angles in a plane of two signals."""
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax

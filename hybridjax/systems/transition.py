@@ -7,6 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PositiveScalar, Scalar
 from .._core.precision import real
 from .._core.text import fields
 
