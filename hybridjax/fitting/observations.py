@@ -1,6 +1,7 @@
 """What a system is fitted to: each kind of data turns a limit cycle into weighted residuals."""
 
 import abc
+from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import equinox as eqx

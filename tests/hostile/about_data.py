@@ -76,7 +76,9 @@ def estimates(t):
     yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
         "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
     }  # fmt: skip
-    yield "remove_transient", hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1), {
+    yield "remove_transient", hj.identify.remove_transient, dict(
+        data=t.repeated, order=2, skip=1
+    ), {
         "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
         "multipliers": ["x", 3, [NAN], [[0.5]], [], [2.0], Other()],
     }  # fmt: skip

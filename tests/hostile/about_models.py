@@ -148,7 +148,9 @@ def cycles(t):
         "throw": FLAG,
     }  # fmt: skip
     yield "LimitCycle.trajectory", t.cycle.trajectory, {}, {"periods": POSITIVE}
-    yield "find_limit_cycles", hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle), {
+    yield "find_limit_cycles", hj.find_limit_cycles, dict(
+        systems=[t.system, t.system], guess=t.cycle
+    ), {
         "systems": [*instance(PHASE), [], [3], [t.system, PHASE]], "guess": instance(t.system),
         "scale": SIZES, "settings": ["fast", 1e-9, PHASE], "execution": EXECUTION,
     }  # fmt: skip
@@ -185,9 +187,9 @@ def linear(t):
         yield f"LDTP.{name}", getattr(t.model, name), dict(u=u), {
             "u": array(u), "x0": start, "first_section": first,
         }  # fmt: skip
-    for name in ("periodic_state", "periodic_states"):
-        yield f"LDTP.{name}", getattr(t.model, name), dict(u=u[None], periods=2), {
-            "u": array(u[None]), "periods": LIMITED,
+    for name, v in (("periodic_state", u), ("periodic_states", u[None])):
+        yield f"LDTP.{name}", getattr(t.model, name), dict(u=v, periods=2), {
+            "u": array(v), "periods": LIMITED,
         }  # fmt: skip
     yield "LDTP.impulse_response", t.model.impulse_response, dict(n_lags=3), {"n_lags": LIMITED}
     yield "LDTP.htf", t.model.htf, dict(f=np.array([0.1, 0.2])), {

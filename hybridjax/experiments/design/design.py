@@ -106,7 +106,7 @@ class Design(eqx.Module):
         sizes = [np.size(f) for f in frequencies]
         if len(sizes) == 0 or min(sizes) == 0:
             raise DefinitionError(
-                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+                "every experiment needs at least one frequency: `frequencies` has none for some."
             )
 
         def flat(name, values, dtype):
@@ -157,7 +157,7 @@ class Design(eqx.Module):
         empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
         if len(empty) or len(self.experiment) == 0:
             raise DefinitionError(
-                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+                "every experiment needs at least one frequency: `frequencies` has none for some."
             )
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
