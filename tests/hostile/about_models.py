@@ -255,7 +255,7 @@ def designs(t):
         "channel": [None, "x", good["channel"][:-1], good["channel"] + 1, Other()],
         "amplitude": array(good["amplitude"]), "phase": array(good["phase"]),
         "n_sections": LIMITED, "periods": LIMITED, "experiments": LIMITED,
-        "input_names": [None, "u", (), (3,), ("u", "v", "v"), Other()],
+        "input_names": [None, (), (3,), ("u", "v", "v"), Other()],
         "highest_harmonic": optional(WHOLE),
     }  # fmt: skip
     yield "Design.inputs", t.design.inputs, {}, {

@@ -11,6 +11,7 @@ import tempfile
 import warnings
 
 import equinox as eqx
+import jax
 import matplotlib
 import numpy as np
 from matplotlib import pyplot
@@ -52,7 +53,8 @@ def attempt(function, good: dict, name: str, value) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             if isinstance(value, Traced):
-                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good.get(name, 1)))
+                arrays, rest = eqx.partition(traceable(good.get(name, 1)), eqx.is_array)
+                jax.make_jaxpr(lambda given: (call(eqx.combine(given, rest)), 0)[1])(arrays)
             else:
                 call(value)
     except Hang:
