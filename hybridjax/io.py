@@ -11,6 +11,7 @@ import typing
 from pathlib import Path
 
 from ._core.archive import read_module, write_module
+from ._core.boundary.checked import checked
 from ._core.precision import require_x64
 from ._core.tracing import is_traced
 from .errors import DefinitionError
@@ -29,6 +30,7 @@ Saved = Design | ExperimentData | HTF | LDTP | RationalFit | Record | SeriesFit 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 
 
+@checked
 def save(path: str | os.PathLike, thing: Saved) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
@@ -55,6 +57,7 @@ def save(path: str | os.PathLike, thing: Saved) -> None:
     write_module(path, thing)
 
 
+@checked
 def load(path: str | os.PathLike) -> Saved:
     """Read an object that `save` has written.
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__, plot
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..io import save
 from ..linear.htf import HTF
@@ -26,6 +27,7 @@ _PAGE = "report.html"
 _POINTS = 240  # frequencies at which transfer functions are written
 
 
+@checked
 def write_report(folder: str | os.PathLike, found: Identification) -> Path:
     """Write all results of a recording into a folder, which appears complete or not at all.
 

@@ -45,14 +45,6 @@ ROUNDING = 4e-15, 2e-6
 _TIMES_ROUNDING = 10.0
 
 
-def _number(x: PositiveScalar) -> Array:
-    return jnp.asarray(x, float)
-
-
-def _numbers(x: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
-
-
 @checked
 class Settings(eqx.Module):
     """Accuracy and effort of the flow.
@@ -61,18 +53,29 @@ class Settings(eqx.Module):
     `rtol * |q[k]| + atol * scale[a, k]`.
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    rtol: Float[Array, ""]
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    atol: Float[Array, ""]
     """Error of a step relative to each state's `scale`."""
-    max_steps: StepCount = eqx.field(static=True, default=256)
+    max_steps: int = eqx.field(static=True)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
-    scale: Float[Array, "A d"] | None = eqx.field(converter=_numbers, default=None)
+    scale: Float[Array, "A d"] | None
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
+
+    def __init__(
+        self,
+        rtol: PositiveScalar = SIMULATION,
+        atol: PositiveScalar = SIMULATION,
+        max_steps: StepCount = 256,
+        scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
+    ):
+        self.rtol, self.atol = jnp.asarray(rtol, float), jnp.asarray(atol, float)
+        self.max_steps = max_steps
+        self.scale = None if scale is None else jnp.asarray(scale, float)
 
     def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
         """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`

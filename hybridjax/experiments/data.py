@@ -91,6 +91,8 @@ class ExperimentData(eqx.Module):
             )
         S = len(self.u)
         self.result = np.zeros(S, int) if result is None else np.asarray(result, int)
+        if not np.isin(self.result, list(Result)).all():
+            raise DefinitionError("`result` must hold codes of `Result`.")
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
         self.n_sections, self.periods, self.label = n_sections, periods, label

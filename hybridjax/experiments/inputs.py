@@ -68,7 +68,9 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
         finite = np.isfinite(np.asarray(u[k : k + _LOOK], float)).all(axis=(1, 2))
         if not finite.all():
             worst = k + int(np.argmin(finite))
-            raise DefinitionError(f"the input of experiment {worst} is NaN or infinite.")
+            raise DefinitionError(
+                f"`design` has NaN or infinity in the input of experiment {worst}."
+            )
     cycles = u.shape[1] // n_sections
     if discard >= cycles:
         raise DefinitionError(

@@ -127,11 +127,13 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     parts = [data] if isinstance(data, HasRecords) else data
     records = [record for part in parts for record in part.records]
     if not records:
-        raise DefinitionError("there is no experiment that ran to its end.")
+        raise DefinitionError("`data` holds no experiment that ran to its end.")
     kinds = {(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records}
     if len(kinds) > 1:
         a, b = sorted(kinds, key=str)[:2]
-        raise DefinitionError(f"these records do not belong together: some have {a}, others {b}.")
+        raise DefinitionError(
+            f"`data` holds records that do not belong together: some have {a}, others {b}."
+        )
     found = [part for record in records for part in _with_known_inputs(record)]
     if not found:
         raise DefinitionError("the input is NaN at every sample.")

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive, Seed, StepCount
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -30,16 +32,17 @@ _PERFECT = 1e-12
 _LIKELY = 4.0
 
 
+@checked
 def fit_model(
     system: HybridSystem,
     data: AbstractObservation | Sequence[AbstractObservation],
     free: Free,
     *,
     guess: Guess | LimitCycle | None = None,
-    guesses: int = 1,
-    spread: float = 0.2,
-    seed: int = 0,
-    max_steps: int = MAX_STEPS,
+    guesses: Count = 1,
+    spread: Positive = 0.2,
+    seed: Seed = 0,
+    max_steps: StepCount = MAX_STEPS,
     progress: bool = False,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
@@ -80,11 +83,6 @@ def fit_model(
     The program is compiled at the first call for each class of systems and kind of data; other
     values of parameters and data use it again.
     """
-    if guesses < 1 or max_steps < 1 or not spread > 0:
-        raise DefinitionError(
-            f"guesses and max_steps must be at least 1 and spread positive, not {guesses}, "
-            f"{max_steps} and {spread}."
-        )
     problem, near = _prepare(system, data, free, guess)
     parameters, weighted = problem.parameters, problem.weighted
     x0 = np.asarray(parameters.encode(parameters.read(system)))
@@ -104,6 +102,7 @@ def fit_model(
     return _summary(problem, tried, best)
 
 
+@checked
 def identifiability(
     system: HybridSystem,
     data: AbstractObservation | Sequence[AbstractObservation],
@@ -138,11 +137,8 @@ def _prepare(
     """The problem, and a limit cycle near which to look for others."""
     parameters = free_parameters(system, free)
     observations = (data,) if isinstance(data, AbstractObservation) else tuple(data)
-    if not observations or not all(isinstance(one, AbstractObservation) for one in observations):
-        raise DefinitionError(
-            "data are observations (ObservedHTF, ObservedSeries, ObservedCycle, or an "
-            "AbstractObservation of your own), one or more."
-        )
+    if not observations:
+        raise DefinitionError("`data` holds no observation, but one or more are needed.")
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     return FitProblem(parameters, tuple(one.prepare(near) for one in observations)), near

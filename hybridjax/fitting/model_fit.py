@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Probability
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -87,6 +89,7 @@ class ModelFit(eqx.Module):
         lost = np.any(self.identifiability.unseen != 0, axis=0)
         return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
 
+    @checked
     def chi_square(self, true: HybridSystem | Mapping[str, float]) -> float:
         r"""How much worse other values explain the data: their cost less that of the fit.
 
@@ -110,7 +113,8 @@ class ModelFit(eqx.Module):
         more = float(r @ r) - self.cost
         return more if self.weighted else more / (self.cost / self.freedom)
 
-    def contains(self, true: HybridSystem | Mapping[str, float], level: float = 0.95) -> bool:
+    @checked
+    def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:
         """Whether other values lie in the joint confidence region of all that the data see."""
         rank = self.identifiability.rank
         if self.weighted:

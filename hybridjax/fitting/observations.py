@@ -2,15 +2,19 @@
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Complex, Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.containers import Names
+from .._core.boundary.kinds import PositiveScalar
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -28,7 +32,8 @@ from ..sections.section_list import FamilyLike, as_family
 from ..systems.structure import Structure
 
 
-Numbers = ArrayLike | Sequence
+AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
+Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 
 
 class AbstractObservation(eqx.Module):
@@ -82,6 +87,7 @@ class AbstractObservation(eqx.Module):
         return self
 
 
+@checked
 class ObservedHTF(AbstractObservation):
     r"""Harmonic transfer functions, exact or estimated.
 
@@ -133,6 +139,7 @@ class ObservedHTF(AbstractObservation):
         return self
 
 
+@checked
 class ObservedSeries(AbstractObservation):
     """Outputs at the sections in experiments that begin on the limit cycle.
 
@@ -152,12 +159,12 @@ class ObservedSeries(AbstractObservation):
     flow: tuple[Plan, Settings] | None
     uses_factors: ClassVar[bool] = False
 
-    def __init__(self, data: ExperimentData, sections: FamilyLike, std: Numbers | None = None):
+    def __init__(self, data: ExperimentData, sections: FamilyLike, std: Deviations | None = None):
         """**Arguments:** `data` of experiments with `start="cycle"`; `sections`, their family;
         `std`, the standard deviation of the measurement noise, one number or one for each output.
 
         **Raises:** `DefinitionError` if no experiment ran well, for another number of sections, or
-        an `std` that is not positive.
+        an `std` that is not one for each output.
         """
         self.sections = as_family(sections)
         if self.sections.n_sections != data.n_sections:
@@ -169,11 +176,13 @@ class ObservedSeries(AbstractObservation):
         self.inputs, self.outputs, ny = data.inputs, data.outputs, len(data.outputs)
         y = data.y[data.ok]
         scale = np.sqrt(np.mean(y**2, axis=(0, 1))) if std is None else np.asarray(std, float)
-        if scale.shape not in ((), (ny,)) or not np.all(np.isfinite(scale) & (scale > 0)):
+        if scale.shape not in ((), (ny,)):
             raise DefinitionError(
-                f"std must be positive, one number or one for each of {ny} outputs, not {std}."
-                if std is not None
-                else "an output does not move in any experiment: leave it out, or give `std`."
+                f"`std` must be one number or one for each of {ny} outputs, not {scale.shape}."
+            )
+        if not np.all(scale > 0):
+            raise DefinitionError(
+                "an output does not move in any experiment: leave it out, or give `std`."
             )
         self.scale = jnp.broadcast_to(scale, (ny,))
         self.weighted = jnp.asarray(std is not None)
@@ -206,6 +215,7 @@ class ObservedSeries(AbstractObservation):
         )
 
 
+@checked
 class ObservedCycle(AbstractObservation):
     """What was seen of the limit cycle itself: outputs at sections, times, the period.
 
@@ -228,14 +238,14 @@ class ObservedCycle(AbstractObservation):
     def __init__(
         self,
         sections: FamilyLike,
-        outputs: Sequence[str] | str = (),
-        values: Numbers | None = None,
+        outputs: AnyNames = (),
+        values: Annotated[Numbers, Reals("N ny")] | None = None,
         *,
-        times: Numbers | None = None,
-        period: Numbers | None = None,
-        std: Numbers | None = None,
-        times_std: Numbers | None = None,
-        period_std: Numbers | None = None,
+        times: Annotated[Numbers, Reals("N")] | None = None,
+        period: PositiveScalar | None = None,
+        std: Deviations | None = None,
+        times_std: Deviations | None = None,
+        period_std: PositiveScalar | None = None,
     ):
         """**Arguments:**
 
@@ -261,7 +271,7 @@ class ObservedCycle(AbstractObservation):
                 "give `outputs` with their `values`, `times`, or the `period` of the cycle."
             )
         self.which = tuple(given)
-        self.seen = tuple(_finite(name, x, shape) for name, (x, _, shape) in given.items())
+        self.seen = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
         self.scales = tuple(
             _scale(name, std, x)
             for x, (name, (_, std, _)) in zip(self.seen, given.items(), strict=True)
@@ -269,9 +279,7 @@ class ObservedCycle(AbstractObservation):
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
-    def of(
-        cls, cycle: LimitCycle, sections: FamilyLike, outputs: Sequence[str] | str = ()
-    ) -> "ObservedCycle":
+    def of(cls, cycle: LimitCycle, sections: FamilyLike, outputs: AnyNames = ()) -> "ObservedCycle":
         """All that can be seen of a known cycle: what an error-free measurement would give.
 
         **Raises:** as `place_sections`; `DefinitionError` for an output that is zero throughout.
@@ -308,10 +316,10 @@ def _times(placed: PlacedSections) -> Float[Array, " N"]:
     return t if placed.cycle.clocked else t - t[0]
 
 
-def _finite(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."]:
+def _shaped(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."]:
     x = jnp.asarray(x, float)
-    if x.shape != shape or not jnp.isfinite(x).all():
-        raise DefinitionError(f"`{name}` must be finite and of the shape {shape}, not {x.shape}.")
+    if x.shape != shape:
+        raise DefinitionError(f"`{name}` must have the shape {shape}, not {x.shape}.")
     return x
 
 
@@ -326,6 +334,9 @@ def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
             )
         return size
     std = jnp.asarray(std, float)
-    if std.shape not in ((), seen.shape[1:]) or not jnp.all(jnp.isfinite(std) & (std > 0)):
-        raise DefinitionError(f"the standard deviation of `{name}` must be positive, not {std}.")
+    if std.shape not in ((), seen.shape[1:]):
+        raise DefinitionError(
+            f"the standard deviation of `{name}` must be one number, or one for each output, not "
+            f"of shape {std.shape}."
+        )
     return jnp.broadcast_to(std, seen.shape[1:])

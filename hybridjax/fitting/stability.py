@@ -5,13 +5,15 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..errors import DefinitionError
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Probability
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
 from ..orbits.cycle import LimitCycle
 
 
-def spectral_radius(model: LDTP | LimitCycle, smoothing: float = 1e-3) -> Float[Array, ""]:
+@checked
+def spectral_radius(model: LDTP | LimitCycle, smoothing: Probability = 1e-3) -> Float[Array, ""]:
     r"""A smooth upper bound of the largest modulus of the Floquet multipliers.
 
     The number $\rho_\epsilon$ with
@@ -35,11 +37,7 @@ def spectral_radius(model: LDTP | LimitCycle, smoothing: float = 1e-3) -> Float[
 
     **Arguments:** `model`: from `linearize` or `find_limit_cycle`; of a batch, one at a time
     (`jax.vmap`). `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
-
-    **Raises:** `DefinitionError` if `smoothing` is out of range.
     """
-    if not 0 < smoothing < 1:
-        raise DefinitionError(f"smoothing lies between 0 and 1, not at {smoothing}.")
     power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
     return _smooth_radius(power, jnp.asarray(smoothing, float))
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.branches.branch import KINDS, Branch
 from ..systems.structure import Structure
@@ -16,6 +17,7 @@ _MARKS = dict(
 )
 
 
+@checked
 def branch(
     *branches: Branch,
     output: str | None = None,

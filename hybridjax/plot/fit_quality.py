@@ -7,15 +7,18 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PeriodCount, Positive
 from ..identify.series.amplitude import AmplitudeSweep
 from ..identify.series.validation import Validation
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
+@checked
 def validation(
     found: Validation,
     *,
-    cycles: int = 4,
+    cycles: PeriodCount = 4,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -68,10 +71,11 @@ def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
+@checked
 def amplitude(
     sweep: AmplitudeSweep,
     *,
-    misfit: float | None = None,
+    misfit: Positive | None = None,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:

@@ -6,6 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive, SignalNames
 from ..errors import DefinitionError
 from ..identify.multipliers.structured import StructuredFit
 from ..identify.rational.fit import RationalFit
@@ -19,12 +21,13 @@ _FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")]
 
 
+@checked
 def magnitude(
     *htfs: HTF,
     output: str | int = 0,
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
-    decades: int | float = 5,
+    decades: Positive = 5,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -40,7 +43,9 @@ def magnitude(
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
     if not htfs:
-        raise DefinitionError("there is no HTF to draw.")
+        raise DefinitionError("`htfs` holds no HTF to draw.")
+    if not harmonics:
+        raise DefinitionError("`harmonics` must hold one harmonic or more.")
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in sorted(htfs, key=_estimates_last):
@@ -60,12 +65,13 @@ def magnitude(
     return Plot(axes)
 
 
+@checked
 def harmonics(
     families: Mapping[str, HTF | Sequence[HTF]],
     harmonics: Sequence[int] = (0, 1, -1),
     *,
     input: str | int = 0,
-    decades: int | float = 5,
+    decades: Positive = 5,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -95,11 +101,12 @@ def harmonics(
     return Plot(axes)
 
 
+@checked
 def bode(
     *htfs: HTF,
     fits: Fit | Sequence[Fit] = (),
     harmonic: int = 0,
-    outputs: Sequence[str] | str | None = None,
+    outputs: SignalNames | None = None,
     input: str | int = 0,
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
@@ -118,7 +125,7 @@ def bode(
     **Raises:** `DefinitionError` for a name or harmonic that is not there.
     """
     if not htfs:
-        raise DefinitionError("there is no HTF to draw.")
+        raise DefinitionError("`htfs` holds no HTF to draw.")
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
@@ -129,7 +136,7 @@ def bode(
 
 def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) -> None:
     upper, lower = axes
-    names = htfs[0].outputs if outputs is None else np.atleast_1d(outputs)
+    names = htfs[0].outputs if outputs is None else outputs
     for number, name in enumerate(names):
         color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
         for htf in sorted(htfs, key=_estimates_last):
@@ -159,6 +166,7 @@ def _bode(axes, htfs, fits, harmonic: int, outputs, input: str | int, labels) ->
     _legend(upper, htfs)
 
 
+@checked
 def bodes(
     families: Mapping[str, HTF | Sequence[HTF]],
     *,
@@ -198,7 +206,7 @@ _FIT_NAMES = {RationalFit: "rational fit", StructuredFit: "structured fit"}
 def _columns(families) -> list[tuple[str, tuple[HTF, ...]]]:
     columns = [(k, (v,) if isinstance(v, HTF) else tuple(v)) for k, v in dict(families).items()]
     if not columns or any(not htfs for _, htfs in columns):
-        raise DefinitionError("every family needs at least one HTF.")
+        raise DefinitionError("`families` must hold at least one HTF in each family.")
     if len({htf.outputs for _, htfs in columns for htf in htfs}) > 1:
         raise DefinitionError("the families must have the same outputs to share a figure.")
     return columns

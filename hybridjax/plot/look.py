@@ -6,7 +6,7 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import matplotlib
 import numpy as np
@@ -14,6 +14,8 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from .._core.boundary.checked import checked
+from .._core.boundary.scalars import Whole
 from ..errors import DefinitionError
 
 
@@ -94,6 +96,8 @@ def new_figure(
     return figure, axes
 
 
+Resolution = Annotated[int, Whole(1, 10_000)]
+"""Dots per inch."""
 AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""
 
@@ -132,6 +136,8 @@ def panels(ax: AxesLike | None, rows: int = 1, columns: int = 1, **options):
             yield new_figure(rows, columns, **options)[1]
         return
     axes = np.asarray(ax, dtype=object)
+    if not all(isinstance(panel, Axes) for panel in axes.flat):
+        raise DefinitionError("`ax` must hold Axes of matplotlib, and nothing else.")
     if axes.size != rows * columns:
         raise DefinitionError(
             f"this plot has {rows} x {columns} panels, but `ax` holds {axes.size}: make as many, "
@@ -151,7 +157,10 @@ def letters(axes: Any) -> None:
         ax.set_title(letter, loc="left", fontweight="bold")
 
 
-def save(path: str | os.PathLike, plot: Plot | Figure | Axes, dpi: int = 150) -> tuple[Path, Path]:
+@checked
+def save(
+    path: str | os.PathLike, plot: Plot | Figure | Axes, dpi: Resolution = 150
+) -> tuple[Path, Path]:
     """Write a figure as PNG and as PDF.
 
     **Arguments:** `path` without suffix (one of `.png`, `.pdf` is dropped); `plot`, or any figure

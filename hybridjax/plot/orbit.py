@@ -7,6 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
@@ -20,6 +22,7 @@ _BAR = 0.035  # half of a section's bar, as a part of the width of the picture
 _TURN = 1 + 1e-6  # so that an event at the very end of a turn is seen
 
 
+@checked
 def cycle(
     cycle: LimitCycle,
     x: str | None = None,
@@ -28,7 +31,7 @@ def cycle(
     sections: PlacedSections | None = None,
     perturbed: Trajectory | None = None,
     labels: Mapping[str, str] | None = None,
-    numbers: int | None = None,
+    numbers: Index | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.

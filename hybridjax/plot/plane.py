@@ -1,15 +1,15 @@
 """Floquet multipliers, poles and zeros in the complex plane."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
-from ..identify.multipliers.compare import compare_multipliers
+from ..identify.multipliers.compare import Multipliers, compare_multipliers
 from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.ldtp import LDTP
@@ -27,15 +27,14 @@ from .look import (
 )
 
 
-Numbers = ArrayLike | Sequence[complex | float]
-
 _MARKERS = "osD^vP*X"
 _RATIO = 2.4  # width of a panel of poles_zeros, in heights
 
 
+@checked
 def multipliers(
-    true: LimitCycle | LDTP | MultiplierEstimate | Numbers,
-    estimates: Mapping[str, RationalFit | MultiplierEstimate | Numbers] | None = None,
+    true: LimitCycle | LDTP | MultiplierEstimate | Multipliers,
+    estimates: Mapping[str, RationalFit | MultiplierEstimate | Multipliers] | None = None,
     *,
     zoom: bool = True,
     labels: Mapping[str, str] | None = None,
@@ -58,7 +57,7 @@ def multipliers(
     """
     true = _values(true.multipliers if isinstance(true, LDTP) else true)
     if true.size == 0:
-        raise DefinitionError("there is no multiplier to draw.")
+        raise DefinitionError("`true` holds no multiplier to draw.")
     series = _series(estimates or {}, labels)
     borders = _borders(estimates or {})
     own = ax is None
@@ -91,6 +90,7 @@ def multipliers(
     return Plot(axes)
 
 
+@checked
 def poles_zeros(
     fits: Mapping[str, RationalFit],
     *,
@@ -107,7 +107,7 @@ def poles_zeros(
     **Raises:** `DefinitionError` if there are none, or their outputs differ.
     """
     if not fits or len({fit.outputs for fit in fits.values()}) != 1:
-        raise DefinitionError("poles_zeros needs one or more fits with the same outputs.")
+        raise DefinitionError("`fits` must hold one or more fits with the same outputs.")
     outputs = next(iter(fits.values())).outputs
     width = COLUMN if len(outputs) == 1 else PAGE
     with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
@@ -155,10 +155,7 @@ def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _values(source: Any) -> np.ndarray:
     if isinstance(source, LimitCycle | MultiplierEstimate):
         source = source.multipliers
-    values = np.asarray(source)
-    if values.dtype.kind not in "fciu":
-        raise DefinitionError(f"multipliers are numbers, not {values.dtype}.")
-    return values.ravel().astype(complex)
+    return np.asarray(source).ravel().astype(complex)
 
 
 def _series(estimates: Mapping[str, Any], labels) -> dict[str, np.ndarray]:

@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Complex
 
+from .._core.boundary.checked import checked
+from ..errors import DefinitionError
+from ..identify.multipliers.compare import Multipliers
 from ..identify.series.series_fit import SeriesFit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
@@ -13,6 +15,7 @@ from ..recordings.spectra import input_spectrum
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 
 
+@checked
 def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
     """Periods of the cycles, one after the other, and how they are distributed."""
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
@@ -34,6 +37,7 @@ def phase(found: Phase, *, ax: AxesLike | None = None) -> Plot:
     return Plot(axes)
 
 
+@checked
 def section_data(
     data: SectionData, *, labels: Mapping[str, str] | None = None, ax: AxesLike | None = None
 ) -> Plot:
@@ -84,6 +88,7 @@ def section_data(
     return Plot(axes)
 
 
+@checked
 def impulse_responses(
     found: ImpulseResponses,
     *,
@@ -94,6 +99,8 @@ def impulse_responses(
     """Left: responses to a push against its phase and the time since. Right: some of them with
     bands of 95 %."""
     ny, N = len(found.outputs), len(found.phase)
+    if not 0 <= input < len(found.inputs):
+        raise DefinitionError(f"there is no `input` {input}; the inputs are {found.inputs}.")
     chosen = [0, N // 4, N // 2, 3 * N // 4]
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
         for i, name in enumerate(found.outputs):
@@ -122,8 +129,9 @@ def impulse_responses(
     return Plot(axes)
 
 
+@checked
 def multiplier_regions(
-    fit: SeriesFit, plain: Complex[np.ndarray, " d"] | None = None, *, ax: AxesLike | None = None
+    fit: SeriesFit, plain: Multipliers | None = None, *, ax: AxesLike | None = None
 ) -> Plot:
     """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
     are small; beside them those of plain regression, if given."""

@@ -4,12 +4,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .._core.boundary.checked import checked
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, label_of, panels
 
 
+@checked
 def experiment(
     data: ExperimentData,
     index: int = 0,

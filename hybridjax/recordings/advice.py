@@ -7,6 +7,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Order
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..experiments.record import RecordedData
@@ -42,7 +44,8 @@ _WHOLE_BAND = 0.9
 _STRIDES = (100, 300, 1000, 3000)
 
 
-def plain_regression(data: RecordedData, order: int) -> Complex[np.ndarray, " d"]:
+@checked
+def plain_regression(data: RecordedData, order: Order) -> Complex[np.ndarray, " d"]:
     """Multipliers by least squares on chi y = B u (ARX), which noise in y biases towards zero.
 
     To see by how much: `fit_series` has no such bias.
@@ -76,6 +79,7 @@ class Advice(eqx.Module):
         return "\n".join(self.warnings) or "Nothing speaks against the fit."
 
 
+@checked
 def advise(data: SectionData, fit: SeriesFit) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 

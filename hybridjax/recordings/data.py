@@ -4,6 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PeriodCount
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record
 
@@ -58,7 +60,8 @@ class SectionData(eqx.Module):
         u, y = (np.concatenate([getattr(r, x) for r in self.records]) for x in "uy")
         return np.sqrt(np.nanmean(u**2, axis=0)), np.sqrt(np.nanmean(y**2, axis=0))
 
-    def experiments(self, periods: int) -> ExperimentData:
+    @checked
+    def experiments(self, periods: PeriodCount) -> ExperimentData:
         """The records as experiments with periodic inputs, for `estimate_htf` and its like.
 
         Every record is cut to whole cycles from section 0, and all to the same length.

@@ -2,11 +2,17 @@
 
 import csv
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PeriodCount, Positive, SectionCount
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
 from .phase.winding import Phase
@@ -18,13 +24,14 @@ from .recording import Recording
 _ROUNDING = 1e-9
 
 
+@checked
 def write_design(
     path: str | os.PathLike,
     design: Design,
     *,
-    cycles: int | None = None,
-    period: int | float | None = None,
-    rate: int | float | None = None,
+    cycles: PeriodCount | None = None,
+    period: Positive | None = None,
+    rate: Positive | None = None,
 ) -> None:
     """Write the inputs of a design to a CSV file.
 
@@ -49,8 +56,6 @@ def write_design(
         k = np.arange(n)
         place = np.stack([k // N, k % N, (k % N) / N], axis=1)
     else:
-        if not (period > 0 and rate > 0):
-            raise DefinitionError(f"period and rate must be positive, not {period} and {rate}.")
         header = ["experiment", "time"]
         time = np.arange(int(n / N * period * rate)) / rate
         u = u[:, np.minimum((time * N / period + _ROUNDING).astype(int), n - 1)]
@@ -71,6 +76,7 @@ def write_design(
         temporary.unlink(missing_ok=True)
 
 
+@checked
 def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
     """The inputs by name, for each experiment and section, from a table of `write_design`.
 
@@ -87,11 +93,12 @@ def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
     return {k: v.reshape(len(count), -1) for k, v in columns.items() if k not in needed}
 
 
+@checked
 def add_command(
     recording: Recording,
     phase: Phase,
-    command: dict[str, Float[np.ndarray, "S n"]],
-    n_sections: int,
+    command: Mapping[str, Annotated[Numbers, Reals("S n")]],
+    n_sections: SectionCount,
 ) -> Recording:
     """A recording with what hardware was told to apply, where that was not measured itself.
 

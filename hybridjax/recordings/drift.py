@@ -1,10 +1,13 @@
 """Slow changes of signals that are no response to the inputs."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive, SignalNames
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 from .phase.winding import Phase
 from .recording import Recording, Trial
@@ -18,14 +21,19 @@ _LONGEST_GAP = 0.25
 _FASTEST_DRIFT = 4
 
 
+DriftCycles = Annotated[float, Number("a positive number of cycles", above=0, infinite=True)]
+"""Slower than in so many cycles; infinite: a constant."""
+
+
 def check_drift(cycles: int | float) -> None:
     """**Raises:** `DefinitionError` for a drift that is too fast to be told from responses."""
     if not cycles >= _FASTEST_DRIFT:
-        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles}.")
+        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles:g}.")
 
 
+@checked
 def without_drift(
-    recording: Recording, phase: Phase, signals: str | Sequence[str], cycles: int | float
+    recording: Recording, phase: Phase, signals: SignalNames, cycles: Positive
 ) -> Recording:
     """A recording without the slow drift of some signals, such as that of sensors.
 
@@ -36,7 +44,6 @@ def without_drift(
     **Raises:** `DefinitionError` for signals that are not there, fewer than four cycles, or a phase
     of other trials.
     """
-    signals = (signals,) if isinstance(signals, str) else signals
     columns = [recording.column(x) for x in signals]
     check_drift(cycles)
     if len(phase.stretches) != len(recording.trials):

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.multipliers.denominator import Denominator
@@ -24,7 +26,8 @@ CYCLES_LOOKED_AT = 1000
 _AS_GOOD = 0.02
 
 
-def choose_order(data: SectionData, most: int = 4, share: float = 0.25) -> int:
+@checked
+def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
     """The number of multipliers that predicts best what it was not fitted to.
 
     For each number a first, consistent estimate (total least squares) is made from all but the last
@@ -61,15 +64,14 @@ class HeldOut(NamedTuple):
     validation: Validation
 
 
-def hold_out(data: SectionData, order: int, share: float = 0.25) -> HeldOut:
+@checked
+def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> HeldOut:
     """Fit all but the last `share` of every record, and simulate that.
 
     Of long recordings the first 1000 cycles are looked at.
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
-    if not 0 < share < 1:
-        raise DefinitionError(f"share must lie between 0 and 1, not {share}.")
     early, late = _split(data, share)
     fit = fit_series(early, order, check=False)
     return HeldOut(fit, validate(fit, late))

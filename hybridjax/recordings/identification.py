@@ -1,21 +1,23 @@
 """All steps from a recording to multipliers, in one call."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Order, SectionCount, SignalNames
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
 from .data import SectionData
-from .drift import without_drift
+from .drift import DriftCycles, without_drift
 from .held_out import CYCLES_LOOKED_AT, HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
 from .phase.estimation import PhaseDefinition, estimate_phase, signals_of
 from .phase.winding import Phase
 from .recording import Recording
 from .sampling import section_data
+from .smoothing import Bandwidth
 
 
 class Identification(eqx.Module):
@@ -38,18 +40,19 @@ class Identification(eqx.Module):
         return "\n".join(map(repr, parts))
 
 
+@checked
 def identify_recording(
     recording: Recording,
     phase: Phase | PhaseDefinition,
     *,
-    inputs: str | Sequence[str],
-    outputs: str | Sequence[str],
-    order: int | None = None,
-    n_sections: int | None = None,
-    bandwidth: int | float | None = None,
+    inputs: SignalNames,
+    outputs: SignalNames,
+    order: Order | None = None,
+    n_sections: SectionCount | None = None,
+    bandwidth: Bandwidth | None = None,
     sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
-    drift: int | float | None = None,
+    drift: DriftCycles | None = None,
 ) -> Identification:
     """From a recording to multipliers, transfer functions, impulse responses and what to think of
     them.

@@ -1,11 +1,14 @@
 """Phase-dependent impulse responses: what a brief push at each phase does, and for how long."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit
 from .data import SectionData
@@ -54,12 +57,16 @@ class ImpulseResponses(eqx.Module):
         )
 
 
+ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=0, high=1e4)]
+
+
+@checked
 def impulse_responses(
     fit: SeriesFit,
     data: SectionData,
-    cycles: int | float = 3,
+    cycles: ResponseCycles = 3,
     *,
-    width: int | float | None = None,
+    width: Positive | None = None,
 ) -> ImpulseResponses:
     """The responses of a fit to a push at each phase, with standard errors.
 
@@ -84,8 +91,8 @@ def impulse_responses(
     if width is None:
         edge = min(input_band(data))
         width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
-    if lags < 2 or width < 0:
-        raise DefinitionError(f"cycles and width must be positive, not {cycles} and {width}.")
+    if lags < 2:
+        raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
     reach = int(np.ceil(_PUSH_REACH * width * N))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     responses = _responses(fit, max(fit.lead + lags + reach, R))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError, FileFormatError
 from .recording import Recording
 
@@ -20,6 +21,7 @@ _MISSING = {"", "nan", "na", "n/a", "null"}
 _EVENT = "event "
 
 
+@checked
 def read_recording(
     *paths: str | os.PathLike, time: str = "time", units: Mapping[str, str] | None = None
 ) -> Recording:

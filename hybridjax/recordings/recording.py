@@ -7,9 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
-from .smoothing import spline
+from .smoothing import Bandwidth, spline
 
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
@@ -34,6 +35,7 @@ class Trial(eqx.Module):
     name: str = eqx.field(static=True)
 
 
+@checked
 class Recording(eqx.Module):
     """Sampled signals of one or several trials. Nothing is resampled.
 
@@ -128,7 +130,12 @@ class Recording(eqx.Module):
 
         **Raises:** `DefinitionError` if there is no such column, and as `Recording`.
         """
-        names = [str(key) for key in getattr(frame, "column_names", None) or frame.keys()]
+        columns = getattr(frame, "column_names", None)
+        if columns is None and not hasattr(frame, "keys"):
+            raise DefinitionError(
+                f"`frame` must be a table with named columns, not a {type(frame).__name__}."
+            )
+        names = [str(key) for key in (frame.keys() if columns is None else columns)]
         if time not in names:
             raise DefinitionError(
                 f"trial '{name}' has no column '{time}'; its columns are {', '.join(names)}."
@@ -144,7 +151,7 @@ class Recording(eqx.Module):
         """
         recordings = list(recordings)
         if not recordings:
-            raise DefinitionError("there is no recording to join.")
+            raise DefinitionError("`recordings` holds no recording to join.")
         first, trials = recordings[0], []
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name
@@ -166,9 +173,7 @@ class Recording(eqx.Module):
             trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
         return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
 
-    def mark(
-        self, event: str, crossing: Crossing, *, bandwidth: int | float = np.inf
-    ) -> "Recording":
+    def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
         """The same with one more event: a signal crosses a level.
 
         Jumps against the direction (an angle that begins anew) are no events, jumps along it are.

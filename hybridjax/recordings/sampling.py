@@ -1,20 +1,21 @@
 """From sampled signals to data at the sections of a cycle."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import SectionCount, SignalNames
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
-from .drift import check_drift
+from .drift import DriftCycles, check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
-from .smoothing import gaps, inside, means, nearest, spline
+from .smoothing import Bandwidth, gaps, inside, means, nearest, spline
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
@@ -28,18 +29,19 @@ _N_SECTIONS = 32
 _ROUNDING = 1e-9
 
 
+@checked
 def section_data(
     recording: Recording,
     phase: Phase | PhaseDefinition,
     *,
-    inputs: str | Sequence[str],
-    outputs: str | Sequence[str],
-    n_sections: int | None = None,
-    bandwidth: int | float | None = None,
+    inputs: SignalNames,
+    outputs: SignalNames,
+    n_sections: SectionCount | None = None,
+    bandwidth: Bandwidth | None = None,
     sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
-    drift: int | float | None = None,
-    max_gap: int | float | None = None,
+    drift: DriftCycles | None = None,
+    max_gap: Bandwidth | None = None,
 ) -> SectionData:
     """Sample a recording at N phases of each cycle.
 
@@ -68,8 +70,6 @@ def section_data(
     **Raises:** `DefinitionError` for names that are not there, constant signals, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
-    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
-    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _refuse_constant(recording, inputs, outputs)
     if drift is not None:
         check_drift(drift)
@@ -151,8 +151,6 @@ def _number_of_sections(given: int | None, phase: Phase) -> int:
             "sections: give it once."
         )
     N = next((n for n in (given, phase.n_sections) if n is not None), _N_SECTIONS)
-    if N < 1:
-        raise DefinitionError(f"there must be one section or more, not {N}.")
     return N
 
 

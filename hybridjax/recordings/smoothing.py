@@ -1,12 +1,18 @@
 """Splines through samples, smoothing ones with a stated bandwidth, and gaps between samples."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solveh_banded
 
+from .._core.boundary.scalars import Number
 from ..errors import DefinitionError
 
+
+Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
+"""In Hz; infinite: nothing is smoothed."""
 
 # Samples that a spline is drawn through, at least. Doubled: shorter stretches are left out.
 FEWEST = 5

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import SectionCount
+from .._core.boundary.kinds import Scalar, SectionCount
 from ..systems.structure import Structure
 from .abstract import (
     AbstractSections,
@@ -31,8 +31,11 @@ class ClockPhase(AbstractSections):
     """
 
     label: ClassVar[str] = "isochron"
-    n_sections: SectionCount = eqx.field(static=True)
-    anchor: Crossing | Float[Array, ""] = eqx.field(converter=as_anchor, default=0.0)
+    n_sections: int = eqx.field(static=True)
+    anchor: Crossing | Float[Array, ""]
+
+    def __init__(self, n_sections: SectionCount, anchor: Crossing | Scalar = 0.0):
+        self.n_sections, self.anchor = n_sections, as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
         check_anchor(self.anchor, s)

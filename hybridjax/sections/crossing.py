@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Scalar
+from .._core.boundary.kinds import Scalar, SignalNames
 from ..systems.output import Output
 from ..systems.structure import Structure
 
@@ -38,8 +38,18 @@ class Crossing(eqx.Module):
 
     function: str | Output | Callable[..., Any]
     direction: Direction = eqx.field(static=True)
-    value: Float[Array, ""] = eqx.field(converter=number, default=0.0)
-    charts: tuple[str, ...] | None = eqx.field(static=True, default=None)
+    value: Float[Array, ""]
+    charts: tuple[str, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        function: str | Output | Callable[..., Any],
+        direction: Direction,
+        value: Scalar = 0.0,
+        charts: SignalNames | None = None,
+    ):
+        self.function, self.direction, self.charts = function, direction, charts
+        self.value = number(value)
 
     def __str__(self):
         name = self.function

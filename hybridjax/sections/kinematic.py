@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Numbers, SectionCount
+from .._core.boundary.kinds import Numbers, Scalar, SectionCount
 from ..engine.target import AbstractLevels
 from ..systems.structure import Structure
 from .abstract import (
@@ -20,14 +20,6 @@ from .abstract import (
     check_anchor,
 )
 from .crossing import Crossing
-
-
-def _center(x: Annotated[Numbers, Reals("2")] | None) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
-
-
-def _scale(x: Annotated[Numbers, Reals("2", sign="positive")] | None) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
 
 
 @checked
@@ -52,12 +44,26 @@ class KinematicPhase(AbstractSections):
     """
 
     label: ClassVar[str] = "kinematic"
-    n_sections: SectionCount = eqx.field(static=True)
+    n_sections: int = eqx.field(static=True)
     position: str = eqx.field(static=True)
     velocity: str = eqx.field(static=True)
-    center: Float[Array, "2"] | None = eqx.field(converter=_center, default=None)
-    scale: Float[Array, "2"] | None = eqx.field(converter=_scale, default=None)
-    anchor: Crossing | Float[Array, ""] = eqx.field(converter=as_anchor, default=0.0)
+    center: Float[Array, "2"] | None
+    scale: Float[Array, "2"] | None
+    anchor: Crossing | Float[Array, ""]
+
+    def __init__(
+        self,
+        n_sections: SectionCount,
+        position: str,
+        velocity: str,
+        center: Annotated[Numbers, Reals("2")] | None = None,
+        scale: Annotated[Numbers, Reals("2", sign="positive")] | None = None,
+        anchor: Crossing | Scalar = 0.0,
+    ):
+        self.n_sections, self.position, self.velocity = n_sections, position, velocity
+        self.center = None if center is None else jnp.asarray(center, float)
+        self.scale = None if scale is None else jnp.asarray(scale, float)
+        self.anchor = as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
         s.resolve_outputs((self.position, self.velocity))

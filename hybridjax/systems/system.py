@@ -2,15 +2,14 @@
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import check_fields, checked
-from .._core.boundary.kinds import Numbers, Scalar
+from .._core.boundary.kinds import Scalar, Vector
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -39,17 +38,16 @@ def _number(x: Scalar) -> Array:
     return jnp.asarray(x, float)
 
 
-def _state(x: Annotated[Numbers, Reals("n")]) -> Array:
-    return jnp.asarray(x, float)
-
-
 @checked
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=_state)
-    time: Float[Array, ""] = eqx.field(converter=_number, default=0.0)
+    state: Float[Array, " n"]
+    time: Float[Array, ""]
+
+    def __init__(self, chart: str, state: Vector, time: Scalar = 0.0):
+        self.chart, self.state, self.time = chart, jnp.asarray(state, float), _number(time)
 
 
 class HybridSystem(eqx.Module):

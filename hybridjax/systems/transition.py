@@ -14,20 +14,15 @@ from .._core.boundary.kinds import PositiveScalar, Scalar
 Direction = Literal["falling", "rising"]
 
 
-def _period(x: PositiveScalar) -> Array:
-    return jnp.asarray(x, float)
-
-
-def _offset(x: Scalar) -> Array:
-    return jnp.asarray(x, float)
-
-
 @checked
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
 
-    period: Float[Array, ""] = eqx.field(converter=_period)
-    offset: Float[Array, ""] = eqx.field(converter=_offset, default=0.0)
+    period: Float[Array, ""]
+    offset: Float[Array, ""]
+
+    def __init__(self, period: PositiveScalar, offset: Scalar = 0.0):
+        self.period, self.offset = jnp.asarray(period, float), jnp.asarray(offset, float)
 
 
 def _identity(t, q, u):

@@ -7,9 +7,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Fraction, Index, NonNegative, Seed, SignalNames
+from ..errors import DefinitionError
 from ..recordings.recording import Recording, Trial
 
 
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Dirt:
     """What a poor laboratory does to a recording; by default nothing.
@@ -28,23 +32,28 @@ class Dirt:
     - `seed`: of all of these.
     """
 
-    noise: float = 0.0
-    quantum: float = 0.0
+    noise: NonNegative = 0.0
+    quantum: NonNegative = 0.0
     drift: float = 0.0
-    missing: float = 0.0
+    missing: Fraction = 0.0
     gap: tuple[float, float] | None = None
     irregular: bool = False
-    lost_events: int = 0
-    doubled_events: int = 0
+    lost_events: Index = 0
+    doubled_events: Index = 0
     stretch: float = 0.0
-    seed: int = 0
+    seed: Seed = 0
+
+    def __post_init__(self):
+        if self.gap is not None and self.gap[0] >= self.gap[1]:
+            raise DefinitionError(f"`gap` must end after it starts, but is {self.gap}.")
 
 
 # How late a false event is, in median intervals. Doubled: it is still taken for a doubled one.
 _FALSE_EVENT = 0.05
 
 
-def spoil(recording: Recording, signals: Sequence[str], dirt: Dirt) -> Recording:
+@checked
+def spoil(recording: Recording, signals: SignalNames, dirt: Dirt) -> Recording:
     """A recording as a poor laboratory would have made it.
 
     **Arguments:** `signals`: those that are measured; inputs stay as they are. `dirt`: how poor.

@@ -4,6 +4,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import signal
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, NonNegative, Positive, Seed
+from .._core.boundary.limits import PERIODS
 from ..errors import DefinitionError
 
 
@@ -12,14 +15,15 @@ from ..errors import DefinitionError
 _TRANSIENT = 4
 
 
+@checked
 def random_force(
-    duration: int | float,
-    rate: int | float,
-    bandwidth: int | float,
+    duration: Positive,
+    rate: Positive,
+    bandwidth: Positive,
     *,
-    rms: int | float = 1.0,
-    inputs: int = 1,
-    seed: int = 0,
+    rms: NonNegative = 1.0,
+    inputs: Count = 1,
+    seed: Seed = 0,
 ) -> Float[np.ndarray, "n nu"]:
     """A random perturbation with power up to `bandwidth`: white noise, low-passed.
 
@@ -31,10 +35,15 @@ def random_force(
 
     **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
     """
-    if not 0 < bandwidth < rate / 2:
+    if bandwidth >= rate / 2:
         raise DefinitionError(
-            f"the bandwidth must lie between 0 and half of the {rate:g} samples per second, but is "
+            f"`bandwidth` must be less than half of the {rate:g} samples per second, but is "
             f"{bandwidth:g}."
+        )
+    if duration * rate * inputs > PERIODS:
+        raise DefinitionError(
+            f"`duration` times `rate` is {duration * rate * inputs:.3g} samples of all inputs, "
+            f"more than {PERIODS}."
         )
     n = round(duration * rate)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")

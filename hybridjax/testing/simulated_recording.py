@@ -1,28 +1,36 @@
 """Recordings of simulated systems, whose truth is known."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive
+from .._core.boundary.limits import SECTIONS
 from ..engine.settings import EXPERIMENT
+from ..errors import DefinitionError
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
 from ..sections.clock import ClockPhase
-from ..systems.output import Output
+from ..systems.output import OutputNames
+from ..systems.structure import Structure
 
 
+@checked
 def simulate_recording(
     cycle: LimitCycle,
-    force: Float[np.ndarray, "S n nu"] | Float[Array, "S n nu"],
-    outputs: Sequence[str | Output] | str | Output,
+    force: Annotated[Numbers, Reals("S n nu")],
+    outputs: OutputNames,
     *,
-    rate: int | float = 500,
-    steps: int = 4,
-    accuracy: float = EXPERIMENT,
+    rate: Positive = 500,
+    steps: Count = 4,
+    accuracy: Positive = EXPERIMENT,
 ) -> Recording:
     """What instruments would see of a system that is perturbed by a force, given as samples.
 
@@ -41,8 +49,14 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
+    Structure(cycle.system).resolve_outputs(outputs)
     force = np.asarray(force, float)
     period = float(cycle.period)
+    if not 1 <= rate * period * steps <= SECTIONS:
+        raise DefinitionError(
+            f"`rate` and `steps` give {rate * period * steps:.3g} steps in a period, but they may "
+            f"be 1 to {SECTIONS}."
+        )
     K = round(rate * period)
     S, n, nu = force.shape
     cycles = -(-(n - 1) // K)

@@ -166,9 +166,10 @@ class Table(Kind):
 
 class Names(Kind):
     """One name, or several distinct ones, as a tuple. Objects of the class `other` may stand among
-    them."""
+    them. Without `empty` there must be one."""
 
-    def __init__(self, other: type | None = None):
+    def __init__(self, other: type | None = None, *, empty: bool = False):
+        self.empty = empty
         self.item = Text() if other is None else Either(Text(), Instance(other))
         self.allowed = "a name, or a sequence of distinct names"
         if other is not None:
@@ -179,7 +180,7 @@ class Names(Kind):
             value = (value,)
         elif isinstance(value, np.ndarray) and value.ndim != 1:
             raise self.refused(value)
-        if not all(map(self._fits, value)):
+        if not all(map(self._fits, value)) or not (len(value) or self.empty):
             raise self.refused(value)
         given = tuple(str(x) if isinstance(x, str) else x for x in value)
         names = [x for x in given if isinstance(x, str)]

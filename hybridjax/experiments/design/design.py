@@ -105,7 +105,9 @@ class Design(eqx.Module):
         """
         sizes = [np.size(f) for f in frequencies]
         if len(sizes) == 0 or min(sizes) == 0:
-            raise DefinitionError("every experiment of a design needs at least one frequency.")
+            raise DefinitionError(
+                "every experiment needs at least one frequency: `frequencies` has none for some."
+            )
 
         def flat(name, values, dtype):
             if np.isscalar(values):
@@ -146,9 +148,17 @@ class Design(eqx.Module):
         **Raises:** `DefinitionError` that names the experiment and the frequencies.
         """
         P, N = self.periods, self.n_sections
+        for name in ("line", "channel", "amplitude", "phase"):
+            if getattr(self, name).shape != self.experiment.shape:
+                raise DefinitionError(
+                    f"`{name}` must hold as many entries as `experiment`, "
+                    f"{len(self.experiment)}, not {len(getattr(self, name))}."
+                )
         empty = np.setdiff1d(np.arange(self.experiments), self.experiment)
         if len(empty) or len(self.experiment) == 0:
-            raise DefinitionError("every experiment of a design needs at least one frequency.")
+            raise DefinitionError(
+                "every experiment needs at least one frequency: `frequencies` has none for some."
+            )
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
         self._refuse(~good, "has an amplitude that is not a positive number")

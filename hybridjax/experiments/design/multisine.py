@@ -146,7 +146,9 @@ def multisine(
         experiment, line, channel, phase = _orthogonal(found[0], j, phase.reshape(nu, -1))
     order = np.lexsort((channel, line, experiment))
     line = line[order]
-    size = amplitude(line / periods) if callable(amplitude) else float(amplitude)
+    size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
+    if size.dtype.kind not in "fiu":
+        raise DefinitionError(f"`amplitude` must return real numbers, not {size.dtype}.")
     return Design(
         experiment=experiment[order],
         line=line,
@@ -274,6 +276,8 @@ def single_cosine(
     """
     names = input_names(inputs)
     lines = to_lines(np.atleast_1d(np.asarray(f, float)), periods)
+    if not len(lines):
+        raise DefinitionError("`f` must hold one frequency or more.")
     twice = needs_two_phases(lines, periods, n_sections) & (half_integers == "two-phase")
     repeats = np.where(twice, 2, 1)
     each = np.repeat(lines, repeats) / periods

@@ -1,19 +1,19 @@
 """How much of the output a linear periodic system explains."""
 
 import functools
-from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Index, Probability
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData
 from ...linear.frequency_response import Harmonics
 from .least_squares import solve_lines
 from .nonparametric import choose_harmonics
-from .spectral_sums import SumOptions, spectral_sums
+from .spectral_sums import Experiments, SumOptions, spectral_sums
 
 
 class Coherence(eqx.Module):
@@ -34,13 +34,14 @@ class Coherence(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
 
+@checked
 def estimate_coherence(
-    data: ExperimentData | Iterable[ExperimentData],
+    data: Experiments,
     harmonics: Harmonics | None = None,
     *,
-    repeats: int = 1,
-    highest: int | None = None,
-    threshold: float = 1e-6,
+    repeats: Count = 1,
+    highest: Index | None = None,
+    threshold: Probability = 1e-6,
 ) -> Coherence:
     """The coherence of inputs with the outputs that they cause at shifted frequencies.
 

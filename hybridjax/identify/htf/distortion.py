@@ -4,6 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.partition import line_class
@@ -39,7 +41,8 @@ class OutputLevels(eqx.Module):
         return "\n".join(rows)
 
 
-def output_levels(data: ExperimentData, repeats: int = 1) -> OutputLevels:
+@checked
+def output_levels(data: ExperimentData, repeats: Count = 1) -> OutputLevels:
     """How much of the output stands at excited lines, and at odd and even ones that are not.
 
     Only where P is even and all excited lines are odd (`multisine(lines="odd")`) are the two kinds

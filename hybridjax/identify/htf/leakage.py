@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.design import Design
@@ -13,6 +14,7 @@ from ...linear.ldtp import LDTP
 from .nonparametric import estimate_htf
 
 
+@checked
 def predict_leakage(
     design: Design, model: LDTP | HTF, harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M ny"]:

@@ -1,30 +1,31 @@
 """Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
 
 import functools
-from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Index, Probability
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
-from ...experiments.data import ExperimentData
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from .least_squares import solve_lines
-from .spectral_sums import SumOptions, spectral_sums
+from .spectral_sums import Experiments, SumOptions, spectral_sums
 
 
+@checked
 def estimate_htf(
-    data: ExperimentData | Iterable[ExperimentData],
+    data: Experiments,
     harmonics: Harmonics | None = None,
     *,
-    repeats: int = 1,
+    repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
-    highest: int | None = None,
+    highest: Index | None = None,
     half_integers: Literal["error", "skip"] = "error",
-    threshold: float = 1e-6,
+    threshold: Probability = 1e-6,
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
 
@@ -66,17 +67,11 @@ def estimate_htf(
     multiple of 1/2; for too few periods or realizations for the variance asked; or for parts that
     do not belong together.
     """
-    if half_integers not in ("error", "skip"):
-        raise DefinitionError(f"half_integers must be 'error' or 'skip', not {half_integers!r}.")
-    if variance not in ("auto", "noise", "total"):
-        raise DefinitionError(f"variance must be 'auto', 'noise' or 'total', not {variance!r}.")
     if variance == "noise" and repeats < 2:
         raise DefinitionError(
             "the variance of noise alone needs two windows or more: record P periods more, and "
             "say repeats=2."
         )
-    if highest is not None and highest < 0:
-        raise DefinitionError(f"highest is a harmonic, 0 or more, not {highest}.")
     require_x64()
     choose = functools.partial(choose_harmonics, harmonics, highest)
     sums = spectral_sums(data, SumOptions(choose, threshold, highest, repeats))
@@ -115,11 +110,12 @@ def estimate_htf(
     )
 
 
+@checked
 def missing_frequencies(
-    data: ExperimentData | Iterable[ExperimentData],
-    threshold: float = 1e-6,
+    data: Experiments,
+    threshold: Probability = 1e-6,
     *,
-    highest: int | None = None,
+    highest: Index | None = None,
 ) -> Float[np.ndarray, " F"]:
     """Frequencies (cycles per period) that were excited but that `estimate_htf` has to leave out.
 

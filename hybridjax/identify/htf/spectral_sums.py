@@ -5,15 +5,20 @@ same memory for any number of experiments, and those of two sets of experiments 
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from ..._core.boundary.stream import Stream
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.partition import check_sharing, meets_itself, regular
 from .crest_test import CrestTest, compare_crest_factors
+
+
+Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
+"""Experiments, or parts of them one after the other."""
 
 
 # Largest change of a line of the input from one window to the next, relative to the largest line.
@@ -106,16 +111,12 @@ class SpectralSums(NamedTuple):
         return out
 
 
-def spectral_sums(
-    data: ExperimentData | Iterable[ExperimentData], options: SumOptions
-) -> SpectralSums:
+def spectral_sums(data: Experiments, options: SumOptions) -> SpectralSums:
     """The sums over all experiments, which may come in parts.
 
     **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
     other, if records are too short, or if parts do not belong together.
     """
-    if not 0 < options.threshold < 1:
-        raise DefinitionError(f"threshold must lie between 0 and 1, not {options.threshold}.")
     if isinstance(data, ExperimentData):
         total, summary = _sums_of_part(data, options, 0), data.summary()
     else:
@@ -130,7 +131,7 @@ def spectral_sums(
             total = new if total is None else _add(total, new)
             count, good = count + len(part.ok), good + int(part.ok.sum())
         if total is None:
-            raise DefinitionError("there are no experiments: what was given has no parts.")
+            raise DefinitionError("`data` holds no experiments.")
         summary = f"{good}/{count} ok"
     if len(total.line) == 0:
         raise DefinitionError("the inputs are zero in the window: there is nothing to estimate.")

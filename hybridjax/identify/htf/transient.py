@@ -9,12 +9,17 @@ multipliers alone are left to be found (variable projection: Golub and Pereyra 1
 """
 
 import dataclasses
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
+from ..._core.arguments import Numbers
+from ..._core.boundary.arrays import Complexes
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index, Order
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData, Simulated
 from ...experiments.design.partition import line_class
@@ -58,12 +63,13 @@ class TransientFit(eqx.Module):
         return f"TransientFit(multipliers {shown}; removed rms up to {removed}; {self.data!r})"
 
 
+@checked
 def remove_transient(
     data: ExperimentData,
-    order: int | None = None,
+    order: Order | None = None,
     *,
-    multipliers: Complex[np.ndarray, " d"] | None = None,
-    skip: int = 1,
+    multipliers: Annotated[Numbers, Complexes("d")] | None = None,
+    skip: Index = 1,
 ) -> TransientFit:
     """Fit the decay of whatever the experiments started with, and subtract it.
 
@@ -88,10 +94,10 @@ def remove_transient(
     N, P = data.n_sections, data.periods
     S, n, ny = data.y.shape
     cycles = n // N - skip
-    if skip < 0:
-        raise DefinitionError(f"skip is a number of periods, not {skip}.")
-    if order is not None and not 1 <= order <= cycles // 2:
-        raise DefinitionError(f"order is the number of multipliers, at least 1, not {order}.")
+    if order is not None and order > cycles // 2:
+        raise DefinitionError(
+            f"`order` must be at most half of the {cycles} cycles, but is {order}."
+        )
     if cycles < P:
         raise DefinitionError(
             f"the record has {n // N} cycles, but to remove a transient it must hold the "
@@ -158,7 +164,7 @@ def _require_periodic(data: ExperimentData) -> None:
 def _polynomial(multipliers) -> Float[np.ndarray, " d"]:
     c = np.poly(np.asarray(multipliers))[1:]
     if np.abs(np.imag(c)).max(initial=0) > _REAL or len(c) == 0:
-        raise DefinitionError(f"multipliers must be real or in conjugate pairs: {multipliers}.")
+        raise DefinitionError(f"`multipliers` must be real or in conjugate pairs: {multipliers}.")
     return np.real(c)
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
@@ -30,7 +32,8 @@ class MultiplierBound(MultiplierEstimate):
         return f"MultiplierBound({self.show_multipliers()})"
 
 
-def multiplier_bound(model: LDTP, htf: HTF, overhang: int | None = None) -> MultiplierBound:
+@checked
+def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> MultiplierBound:
     r"""The Cramer-Rao bound of the multipliers of a known model.
 
     For independent, circular, normal errors of the HTFs, with all numerators unknown: the inverse

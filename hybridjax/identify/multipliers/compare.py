@@ -1,6 +1,7 @@
 """Estimated multipliers beside the true ones."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -8,7 +9,12 @@ from jaxtyping import Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from ..._core.arguments import Numbers
+from ..._core.boundary.arrays import Complexes
 from ...errors import DefinitionError
+
+
+Multipliers = Annotated[Numbers, Complexes()]
+"""Supposed or true multipliers, one or several."""
 
 
 class MultiplierComparison(eqx.Module):
@@ -51,14 +57,14 @@ def _show(value: complex) -> str:
     return f"{value.real:+.9f} {value.imag:+.9f}i"
 
 
-def compare_multipliers(estimated: Numbers, true: Numbers) -> MultiplierComparison:
+def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComparison:
     """Pair estimated with true multipliers so that the sum of distances is smallest.
 
     **Raises:** `DefinitionError` if either is empty.
     """
     found, known = np.asarray(estimated).ravel(), np.asarray(true).ravel()
     if found.size == 0 or known.size == 0:
-        raise DefinitionError("there is no multiplier to compare.")
+        raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
     here, there = linear_sum_assignment(np.abs(found[:, None] - known))
     order = np.lexsort((-known[there].imag, -np.abs(known[there])))
     return MultiplierComparison(
@@ -68,7 +74,7 @@ def compare_multipliers(estimated: Numbers, true: Numbers) -> MultiplierComparis
 
 def compare_by_output(
     estimated: Sequence[Complex[np.ndarray, " _"]],
-    true: Numbers,
+    true: Multipliers,
     outputs: Sequence[str],
     output: str | int | None = None,
 ) -> MultiplierComparison:

@@ -1,6 +1,6 @@
 """Values and errors of harmonic transfer functions as fits take them: checked, with weights."""
 
-from itertools import count
+from bisect import bisect_left
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -82,7 +82,9 @@ def require_frequencies(htf: HTF, order: int, size: int) -> None:
     coefficients and `order` multipliers."""
     frequencies = len(htf.f)
     if _equations_left(htf, frequencies, size) < order:
-        needed = next(F for F in count(1) if _equations_left(htf, F, size) >= order)
+        # (2 * size frequencies are enough for all coefficients, and `order` more for the rest.)
+        enough = range(2 * size + order + 1)
+        needed = bisect_left(enough, order, key=lambda F: _equations_left(htf, F, size))
         raise DefinitionError(
             f"{frequencies} frequencies are too few for numerators of {size} coefficients and "
             f"{order} multipliers: {needed} or more are needed. Measure more, or lower `order` or "

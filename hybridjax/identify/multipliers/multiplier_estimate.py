@@ -5,9 +5,10 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy import stats
 
-from ..._core.arguments import Numbers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import PeriodCount, Probability
 from ...errors import DefinitionError
-from .compare import MultiplierComparison, compare_multipliers
+from .compare import MultiplierComparison, Multipliers, compare_multipliers
 
 
 class MultiplierEstimate(eqx.Module):
@@ -45,7 +46,8 @@ class MultiplierEstimate(eqx.Module):
         """Root of the expected squared distance of each multiplier from the true one."""
         return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
 
-    def distance(self, true: Numbers) -> Float[np.ndarray, " k"]:
+    @checked
+    def distance(self, true: Multipliers) -> Float[np.ndarray, " k"]:
         r"""Squared distance of the estimate from supposed multipliers, in units of its covariance.
 
         $\lambda$ is a multiplier if $p(\lambda) = 0$, which is linear in c: one real equation for
@@ -74,24 +76,24 @@ class MultiplierEstimate(eqx.Module):
             out[i] = p @ np.linalg.lstsq(cov, p)[0]
         return out
 
-    def contains(self, true: Numbers, level: float = 0.95) -> Bool[np.ndarray, " k"]:
+    @checked
+    def contains(self, true: Multipliers, level: Probability = 0.95) -> Bool[np.ndarray, " k"]:
         """Whether supposed multipliers lie in the confidence region of this level.
 
         A conjugate pair is one statement, not two.
-
-        **Raises:** `DefinitionError` if `level` is not between 0 and 1.
         """
         known = np.atleast_1d(np.asarray(true, complex)).ravel()
         return self.distance(known) <= self._radius(level, np.where(known.imag == 0, 1, 2))
 
+    @checked
     def ellipse(
-        self, index: int = 0, level: float = 0.95, points: int = 100
+        self, index: int = 0, level: Probability = 0.95, points: PeriodCount = 100
     ) -> Complex[np.ndarray, " points"]:
         """The border of a multiplier's confidence region, to first order: a closed curve.
 
         For a real multiplier it is an interval, drawn forth and back.
 
-        **Raises:** `DefinitionError` for an index that is not there, or a level not in (0, 1).
+        **Raises:** `DefinitionError` for an index that is not there.
         """
         if not -len(self.multipliers) <= index < len(self.multipliers):
             raise DefinitionError(
@@ -105,7 +107,8 @@ class MultiplierEstimate(eqx.Module):
         x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
         return self.multipliers[index] + x + 1j * y
 
-    def compare(self, true: Numbers) -> MultiplierComparison:
+    @checked
+    def compare(self, true: Multipliers) -> MultiplierComparison:
         """The multipliers beside the true ones, paired; printing it shows a table."""
         return compare_multipliers(self.multipliers, true)
 
@@ -119,8 +122,6 @@ class MultiplierEstimate(eqx.Module):
 
     def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""
-        if not 0 < level < 1:
-            raise DefinitionError(f"a confidence level lies between 0 and 1, not {level}.")
         if np.isinf(self.covariance_freedom):
             return stats.chi2.ppf(level, degrees)
         rest = np.maximum(self.covariance_freedom - degrees + 1, 1.0)

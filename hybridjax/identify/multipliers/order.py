@@ -8,6 +8,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, Int
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index, Order, StepCount
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
@@ -92,13 +94,14 @@ class OrderSelection(eqx.Module):
         return "\n".join(rows)
 
 
+@checked
 def select_order(
     htf: HTF,
-    max_order: int = 5,
+    max_order: Order = 5,
     harmonics: Harmonics | None = None,
     *,
-    overhang: int | None = None,
-    max_steps: int = 50,
+    overhang: Index | None = None,
+    max_steps: StepCount = 50,
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 
@@ -117,10 +120,6 @@ def select_order(
     """
     N = htf.n_sections
     overhang = N if overhang is None else overhang
-    if max_order < 1 or overhang < 0:
-        raise DefinitionError(
-            f"max_order must be at least 1 and overhang at least 0, not {max_order} and {overhang}."
-        )
     if harmonics is not None:
         htf = htf.select(harmonics)
     rms = check_values(htf)

@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..._core.arguments import Numbers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
 from ..._core.results import Result
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -59,7 +60,8 @@ class StructuredFit(MultiplierEstimate):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
+    @checked
+    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
         """The fitted HTFs at frequencies f (F,), cycles per period, inside the band of the data.
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
@@ -92,15 +94,16 @@ class StructuredFit(MultiplierEstimate):
         )
 
 
+@checked
 def fit_multipliers(
     htf: HTF,
-    order: int | LDTP,
+    order: Order | LDTP,
     harmonics: Harmonics | None = None,
     *,
-    overhang: int | None = None,
+    overhang: Index | None = None,
     errors: Literal["residuals", "variance"] = "residuals",
     check: bool = True,
-    max_steps: int = 50,
+    max_steps: StepCount = 50,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
 
@@ -135,11 +138,6 @@ def fit_multipliers(
     order = order.rank() if isinstance(order, LDTP) else order
     N = htf.n_sections
     overhang = N if overhang is None else overhang
-    if order < 1 or max_steps < 1 or overhang < 0:
-        raise DefinitionError(
-            "a structured fit needs order >= 1 (the number of non-zero multipliers), max_steps "
-            f">= 1 and overhang >= 0, not {order}, {max_steps} and {overhang}."
-        )
     if harmonics is not None:
         htf = htf.select(harmonics)
     rms = check_values(htf)

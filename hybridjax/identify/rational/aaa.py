@@ -5,11 +5,17 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.interpolate import AAA
 
-from ..._core.arguments import Numbers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Positive
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.htf import HTF
-from ..multipliers.compare import MultiplierComparison, channel_index, compare_by_output
+from ..multipliers.compare import (
+    MultiplierComparison,
+    Multipliers,
+    channel_index,
+    compare_by_output,
+)
 
 
 # Imaginary part of z up to which it is real, so that it is its own mirror image. Doubled: none but
@@ -40,7 +46,8 @@ class AAAFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
+    @checked
+    def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
         """For each output (or one alone) the multipliers that come closest to the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.
@@ -57,13 +64,14 @@ class AAAFit(eqx.Module):
         return f"AAAFit(H_{self.harmonic} from {self.input}: {rows})"
 
 
+@checked
 def fit_aaa(
     htf: HTF,
     harmonic: int = 0,
     *,
     input: str | int = 0,
-    tolerance: float = 1e-13,
-    terms: int = 100,
+    tolerance: Positive = 1e-13,
+    terms: Count = 100,
 ) -> AAAFit:
     """Approximate one harmonic by rational functions with the AAA algorithm.
 

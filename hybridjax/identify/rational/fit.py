@@ -9,13 +9,19 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..._core.arguments import Numbers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
 from ..._core.compilation.compile import quick_jit
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError
 from ...linear.htf import HTF
-from ..multipliers.compare import MultiplierComparison, channel_index, compare_by_output
+from ..multipliers.compare import (
+    MultiplierComparison,
+    Multipliers,
+    channel_index,
+    compare_by_output,
+)
 
 
 # Steps of the iteration of Sanathanan and Koerner from which fits are started. Doubled: twice the
@@ -70,7 +76,8 @@ class RationalFit(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     input: str = eqx.field(static=True)
 
-    def htf(self, f: Numbers) -> HTF:
+    @checked
+    def htf(self, f: Scalar | Vector) -> HTF:
         """The fitted functions at frequencies f (F,), cycles per period: one harmonic and input."""
         f = np.atleast_1d(np.asarray(f, float))
         w = np.exp(-2j * np.pi * f / self.n_sections)[:, None]
@@ -84,7 +91,8 @@ class RationalFit(eqx.Module):
         harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
         return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
 
-    def compare(self, true: Numbers, output: str | int | None = None) -> MultiplierComparison:
+    @checked
+    def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
         """The multipliers of each output's fit (or of one alone) beside the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.
@@ -105,17 +113,18 @@ class RationalFit(eqx.Module):
         return "\n".join(rows)
 
 
+@checked
 def fit_rational(
     htf: HTF,
     harmonic: int = 0,
     *,
     output: str | int | None = None,
     input: str | int = 0,
-    poles: int = 2,
-    zeros: int = 1,
+    poles: Order = 2,
+    zeros: Index = 1,
     form: Literal["delayed", "direct"] = "delayed",
     weighting: Literal["uniform", "relative"] = "uniform",
-    max_steps: int = 200,
+    max_steps: StepCount = 200,
 ) -> RationalFit:
     """Fit a rational function of z with real coefficients to one harmonic.
 
@@ -141,12 +150,6 @@ def fit_rational(
     `ComputationError` if no start leads anywhere.
     """
     require_x64(htf.H)
-    if form not in ("delayed", "direct"):
-        raise DefinitionError(f"form must be 'delayed' or 'direct', not {form!r}.")
-    if weighting not in ("uniform", "relative"):
-        raise DefinitionError(f"weighting must be 'uniform' or 'relative', not {weighting!r}.")
-    if poles < 1 or zeros < 0:
-        raise DefinitionError(f"a fit needs poles >= 1 and zeros >= 0, not {poles} and {zeros}.")
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]

@@ -1,13 +1,16 @@
 """Up to which amplitude a linear model holds."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Annotated, Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..._core.arguments import Numbers
+from ..._core.boundary.arrays import Reals
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
@@ -30,7 +33,8 @@ class AmplitudeSweep(eqx.Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def limit(self, misfit: float) -> float:
+    @checked
+    def limit(self, misfit: Positive) -> float:
         """The amplitude up to which no output misfits more, between those tried by log-log lines.
 
         **Raises:** `DefinitionError` if the smallest amplitude tried misfits more.
@@ -61,11 +65,12 @@ class AmplitudeSweep(eqx.Module):
         return "\n".join(rows)
 
 
+@checked
 def amplitude_sweep(
     run: Callable[[Float[np.ndarray, "S n nu"]], ExperimentData],
     model: LDTP,
-    u: Numbers,
-    amplitudes: Numbers,
+    u: Annotated[Numbers, Reals("S n nu")],
+    amplitudes: Annotated[Numbers, Reals("A", sign="positive")],
     *,
     start: Literal["free", "cycle"] = "cycle",
 ) -> AmplitudeSweep:
@@ -82,12 +87,16 @@ def amplitude_sweep(
     **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
     """
     free_start = start == "free"
-    factors = np.sort(np.asarray(amplitudes, float))
-    if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
-        raise DefinitionError(f"amplitudes must be positive numbers, not {factors}.")
+    factors = np.sort(np.asarray(amplitudes))
+    if not len(factors):
+        raise DefinitionError("`amplitudes` must hold one amplitude or more.")
     misfit, rms, failed = [], [], []
     for a in factors:
         data = run(a * np.asarray(u))
+        if not isinstance(data, ExperimentData):
+            raise DefinitionError(
+                f"`run` must return ExperimentData, but returned a {type(data).__name__}."
+            )
         require_same_kind(model, data)
         failed.append(float((~data.ok).sum()))
         rms.append(np.sqrt(np.mean(data.u**2, axis=(0, 1))))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.threads import on_all_cores
+from ...errors import DefinitionError
 from ..multipliers.gauss_newton import Coefficients
 from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
 from .cycle_grid import CycleGrid
@@ -49,6 +50,11 @@ class OutputErrorProblem(NamedTuple):
         whether the state at the start of records is unknown, or zero."""
         N = grid.n_sections
         lags = grid.lead + order * N + overhang + 1
+        if lags > grid.y[0, ..., 0].size:
+            raise DefinitionError(
+                f"numerators of {lags} lags reach beyond the longest record, of "
+                f"{grid.y[0, ..., 0].size} samples: lower `order` or `overhang`."
+            )
         free = order + -(-overhang // N) if free_start else 0
         sampled, first = np.isfinite(grid.y), np.argmax(grid.inside, axis=1)
         cycle = np.arange(grid.y.shape[1])

@@ -109,8 +109,6 @@ def realize(
 
 
 def _horizon(horizon: int | None, N: int) -> int:
-    if horizon is not None and horizon < 1:
-        raise DefinitionError(f"a horizon is at least 1 section, not {horizon}.")
     return max(_SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
 
 
@@ -122,10 +120,8 @@ def _chosen(dims, N: int) -> list[int] | None:
     if dims is None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
-    if chosen.shape != (N,) or chosen.dtype.kind not in "iu" or (chosen < 1).any():
-        raise DefinitionError(
-            f"dims must be one positive integer, or one for each of {N} sections, not {dims}."
-        )
+    if chosen.shape != (N,):
+        raise DefinitionError(f"`dims` must be one for each of {N} sections, not {len(chosen)}.")
     return [int(d) for d in chosen]
 
 

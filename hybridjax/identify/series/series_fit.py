@@ -4,9 +4,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..._core.arguments import Numbers
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import PeriodCount, Scalar, Vector
 from ..._core.results import Result
-from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ..multipliers.denominator import chi
@@ -52,10 +52,9 @@ class SeriesFit(MultiplierEstimate):
     lead: int = eqx.field(static=True, default=0)
     distortion: bool = eqx.field(static=True, default=False)
 
-    def impulse_response(self, n_lags: int) -> Float[np.ndarray, "N lags ny nu"]:
+    @checked
+    def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
         """Markov parameters: the response at section n to a unit input r sections earlier."""
-        if n_lags < 1:
-            raise DefinitionError(f"`n_lags` must be at least 1, not {n_lags}.")
         N, R = self.numerators.shape[:2]
         h = np.zeros((N, max(self.lead + n_lags, R), *self.numerators.shape[2:]))
         h[:, :R] = self.numerators
@@ -64,7 +63,8 @@ class SeriesFit(MultiplierEstimate):
                 h[:, r] -= c * h[:, r - j * N]
         return h[:, self.lead : self.lead + n_lags]
 
-    def htf(self, f: Numbers, harmonics: Harmonics | None = None) -> HTF:
+    @checked
+    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
         r"""The harmonic transfer functions at frequencies f (F,), cycles per period, and variances.
 
         Only where the inputs had power; elsewhere the variance is large, or there is none at

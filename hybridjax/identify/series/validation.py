@@ -145,6 +145,8 @@ def validate(
     lags = min(N, int(fewest) // _SAMPLES_PER_LAG) if lags is None else lags
     if lags < 1:
         raise DefinitionError(f"lags must be at least 1, not {lags}.")
+    if lags >= max(len(record.y) for record in records):
+        raise DefinitionError(f"`lags` is {lags}, more than the samples of any record.")
     auto, white = _whiteness(records, e, N, lags)
     cross, independent = _independence(records, e, N, lags)
     return Validation(

@@ -104,11 +104,11 @@ def function_angles(recording: Recording, function: AngleFunction) -> list[Angle
     angles = []
     for trial in recording.trials:
         signals = dict(zip(recording.signals, trial.values.T, strict=True))
-        angle = np.asarray(function(trial.time, signals), float)
-        if angle.shape != trial.time.shape:
+        angle = np.asarray(function(trial.time, signals))
+        if angle.shape != trial.time.shape or angle.dtype.kind not in "fiu":
             raise DefinitionError(
-                f"the phase function returned the shape {angle.shape} for {len(trial.time)} "
-                f"samples of trial '{trial.name}'."
+                f"the phase function must return an angle for each of {len(trial.time)} samples of "
+                f"trial '{trial.name}', not {angle.dtype} of shape {angle.shape}."
             )
         known = np.isfinite(angle)
         angles.append(Angle(trial.time[known], angle[known]))

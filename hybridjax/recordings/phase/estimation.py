@@ -1,10 +1,11 @@
 """From a definition of phase to the phase of a recording."""
 
+from ..._core.boundary.checked import checked
 from ...errors import DefinitionError
-from ...sections.abstract import AbstractSections
 from ...sections.crossing import AtEvent, Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording, signal_of
+from ..smoothing import Bandwidth
 from .angle import AngleFunction, from_angles, function_angles, kinematic_angles
 from .crossings import from_crossings, from_events
 from .winding import Phase
@@ -14,11 +15,12 @@ PhaseDefinition = KinematicPhase | Crossing | AtEvent | AngleFunction
 """What the phase of a recording may be defined by; see `estimate_phase`."""
 
 
+@checked
 def estimate_phase(
     recording: Recording,
     definition: PhaseDefinition,
     *,
-    bandwidth: int | float | None = None,
+    bandwidth: Bandwidth | None = None,
     causal: bool = False,
 ) -> Phase:
     """The phase of every trial.
@@ -51,7 +53,6 @@ def estimate_phase(
     recording cannot have (functions of a state, charts), a phase that does not wind, or a recording
     of less than two cycles.
     """
-    bandwidth = None if bandwidth is None else float(bandwidth)
     if isinstance(definition, Crossing):
         return from_crossings(recording, definition, bandwidth, causal)
     if isinstance(definition, KinematicPhase):
@@ -63,11 +64,6 @@ def estimate_phase(
         raise DefinitionError("events, and functions, are not smoothed: no `bandwidth`.")
     if isinstance(definition, AtEvent):
         return from_events(recording, definition, causal)
-    if isinstance(definition, AbstractSections) or not callable(definition):
-        raise DefinitionError(
-            "the phase of a recording is defined by a KinematicPhase, a Crossing, an AtEvent, or a "
-            f"function of times and signals, not by a {type(definition).__name__}."
-        )
     return from_angles(function_angles(recording, definition), None, causal)
 
 

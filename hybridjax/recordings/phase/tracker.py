@@ -5,16 +5,17 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 
-
-Number = int | float
 
 # Bandwidth of the loop in cycles per cycle. Doubled: changes of the rate are followed twice as
 # fast, with more of the noise.
 _LOOP_HARMONICS = 5
 
 
+@checked
 class PhaseTracker:
     """Follows a phase sample by sample, for hardware that acts at phases.
 
@@ -25,24 +26,21 @@ class PhaseTracker:
 
     def __init__(
         self,
-        center: tuple[Number, Number],
-        scale: tuple[Number, Number],
-        rate: Number,
+        center: tuple[float, float],
+        scale: tuple[Positive, Positive],
+        rate: float,
         *,
-        anchor: Number = 0.0,
-        bandwidth: Number | None = None,
+        anchor: float = 0.0,
+        bandwidth: Positive | None = None,
     ):
         """**Arguments:** `center`, `scale` and `anchor` (rad) as in `KinematicPhase`; `rate`:
         cycles per second to begin with, negative if the angle decreases; `bandwidth` of the loop in
         Hz, by default five times the rate.
 
-        **Raises:** `DefinitionError` for a rate of zero, or scales that are not positive.
+        **Raises:** `DefinitionError` for a rate of zero.
         """
-        if not (rate and min(scale) > 0 and (bandwidth is None or bandwidth > 0)):
-            raise DefinitionError(
-                "a tracker needs a rate other than 0 and positive scales and bandwidth, not "
-                f"{rate}, {scale} and {bandwidth}."
-            )
+        if rate == 0:
+            raise DefinitionError("`rate` must not be 0: a tracker needs to know the direction.")
         self.center, self.scale, self.anchor = center, scale, anchor
         self.sense = math.copysign(1.0, rate)
         self.rate = abs(rate)
@@ -51,7 +49,7 @@ class PhaseTracker:
         self.phase: float | None = None
         self._loop = 0.0
 
-    def update(self, time: Number, position: Number, velocity: Number) -> float | None:
+    def update(self, time: float, position: float, velocity: float) -> float | None:
         """The phase in cycles after one more sample, counted from the first one; NaN are skipped.
 
         **Returns:** None before the first good sample.

@@ -1,0 +1,347 @@
+"""Hostile calls of what concerns estimates, fits, recordings and files."""
+
+import numpy as np
+
+import hybridjax as hj
+
+from .things import NAMES as STATES, PHASE
+from .values import (
+    CALLABLE,
+    COUNT,
+    FINITE,
+    FLAG,
+    HARMONICS,
+    HUGE,
+    INF,
+    INTEGER,
+    LIMITED,
+    NAME,
+    NAMES,
+    NAN,
+    NEW_NAME,
+    NEW_NAMES,
+    NONNEGATIVE,
+    OUTPUT,
+    OUTPUTS,
+    PATH,
+    POSITIVE,
+    SEED,
+    SHARE,
+    TRACED,
+    UNITS,
+    WHOLE,
+    WORD,
+    Other,
+    array,
+    instance,
+    optional,
+)  # fmt: skip
+
+
+FEW = [*COUNT, 10**6]
+
+INPUT = [None, *OUTPUT]
+TRUE = ["x", None, [NAN], [INF], Other(), {}]
+SIGNAL = [None, 3, (), "nope", ("nope",), (3,), ("x", "x"), Other()]
+
+
+def calls(t):
+    """Name, function, good arguments, hostile values of each argument."""
+    yield from estimates(t)
+    yield from series(t)
+    yield from fitting(t)
+    yield from recordings(t)
+    yield from testing(t)
+    yield from files(t)
+
+
+def estimates(t):
+    alone = [*instance(t.design, t.model), [], [3], ["x"]]
+    shared = {"repeats": FEW, "highest": optional([*WHOLE, HUGE]), "threshold": NONNEGATIVE}
+    yield "estimate_htf", hj.estimate_htf, dict(data=t.data, harmonics=0), {
+        "data": alone, "harmonics": HARMONICS, "variance": WORD, "half_integers": WORD,
+    } | shared  # fmt: skip
+    yield (
+        "estimate_coherence",
+        hj.identify.estimate_coherence,
+        dict(data=t.repeated, harmonics=0, repeats=2),
+        {"data": alone, "harmonics": HARMONICS} | shared,
+    )
+    yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
+        "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
+    }  # fmt: skip
+    yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
+        "data": instance(t.design), "repeats": FEW,
+    }  # fmt: skip
+    yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
+        "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
+    }  # fmt: skip
+    yield "remove_transient", hj.identify.remove_transient, dict(
+        data=t.repeated, order=2, skip=1
+    ), {
+        "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
+        "multipliers": ["x", 3, [NAN], [[0.5]], [], [2.0], Other()],
+    }  # fmt: skip
+    htf = instance(t.model, t.data)
+    yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
+        "htf": htf, "harmonic": INTEGER, "output": OUTPUT, "input": INPUT, "poles": FEW,
+        "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD, "max_steps": COUNT,
+    }  # fmt: skip
+    yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2])), {
+        "f": array([0.1, 0.2], empty=True),
+    }  # fmt: skip
+    yield "RationalFit.compare", t.rational.compare, dict(true=[0.5]), {
+        "true": TRUE, "output": OUTPUT,
+    }  # fmt: skip
+    yield "fit_aaa", hj.identify.fit_aaa, dict(htf=t.estimate), {
+        "htf": htf, "harmonic": INTEGER, "input": INPUT, "tolerance": POSITIVE,
+        "terms": COUNT,
+    }  # fmt: skip
+    yield "AAAFit.compare", t.aaa.compare, dict(true=[0.5]), {"true": TRUE, "output": OUTPUT}
+    order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
+    yield "fit_multipliers", hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6), {
+        "htf": htf, "order": order, "harmonics": HARMONICS, "overhang": optional([*WHOLE, 10**6]),
+        "errors": WORD, "check": FLAG, "max_steps": COUNT,
+    }  # fmt: skip
+    yield "StructuredFit.htf", t.structured.htf, dict(f=np.array([0.1, 0.2])), {
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
+    }  # fmt: skip
+    true = np.asarray(t.model.multipliers)
+    yield "MultiplierEstimate.distance", t.structured.distance, dict(true=true), {"true": TRUE}
+    yield "MultiplierEstimate.compare", t.structured.compare, dict(true=true), {"true": TRUE}
+    yield "MultiplierEstimate.contains", t.structured.contains, dict(true=true), {
+        "true": TRUE, "level": SHARE,
+    }  # fmt: skip
+    yield "MultiplierEstimate.ellipse", t.structured.ellipse, {}, {
+        "index": [*INTEGER, 9], "level": SHARE, "points": LIMITED,
+    }  # fmt: skip
+    yield "select_order", hj.select_order, dict(htf=t.estimate, overhang=6), {
+        "htf": htf, "max_order": FEW, "harmonics": HARMONICS, "max_steps": COUNT,
+        "overhang": optional([*WHOLE, 10**6]),
+    }  # fmt: skip
+    yield "multiplier_bound", hj.identify.multiplier_bound, dict(model=t.model, htf=t.estimate), {
+        "model": instance(t.design), "htf": htf, "overhang": optional([*WHOLE, 10**6]),
+    }  # fmt: skip
+    dims = ["x", 2.5, NAN, 0, -1, [3], [2.5] * 6, ["2"] * 6, 10**6, Other()]
+    yield "realize", hj.identify.realize, dict(source=t.exact), {
+        "source": [None, "x", 3, NAN, np.zeros(3), t.design, Other()], "dims": dims,
+        "order": FEW, "horizon": optional(FEW), "outputs": NEW_NAMES, "inputs": NEW_NAMES,
+    }  # fmt: skip
+
+
+def series(t):
+    other = hj.Record(t.record.u, t.record.y, n_sections=8)
+    named = hj.Record(t.record.u, t.record.y, n_sections=6, outputs=("a", "b"))
+    data = [*instance(t.design, t.model), [], [3], [t.record, other], [t.record, named]]
+    order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
+    yield "fit_series", hj.fit_series, dict(data=t.record, order=2), {
+        "data": data, "order": order, "overhang": optional([*WHOLE, 10**6]), "start": WORD,
+        "errors": WORD, "distortion": optional(FLAG), "check": FLAG, "max_steps": COUNT,
+    }  # fmt: skip
+    yield "SeriesFit.impulse_response", t.fit.impulse_response, dict(n_lags=3), {
+        "n_lags": LIMITED,
+    }  # fmt: skip
+    yield "SeriesFit.htf", t.fit.htf, dict(f=np.array([0.1, 0.2])), {
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
+    }  # fmt: skip
+    yield "validate", hj.validate, dict(model=t.fit, data=t.record), {
+        "model": [*instance(t.design), t.exact], "data": [*data, other], "start": WORD,
+        "lags": optional([*COUNT, 10**6]), "level": SHARE,
+    }  # fmt: skip
+    u = t.data.u
+    yield "amplitude_sweep", hj.identify.amplitude_sweep, dict(
+        run=t.run, model=t.model, u=u, amplitudes=[1.0, 2.0]
+    ), {
+        "run": [*CALLABLE, lambda u: 3], "model": instance(t.design), "u": array(u),
+        "amplitudes": [None, "x", 1.0, [], [NAN], [-1.0], [0.0], ["1"], [1j], [INF], TRACED],
+        "start": WORD,
+    }  # fmt: skip
+    yield "AmplitudeSweep.limit", t.sweep.limit, dict(misfit=1.0), {"misfit": POSITIVE}
+
+
+def fitting(t):
+    data = [*instance(t.design, t.model), [], [3], ["x"]]
+    free = [None, 3, (), "nope", ("nope",), (3,), ("mu", "mu"), {}, {"mu": 3}, {"mu": (1.0, 0.5)},
+            {"mu": (NAN, 1.0)}, {"mu": ("0", "1")}, {"mu": (0.5, 1.0)}, {"mu": (0.0, 1j)},
+            ]  # fmt: skip
+    guess = ["flow", 3, (1.0, 0.0), PHASE, Other()]
+    both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
+    shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
+    yield "fit_model", hj.fit_model, both, shared | {
+        "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT, "progress": FLAG,
+    }  # fmt: skip
+    yield "identifiability", hj.fitting.identifiability, both, shared
+    yield "spectral_radius", hj.fitting.spectral_radius, dict(model=t.model), {
+        "model": instance(t.design), "smoothing": NONNEGATIVE,
+    }  # fmt: skip
+    sections = [None, "x", 8, [], [3], Other(), hj.Execution()]
+    yield "ObservedHTF", hj.ObservedHTF, dict(htf=t.htf, sections=PHASE), {
+        "htf": instance(t.model), "sections": sections,
+    }  # fmt: skip
+    yield "ObservedSeries", hj.ObservedSeries, dict(data=t.series, sections=PHASE), {
+        "data": instance(t.record), "sections": sections, "std": ["x", -1.0, 0.0, NAN, 1j, [1.0]],
+    }  # fmt: skip
+    values = np.ones((4, 2))
+    yield "ObservedCycle", hj.ObservedCycle, dict(
+        sections=PHASE, outputs=STATES, values=values, times=np.arange(4.0), period=1.0
+    ), {
+        "sections": sections, "outputs": NAMES[1:4] + NAMES[6:],
+        "values": optional(array(values, missing=True)),
+        "times": optional(array(np.arange(4.0), missing=True)), "period": optional(POSITIVE),
+        "std": ["x", -1.0, 0.0, NAN, 1j, [1.0] * 5], "times_std": ["x", -1.0, 0.0, NAN, 1j],
+        "period_std": ["x", -1.0, 0.0, NAN, 1j],
+    }  # fmt: skip
+    yield (
+        "ObservedCycle.of",
+        hj.ObservedCycle.of,
+        dict(cycle=t.cycle, sections=PHASE, outputs=STATES),
+        {"cycle": instance(t.system), "sections": sections, "outputs": NAMES[1:2] + NAMES[3:]},
+    )
+    for name in ("ObservedCycle", "ObservedHTF"):
+        made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
+        for method in ("residuals", "prepare"):
+            yield f"{name}.{method}", getattr(made, method), dict(cycle=t.cycle), {
+                "cycle": instance(t.system),
+            }  # fmt: skip
+
+
+def recordings(t):
+    x = np.arange(5.0)
+    numbers = [None, "abcde", 3.0, x[:, None], x[:3], list("abcde"), x + 1j, x * INF, Other()]
+    events = [3, "x", ["x"], {"e": "x"}, {"e": 1j * x}, {"e": [INF]}, {"e": [[1.0]]}, {3: [1.0]}]
+    about = {"events": events, "units": UNITS, "name": [None, 3]}
+    yield "Recording", hj.Recording, dict(time=x, signals={"x": x}), {
+        "time": [*numbers, x[::-1], x * NAN, x * 0, [], [0.0], TRACED],
+        "signals": [None, 3, "x", x, {}, {3: x}, *({"x": each} for each in numbers)],
+    } | about  # fmt: skip
+    frame = {"time": x, "x": x}
+    yield "Recording.from_frame", hj.Recording.from_frame, dict(frame=frame), {
+        "frame": [None, 3, "x", x, {}, {"time": x}, {"time": x, "x": "abc"}, Other()], "time": NAME,
+    } | about  # fmt: skip
+    yield "Recording.join", hj.Recording.join, dict(recordings=[t.recording]), {
+        "recordings": [None, 3, "x", [], [3], [t.recording, None], t.recording, Other()],
+    }  # fmt: skip
+    rises, angle = hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v")
+    yield "Recording.mark", t.recording.mark, dict(event="e", crossing=rises), {
+        "event": NEW_NAME, "bandwidth": [None, "1", 1j, NAN, 0.0, -1.0, True, Other()],
+        "crossing": [*instance(PHASE, t.phase), "x", hj.Crossing("nope", "rising")],
+    }  # fmt: skip
+    for name in ("column", "unit"):
+        yield f"Recording.{name}", getattr(t.recording, name), dict(name="x"), {"name": NAME}
+    definition = [None, "x", 3, hj.AtEvent("nope"), hj.Crossing("nope", "rising"),
+                  hj.ClockPhase(4), Other(), t.design, lambda time, signals: "x"]  # fmt: skip
+    yield "estimate_phase", hj.recordings.estimate_phase, dict(
+        recording=t.recording, definition=angle
+    ), {
+        "recording": instance(t.record), "definition": definition, "bandwidth": optional(POSITIVE),
+        "causal": FLAG,
+    }  # fmt: skip
+    take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
+    taken = {
+        "recording": instance(t.record), "phase": definition, "inputs": SIGNAL, "outputs": SIGNAL,
+        "n_sections": [*optional(LIMITED), 8.5], "bandwidth": optional(POSITIVE), "sampled": WORD,
+        "timing": optional(WORD), "drift": optional(POSITIVE),
+    }  # fmt: skip
+    yield "section_data", hj.recordings.section_data, take, taken | {"max_gap": optional(POSITIVE)}
+    yield (
+        "identify_recording",
+        hj.identify_recording,
+        take | dict(order=1),
+        (taken | {"order": optional(FEW)}),
+    )
+    yield "SectionData.experiments", t.section_data.experiments, dict(periods=4), {
+        "periods": LIMITED,
+    }  # fmt: skip
+    data = instance(t.record, t.data)
+    yield "advise", hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit), {
+        "data": data, "fit": instance(t.structured),
+    }  # fmt: skip
+    yield "plain_regression", hj.recordings.plain_regression, dict(data=t.record, order=2), {
+        "data": [*instance(t.design), [], [3]], "order": FEW,
+    }  # fmt: skip
+    yield "choose_order", hj.recordings.choose_order, dict(data=t.section_data), {
+        "data": data, "most": FEW, "share": [*SHARE, 1.0],
+    }  # fmt: skip
+    yield "hold_out", hj.recordings.hold_out, dict(data=t.section_data, order=1), {
+        "data": data, "order": FEW, "share": [*SHARE, 1.0],
+    }  # fmt: skip
+    yield "impulse_responses", hj.recordings.impulse_responses, dict(
+        fit=t.found.fit, data=t.found.data
+    ), {
+        "fit": instance(t.structured), "data": data, "cycles": [*POSITIVE, 10**9],
+        "width": optional(POSITIVE),
+    }  # fmt: skip
+    yield "without_drift", hj.recordings.without_drift, dict(
+        recording=t.recording, phase=t.phase, signals="x", cycles=5.0
+    ), {
+        "recording": instance(t.record), "phase": instance(PHASE), "signals": SIGNAL,
+        "cycles": POSITIVE,
+    }  # fmt: skip
+    command = {"c": np.zeros((1, 120))}
+    yield "add_command", hj.recordings.add_command, dict(
+        recording=t.recording, phase=t.phase, command=command, n_sections=2
+    ), {
+        "recording": instance(t.record), "phase": instance(PHASE), "n_sections": LIMITED,
+        "command": [None, 3, "x", ["c"], {}, {"c": "x"}, {3: command["c"]},
+                    {"c": np.zeros(3)}, {"c": command["c"] * NAN}, {"c": command["c"] + 1j}],
+    }  # fmt: skip
+    yield "write_design", hj.recordings.write_design, dict(path="d.csv", design=t.one_input), {
+        "path": [*PATH, "nope/d.csv"], "design": instance(t.model), "cycles": optional(LIMITED),
+        "period": optional(POSITIVE), "rate": optional(POSITIVE),
+    }  # fmt: skip
+    yield "read_design", hj.recordings.read_design, dict(path="nope.csv"), {
+        "path": [*PATH, "nope.csv"],
+    }  # fmt: skip
+    yield (
+        "read_recording",
+        lambda paths, **k: hj.read_recording(paths, **k),
+        dict(paths="nope.csv"),
+        {"paths": [*PATH, "nope.csv", "nope.docx"], "time": NEW_NAME, "units": UNITS},
+    )
+    pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
+    tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
+    yield "PhaseTracker", hj.recordings.PhaseTracker, tracker, {
+        "center": pair, "scale": [*pair, (0.0, 1.0), (-1.0, 1.0)], "rate": [*FINITE, 0.0],
+        "anchor": FINITE, "bandwidth": optional(POSITIVE),
+    }  # fmt: skip
+    update = hj.recordings.PhaseTracker(**tracker).update
+    yield "PhaseTracker.update", update, dict(time=0.0, position=1.0, velocity=0.0), {
+        "time": FINITE, "position": FINITE, "velocity": FINITE,
+    }  # fmt: skip
+
+
+def testing(t):
+    yield "Dirt", hj.testing.Dirt, {}, {
+        "noise": NONNEGATIVE, "quantum": NONNEGATIVE, "drift": FINITE,
+        "missing": [*NONNEGATIVE, 1.5], "gap": ["ab", 1.0, (1.0,), (NAN, 1.0), (2.0, 1.0)],
+        "irregular": FLAG, "lost_events": WHOLE, "doubled_events": WHOLE, "stretch": FINITE,
+        "seed": SEED,
+    }  # fmt: skip
+    yield (
+        "spoil",
+        hj.testing.spoil,
+        dict(recording=t.recording, signals=("x",), dirt=hj.testing.Dirt()),
+        {"recording": instance(t.record), "signals": SIGNAL, "dirt": instance(PHASE)},
+    )
+    yield "random_force", hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5), {
+        "duration": [*POSITIVE, 1e12], "rate": [*POSITIVE, 1e12], "bandwidth": [*POSITIVE, 40],
+        "rms": NONNEGATIVE, "inputs": LIMITED, "seed": SEED,
+    }  # fmt: skip
+    force = np.zeros((1, 50, 1))
+    yield "simulate_recording", hj.testing.simulate_recording, dict(
+        cycle=t.cycle, force=force, outputs=STATES, rate=16
+    ), {
+        "cycle": instance(t.system), "force": array(force), "outputs": OUTPUTS,
+        "rate": [*POSITIVE, 1e12], "steps": LIMITED, "accuracy": POSITIVE,
+    }  # fmt: skip
+
+
+def files(t):
+    yield "save", hj.save, dict(path="thing.npz", thing=t.model), {
+        "path": [*PATH, "thing.txt", "nope/thing.npz"],
+        "thing": [*instance(t.cycle, t.recording), hj.LDTP],
+    }  # fmt: skip
+    yield "load", hj.load, dict(path="thing.npz"), {"path": [*PATH, "thing.npz"]}
+    yield "write_report", hj.write_report, dict(folder="report", found=t.found), {
+        "folder": PATH, "found": instance(t.fit),
+    }  # fmt: skip
