@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.boundary.checked import checked
+from .._core.boundary.checked import checked_methods
 from .._core.compilation.compile import quick_jit
 from .._core.precision import require_x64
 from .._core.results import Result
@@ -28,6 +28,7 @@ from .outputs import observe
 _GRACE = 0.5
 
 
+@checked_methods
 class PlacedSections(eqx.Module):
     """N sections of a family on a limit cycle.
 
@@ -83,7 +84,6 @@ class PlacedSections(eqx.Module):
         next."""
         return Structure(self.cycle.system)
 
-    @checked
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
         """Outputs of the cycle at the sections, without input; NaN where a chart does not define
         them.

@@ -73,8 +73,8 @@ class SectionMap(eqx.Module):
         q = jnp.asarray(q, float)
         if q.shape != self.fixed_point.shape:
             raise DefinitionError(
-                f"`q` must be a state where the map starts: on {self.placed.family.describe(self.i)}, where the state has "
-                f"shape {self.fixed_point.shape}; got {q.shape}."
+                f"`q` must be a state on {self.placed.family.describe(self.i)}, where the map "
+                f"starts and states have the shape {self.fixed_point.shape}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)
         u = jnp.asarray(0.0 if u is None else u, float)

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .._core.boundary.checked import checked_methods
+from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.memo import remembered
 from .._core.results import Result
@@ -14,7 +14,6 @@ from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
-from ..errors import DefinitionError
 from ..linear.multipliers import product_eigenvalues
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure
@@ -164,7 +163,7 @@ class LimitCycle(eqx.Module):
 
 def _require_values(cycle: LimitCycle, name: str) -> None:
     if is_traced(cycle):
-        raise DefinitionError(
+        raise NeedsValues(
             f"`{name}` of a limit cycle needs its values, which a JAX transformation hides: use "
             "its arrays (`anchor`, `period`, `factors`) there, or `linearize(...).monodromy()`."
         )

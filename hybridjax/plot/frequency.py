@@ -229,7 +229,7 @@ def _index(names: Sequence[str], which: str | int) -> int:
         return names.index(which)
     if not isinstance(which, str) and -len(names) <= which < len(names):
         return int(which)
-    raise DefinitionError(f"there is no {which!r} (`output` or `input`) among {', '.join(names)}.")
+    raise DefinitionError(f"there is no {which!r} among {', '.join(names)}.")
 
 
 def _sorted(htf: HTF):

@@ -28,7 +28,7 @@ def experiment(
     """
     S, n, _ = data.u.shape
     if not -S <= index < S:
-        raise DefinitionError(f"there is no experiment with `index` {index}; there are {S}.")
+        raise DefinitionError(f"there is no experiment {index}; there are {S}.")
     index = index % S
     time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]

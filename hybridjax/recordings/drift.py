@@ -29,7 +29,7 @@ DriftCycles = Annotated[float, Number("a positive number of cycles", above=0, in
 def check_drift(cycles: int | float) -> None:
     """**Raises:** `DefinitionError` for a drift that is too fast to be told from responses."""
     if not cycles >= _FASTEST_DRIFT:
-        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles}.")
+        raise DefinitionError(f"drift takes {_FASTEST_DRIFT} cycles or more, not {cycles:g}.")
 
 
 @checked

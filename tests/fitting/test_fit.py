@@ -68,8 +68,8 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     "options, message",
     [
         ({"free": "mass"}, "no parameter of Oscillator"),
-        ({"guesses": 0}, "guesses and max_steps"),
-        ({"spread": 0.0}, "spread positive"),
+        ({"guesses": 0}, "`guesses` must be an integer from 1"),
+        ({"spread": 0.0}, "`spread` must be a positive number"),
         ({"data": ()}, "one or more"),
     ],
 )

@@ -27,7 +27,7 @@ def records(**options):
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
         (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
-        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "std must be positive"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "`std` must be positive"),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "each of 1 outputs"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "does not move"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),
@@ -36,12 +36,12 @@ def records(**options):
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
         (lambda: hj.ObservedCycle(SECTIONS, times=np.full(8, np.nan)), "finite"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero at all sections"),
-        (lambda: hj.ObservedCycle(SECTIONS, period=1.0, period_std=0.0), "must be positive"),
-        (lambda: hj.ObservedCycle("apex", period=1.0), "sections are a family|'sections'"),
+        (lambda: hj.ObservedCycle(SECTIONS, period=1.0, period_std=0.0), "must be a positive"),
+        (lambda: hj.ObservedCycle("apex", period=1.0), "`sections` must be"),
     ],
 )
 def test_bad_data_are_refused(make, message):
-    with pytest.raises((hj.DefinitionError, TypeError), match=message):
+    with pytest.raises(hj.DefinitionError, match=message):
         make()
 
 

@@ -70,5 +70,5 @@ def test_a_cycle_and_its_sections_agree_as_far_as_the_bias_allows(hopper_cycle, 
 
 @pytest.mark.parametrize("smoothing", [0.0, 1.0, -1e-3])
 def test_a_smoothing_out_of_range_is_refused(isochron_ldtp, smoothing):
-    with pytest.raises(hj.DefinitionError, match="smoothing lies between"):
+    with pytest.raises(hj.DefinitionError, match="`smoothing` must be a number between 0 and 1"):
         hj.fitting.spectral_radius(isochron_ldtp, smoothing)

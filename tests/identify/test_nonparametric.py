@@ -154,7 +154,7 @@ def test_bad_inputs_are_named(message, data):
 def test_bad_options(paper_data):
     with pytest.raises(hj.DefinitionError, match="Harmonic 16 does not exist"):
         hj.estimate_htf(paper_data, (0, 16))
-    with pytest.raises(hj.DefinitionError, match="threshold must lie between 0 and 1"):
+    with pytest.raises(hj.DefinitionError, match="`threshold` must be a number between 0 and 1"):
         hj.estimate_htf(paper_data, threshold=2.0)
 
 

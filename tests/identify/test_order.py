@@ -70,7 +70,7 @@ def test_what_noise_hides_is_not_reported(small, variance):
 
 def test_bad_requests(small):
     _, htf = small
-    with pytest.raises(hj.DefinitionError, match="max_order must be at least 1"):
+    with pytest.raises(hj.DefinitionError, match="`max_order` must be an integer from 1"):
         hj.select_order(htf, 0)
     with pytest.raises(hj.DefinitionError, match="80 frequencies are too few"):
         hj.select_order(htf, 60)

@@ -86,7 +86,7 @@ def test_one_output_of_several(exact):
         "there is no output 2": dict(output=2),
         "there is no input 'v'": dict(input="v"),
         "Harmonic 40|not stored": dict(harmonic=2),
-        "poles >= 1": dict(poles=0),
+        "`poles` must be an integer from 1": dict(poles=0),
         "too many for 3 frequencies": dict(poles=4, zeros=3),
     }.items(),
 )

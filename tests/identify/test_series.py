@@ -244,7 +244,7 @@ def test_bad_records(small):
     good = record(small, 400)
     with pytest.raises(hj.DefinitionError, match="section 0 was sampled 10 times, too few"):
         hj.fit_series(record(small, 40), 2)
-    with pytest.raises(hj.DefinitionError, match="order >= 1"):
+    with pytest.raises(hj.DefinitionError, match="`order` must be an integer from 1"):
         hj.fit_series(good, 0)
     with pytest.raises(hj.DefinitionError, match="input u is zero"):
         hj.fit_series(hj.Record(0 * good.u, good.y, n_sections=4), 2)

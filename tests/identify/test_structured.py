@@ -75,8 +75,8 @@ def test_units_of_an_output_do_not_matter(paper_estimate):
 @pytest.mark.parametrize(
     "message, arguments",
     {
-        "order >= 1": dict(order=0),
-        "overhang >= 0": dict(order=2, overhang=-1),
+        "`order` must be an integer from 1": dict(order=0),
+        "`overhang` must be an integer from 0": dict(order=2, overhang=-1),
         "50 frequencies are too few .* 97 coefficients and 2 multipliers: 98": dict(
             order=2, harmonics=1
         ),

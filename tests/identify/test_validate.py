@@ -110,7 +110,7 @@ def test_amplitudes(small):
     with pytest.raises(hj.DefinitionError, match="smallest amplitude tried has a misfit"):
         sweep.limit(worst / 2)
     assert repr(sweep).splitlines()[-1].split()[-1] == "1"
-    with pytest.raises(hj.DefinitionError, match="positive numbers"):
+    with pytest.raises(hj.DefinitionError, match="must be positive"):
         hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
 
 
@@ -124,7 +124,7 @@ def test_bad_requests(small, hopper):
         hj.validate(small, data, level=5.0)
     with pytest.raises(hj.DefinitionError, match="output y0 is constant or missing"):
         hj.validate(small, hj.Record(data.u, data.y * [0, 1], n_sections=4))
-    with pytest.raises(hj.DefinitionError, match="lags must be at least 1"):
+    with pytest.raises(hj.DefinitionError, match="`lags` must be an integer from 1"):
         hj.validate(small, data, lags=0)
 
 

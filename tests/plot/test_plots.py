@@ -146,7 +146,7 @@ def test_multipliers_outside_the_disc_and_without_estimates():
 
 @pytest.mark.parametrize("bad", [[], np.array(["a"])])
 def test_multipliers_of_nothing(bad):
-    with pytest.raises(hj.DefinitionError, match="multiplier"):
+    with pytest.raises(hj.DefinitionError, match="`true`"):
         hj.plot.multipliers(bad)
 
 

@@ -96,7 +96,7 @@ def test_in_real_time(wave):
     assert tracker.update(t[-1] + 1, np.nan, 0.0) == found[-1]
     with pytest.raises(hj.DefinitionError, match="time must grow"):
         tracker.update(t[-1], 1.0, 0.0)
-    with pytest.raises(hj.DefinitionError, match="rate other than 0"):
+    with pytest.raises(hj.DefinitionError, match="`rate` must not be 0"):
         hj.recordings.PhaseTracker((0, 0), (1, 1), 0.0)
 
 
@@ -164,7 +164,7 @@ def test_what_is_no_phase(wave):
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             hj.recordings.estimate_phase(still, definition)
-    with pytest.raises((hj.DefinitionError, TypeError), match="not by a ClockPhase|'definition'"):
+    with pytest.raises(hj.DefinitionError, match="not a ClockPhase"):
         hj.recordings.estimate_phase(still, hj.ClockPhase(8))
     one = hj.Recording(
         t[:180], {"x": np.cos(2 * np.pi * t[:180]), "v": np.sin(2 * np.pi * t[:180])}

@@ -42,6 +42,9 @@ class Reals(Kind):
     ):
         self.shape, self.sign = tuple(shape.split()), sign
         self.missing, self.infinite, self.form = missing, infinite, form
+        self._only_axes = all(word.isidentifier() for word in self.shape) and (
+            len(set(self.shape)) == len(self.shape)
+        )
         self.items = self.sort if sign == "any" else f"{sign} numbers"
         if self.shape == ():
             self.allowed = self.single if sign == "any" else f"a {sign} number"
@@ -94,6 +97,8 @@ class Reals(Kind):
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
         words = self.shape
+        if self._only_axes:
+            return len(shape) == len(words)
         if "..." in words:
             first = words.index("...")
             after = len(words) - first - 1

@@ -59,9 +59,8 @@ def checked_methods(cls: Class) -> Class:
         function = member.__func__ if isinstance(member, classmethod | staticmethod) else member
         if not inspect.isfunction(function) or getattr(function, "__isabstractmethod__", False):
             continue
-        if len(inspect.signature(function).parameters) > (not isinstance(member, staticmethod)):
-            wrapped = _wrapped(function, f"{cls.__name__}.{name}")
-            setattr(cls, name, type(member)(wrapped) if function is not member else wrapped)
+        wrapped = _wrapped(function, f"{cls.__name__}.{name}")
+        setattr(cls, name, type(member)(wrapped) if function is not member else wrapped)
     return cls
 
 

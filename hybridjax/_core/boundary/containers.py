@@ -10,7 +10,7 @@ import numpy as np
 from ..signal import Signal
 from .kind import Kind
 from .misfit import Misfit, listed, show, with_article
-from .scalars import Text
+from .scalars import Text, refuse_traced
 
 
 class Either(Kind):
@@ -111,7 +111,10 @@ class Items(Kind):
     def take(self, value):
         if isinstance(value, str | bytes | Mapping):
             raise self.refused(value)
-        if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0:
+        if isinstance(value, np.ndarray | jax.Array):
+            if value.ndim == 0:
+                refuse_traced(value, self.allowed)
+                raise self.refused(value)
             value = list(value if isinstance(value, jax.core.Tracer) else np.asarray(value))
         elif not isinstance(value, Sequence):
             if not (self.iterable and isinstance(value, Iterable)):

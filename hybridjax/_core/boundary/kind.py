@@ -24,4 +24,4 @@ class Kind:
         return self.allowed  # (as `help` shows it)
 
     def refused(self, value: Any) -> Misfit:
-        return Misfit(f"must be {self.allowed}, not {show(value)}")
+        return Misfit(lambda: f"must be {self.allowed}, not {show(value)}")

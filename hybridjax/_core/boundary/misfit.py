@@ -1,5 +1,6 @@
 """What is wrong with an argument, in words."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,17 +19,24 @@ class Misfit(Exception):
     other sorts, which would do as well, need not be named.
     """
 
-    def __init__(self, problem: str, *, near: bool = False, path: str = ""):
-        super().__init__(problem)
-        self.problem, self.near, self.path = problem, near, path
+    def __init__(self, problem: str | Callable[[], str], *, near: bool = False, path: str = ""):
+        self._problem, self.near, self.path = problem, near, path
+
+    @property
+    def problem(self) -> str:
+        """In words, which are made when they are asked for: of several sorts most do not fit."""
+        return self._problem if isinstance(self._problem, str) else self._problem()
+
+    def __str__(self) -> str:
+        return self.problem
 
     def inside(self, key: Any) -> "Misfit":
         """The same, of a value that stands under this key of the argument."""
-        return Misfit(self.problem, near=True, path=f"[{key!r}]{self.path}")
+        return Misfit(self._problem, near=True, path=f"[{key!r}]{self.path}")
 
     def of(self, name: str) -> "Misfit":
         """The same, of the argument with this name."""
-        return Misfit(self.problem, path=name + self.path)
+        return Misfit(self._problem, path=name + self.path)
 
 
 def show(value: Any) -> str:

@@ -44,7 +44,7 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
             "sign), so none of them can be chosen for the crest factor."
         )
     where = design.experiment * nu + design.channel
-    size = np.where(real, 2.0, 1.0) * 0.5 * length * design.amplitude
+    size = np.where(real, 2.0, 1.0) * 0.5 * length * np.asarray(design.amplitude)
     rng = np.random.default_rng(seed)
     phase = np.where(free, rng.uniform(0, 2 * np.pi, len(free)), design.phase)
     for signal in np.unique(where):

@@ -12,6 +12,7 @@ from ..._core import limits
 from ..._core.arguments import Numbers, names
 from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
+from ..._core.boundary.containers import Names
 from ..._core.boundary.kinds import (
     Count,
     ExperimentCount,
@@ -74,7 +75,7 @@ class Design(eqx.Module):
     n_sections: SectionCount = eqx.field(static=True)
     periods: PeriodCount = eqx.field(static=True)
     experiments: ExperimentCount = eqx.field(static=True)
-    input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
+    input_names: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
     highest_harmonic: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -107,7 +108,7 @@ class Design(eqx.Module):
         sizes = [np.size(f) for f in frequencies]
         if len(sizes) == 0 or min(sizes) == 0:
             raise DefinitionError(
-                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+                "every experiment needs at least one frequency: `frequencies` has none for some."
             )
 
         def flat(name, values, dtype):
@@ -160,7 +161,7 @@ class Design(eqx.Module):
         count = max(len(found), 1)
         if self.experiments != count or not np.array_equal(found, np.arange(count)):
             raise DefinitionError(
-                "every experiment of a design needs at least one frequency: `frequencies` lack some."
+                "every experiment needs at least one frequency: `frequencies` has none for some."
             )
         self._refuse((self.line < 0) | (2 * self.line > N * P), f"lies outside [0, N/2 = {N / 2}]")
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)

@@ -103,4 +103,4 @@ def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
         return names.index(wanted)
     if not isinstance(wanted, str) and 0 <= wanted < len(names):
         return int(wanted)
-    raise DefinitionError(f"`{kind}` {wanted!r} is not there; the {kind}s are {', '.join(names)}.")
+    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")

@@ -97,7 +97,7 @@ class MultiplierEstimate(eqx.Module):
         """
         if not -len(self.multipliers) <= index < len(self.multipliers):
             raise DefinitionError(
-                f"there is no multiplier with `index` {index}: the fit has {len(self.multipliers)}."
+                f"there is no multiplier {index}: the fit has {len(self.multipliers)}."
             )
         covariance = self.multiplier_covariances[index]
         degrees = 1 if self.multipliers[index].imag == 0 else 2

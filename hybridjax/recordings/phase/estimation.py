@@ -2,7 +2,6 @@
 
 from ..._core.boundary.checked import checked
 from ...errors import DefinitionError
-from ...sections.abstract import AbstractSections
 from ...sections.crossing import AtEvent, Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording, signal_of
@@ -67,11 +66,6 @@ def estimate_phase(
         raise DefinitionError("events, and functions, are not smoothed: no `bandwidth`.")
     if isinstance(definition, AtEvent):
         return from_events(recording, definition, causal)
-    if isinstance(definition, AbstractSections) or not callable(definition):
-        raise DefinitionError(
-            "the phase of a recording is defined by a KinematicPhase, a Crossing, an AtEvent, or a "
-            f"function of times and signals, not by a {type(definition).__name__}."
-        )
     return from_angles(function_angles(recording, definition), None, causal)
 
 
