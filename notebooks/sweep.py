@@ -72,7 +72,8 @@ with hj.plot.style():
     left.clabel(lines, fontsize=6)
     figure.colorbar(image, ax=left, label="largest modulus of a multiplier")
     label(left, "contraction in one period")
-    image = right.pcolormesh(k_axis, b_axis, angle, cmap="cividis", vmax=np.pi, rasterized=True)
+    scale = {"cmap": "cividis", "vmin": 0, "vmax": np.pi}
+    image = right.pcolormesh(k_axis, b_axis, angle, rasterized=True, **scale)
     key = figure.colorbar(image, ax=right, label="angle of the first multiplier (rad)")
     key.set_ticks([0, np.pi / 2, np.pi], labels=["0", "π/2", "π"])
     label(right, "oscillation from period to period")

@@ -11,8 +11,8 @@ def branch():
 
 
 def test_stable_cycles_have_full_lines(branch):
-    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude (m)"}).ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v")
+    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude"}).ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v (m/s)")
     lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
     fold, flip = branch.points
     rows = (0, fold.index, flip.index, len(branch) - 1)
