@@ -195,7 +195,7 @@ class _Sampler:
         k = np.arange(np.ceil(first - _ROUNDING), np.floor(last + _ROUNDING) + 1).astype(int)
         if len(k) <= n_sections:
             return None
-        t = winding.when(k / n_sections)
+        t = np.clip(winding.when(k / n_sections), *winding.time[[0, -1]])
         section = _GAP_SECTIONS * period / n_sections
 
         def holes(x):

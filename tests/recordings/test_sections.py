@@ -52,6 +52,18 @@ def test_gaps_are_masked_and_cut(wave):
     assert 0 < data.missing < 0.1
 
 
+def test_nothing_is_made_up_before_and_after_a_signal(wave):
+    """A signal that begins later than the events that are the phase, and ends earlier."""
+    t, (f, x, _) = wave.trials[0].time, wave.trials[0].values.T
+    late, early = np.where(t < 3.3, np.nan, x), np.where(t > 17.3, np.nan, f)
+    recording = hj.Recording(t, {"f": early, "x": late}, events={"top": np.arange(-1.0, 25)})
+    data = sample(recording, hj.AtEvent("top"), outputs="x", n_sections=8)
+    (record,), (times,) = data.records, data.times
+    assert times[0] == 0.0 and times[-1] < 20.0
+    np.testing.assert_array_equal(np.isnan(record.y[:, 0]), times < 3.29)
+    np.testing.assert_array_equal(np.isnan(record.u[:, 0]), times + 1 / 8 > 17.31)
+
+
 def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
     """Where the phase was not seen, sections are not known to be sections, nor their times."""
     t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
