@@ -20,6 +20,11 @@ from .spikes import without_spikes
 _BISECTIONS = 50
 
 
+# Times between samples are irregular if those at this part from either end differ by more than that
+# part of their median. Doubled: fewer recordings are said to be irregular.
+_TAIL, _IRREGULAR = 0.05, 0.1
+
+
 class Trial(eqx.Module):
     """One uninterrupted run of the instruments.
 
@@ -252,11 +257,13 @@ class Recording(eqx.Module):
         for t in self.trials:
             step = np.diff(t.time)
             middle = float(np.median(step))
+            low, high = np.quantile(step, [_TAIL, 1 - _TAIL])
+            how = "irregular; " if high - low > _IRREGULAR * middle else ""
             missing = int(np.isnan(t.values).any(axis=1).sum())
             events = "".join(f", {len(v)} {k}" for k, v in t.events.items())
             parts.append(
                 f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
-                f"{middle:.4g} s ({1 / middle:.4g} Hz; longest {step.max():.4g} s)"
+                f"{middle:.4g} s ({1 / middle:.4g} Hz; {how}longest {step.max():.4g} s)"
                 + (f", {missing} with gaps" if missing else "")
                 + events
             )

@@ -207,7 +207,9 @@ def test_the_unit_of_time(tmp_path):
     both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
     assert both.notes == ("the times in 'frame' have no unit: taken as seconds",)
     assert "(the times in 'frame' have no unit: taken as seconds)" in repr(both)
-    assert "every 1 s (1 Hz;" in repr(both)
+    assert "every 1 s (1 Hz; longest 1 s)" in repr(both)
+    uneven = hj.Recording(np.array([0, 1, 2.5, 3, 4.2]), {"a": T})
+    assert "every 1.1 s (0.9091 Hz; irregular; longest 1.5 s)" in repr(uneven)
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
     with pytest.raises(hj.DefinitionError, match="are in 'samples', which is no known unit"):
         hj.read_recording(tmp_path / "y.csv")
