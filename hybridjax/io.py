@@ -10,8 +10,8 @@ import os
 import typing
 from pathlib import Path
 
-from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
+from ._core.files.archive import read_module, write_module
 from ._core.precision import require_x64
 from ._core.tracing import is_traced
 from .errors import DefinitionError

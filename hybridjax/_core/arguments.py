@@ -13,7 +13,8 @@ Numbers = npt.ArrayLike | Sequence | int | float
 
 
 def names(kind: str, given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:
-    """`count` names, with units where these are given; by default `u` or `y` for one, `u0, u1, ...` for several.
+    """`count` names, with units where these are given; by default `u` or `y` for one, and
+    `u0, u1, ...` for several.
 
     **Raises:** `DefinitionError` if `given` has another length.
     """

@@ -1,11 +1,27 @@
-"""What a file may declare. More is damage, or malice, and is refused before memory is taken."""
+"""How much one call may ask for, and how much a file may declare: more is a slip of the hand, or
+damage, or malice, and ends in a sentence before memory is taken."""
 
-TEXT = 2**26
-"""Bytes of a header or a manifest."""
-COUNT = 10**6
-"""Sections, periods, harmonics, experiments of a design, chunks: any whole number of a header."""
+COUNT = 10**9
+"""Of anything else."""
+SECTIONS = 10**5
+"""Of a family."""
+PERIODS = 10**7
+"""Cycles, periods and samples in one record or experiment."""
+EXPERIMENTS = 10**7
+"""Experiments of a design, systems of a sweep."""
+ORDER = 1000
+"""Multipliers of a model."""
+STEPS = 10**8
+"""Of an iteration."""
+WORKERS = 10**4
+"""Threads."""
 WINDOW = 2**26
 """Samples of one input in one window of a design."""
+
+DECLARED = 10**7
+"""Any whole number in the header of a file: sections, periods, experiments, chunks."""
+TEXT = 2**26
+"""Bytes of a header or a manifest."""
 
 
 def unpacked(size: int) -> int:

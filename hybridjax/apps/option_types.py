@@ -10,8 +10,8 @@ from .._core import limits
 def count(text: str) -> int:
     """A whole number, at least 1."""
     value = _whole(text)
-    if not 1 <= value <= limits.COUNT:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and {limits.COUNT}")
+    if not 1 <= value <= limits.DECLARED:
+        raise argparse.ArgumentTypeError(f"{text} is not between 1 and {limits.DECLARED}")
     return value
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from .. import __version__
-from .._core.words import p_value
+from .._core.text import p_value
 from ..recordings.identification import Identification
 from ..recordings.recording import Recording
 

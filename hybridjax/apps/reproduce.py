@@ -15,8 +15,8 @@ import numpy as np
 
 from .. import __version__
 from .._core.compilation.compilation_cache import enable_compilation_cache
+from .._core.files.results_folder import results_folder
 from .._core.precision import enable_x64
-from .._core.results_folder import results_folder
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData

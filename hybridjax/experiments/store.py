@@ -19,12 +19,12 @@ import jax
 import numpy as np
 
 from .._core import limits
-from .._core.archive import read_module, write_module
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Index, Path as PathLike
-from .._core.npz import damaged
+from .._core.files.archive import read_module, write_module
+from .._core.files.npz import damaged
+from .._core.files.writing import made_folder, replacing
 from .._core.progress import counted, working
-from .._core.writing import made_folder, replacing
 from ..errors import DefinitionError, FileFormatError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
@@ -88,10 +88,10 @@ def store_experiments(
     with made_folder(folder):
         campaign = prepare(cycle, sections, design, outputs, chosen, chunk)
         parts = chunks(len(campaign.inputs), chunk)
-        if len(parts) > limits.COUNT:
+        if len(parts) > limits.DECLARED:
             raise DefinitionError(
                 f"{len(campaign.inputs)} experiments in chunks of {chunk} are more than "
-                f"{limits.COUNT} files: take a larger `chunk`."
+                f"{limits.DECLARED} files: take a larger `chunk`."
             )
         _open(folder, _describe(campaign, chunk))
     stored = StoredExperiments(folder)
@@ -124,7 +124,7 @@ class StoredExperiments:
         self.experiments, self.chunk, self.n_sections = (
             _count(self.folder, about, name) for name in ("experiments", "chunk", "n_sections")
         )
-        if len(self) > limits.COUNT:
+        if len(self) > limits.DECLARED:
             raise damaged(self.folder / _MANIFEST, f"it declares {len(self)} chunks")
         for name in sorted(p.name for p in self.folder.glob("[!.]*.npz")):
             number = name.partition("-")[0]

@@ -86,6 +86,7 @@ class HTF(eqx.Module):
         noise_variance: Variance | None = None,
         variance_freedom: Annotated[Numbers, Reals("F", sign="positive")] | None = None,
     ):
+        require_x64()
         self.f, self.H = jnp.asarray(f), jnp.asarray(H, complex)
         self.harmonics = check_harmonics(harmonics, n_sections)
         shape = self.H.shape

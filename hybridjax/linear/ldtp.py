@@ -78,6 +78,7 @@ class LDTP(eqx.Module):
         outputs: NewNames | None = None,
         coordinates: Sequence[Sequence[str]] | None = None,
     ):
+        require_x64()
         A, B, C = map(jnp.asarray, (A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
@@ -288,6 +289,7 @@ class LDTP(eqx.Module):
         return (first_section + jnp.arange(u.shape[0])) % self.n_sections
 
     def _input(self, u):
+        require_x64()
         u = jnp.asarray(u)
         if u.shape[-1] != len(self.inputs):
             raise DefinitionError(

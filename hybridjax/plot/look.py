@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from .._core.boundary.checked import checked
 from .._core.boundary.scalars import Whole
+from .._core.files.writing import replacing
 from .._core.signal import unit_of, with_unit
-from .._core.writing import replacing
 from ..errors import DefinitionError
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.npz import damaged, read_arrays
+from .._core.files.npz import damaged, read_arrays
 from ..errors import DefinitionError, FileFormatError
 from .headers import seconds, split_header, time_unit
 from .recording import Recording

@@ -6,7 +6,7 @@ from scipy import signal
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NonNegative, Positive, Seed
-from .._core.boundary.limits import PERIODS
+from .._core.limits import PERIODS
 from ..errors import DefinitionError
 
 

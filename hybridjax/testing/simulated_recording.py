@@ -11,7 +11,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
-from .._core.boundary.limits import SECTIONS
+from .._core.limits import SECTIONS
 from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError

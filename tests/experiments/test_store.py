@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core import limits
-from hybridjax._core.archive import write_module
+from hybridjax._core.files.archive import write_module
 from hybridjax.experiments import StoredExperiments, store
 
 

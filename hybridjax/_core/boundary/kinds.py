@@ -10,8 +10,8 @@ from typing import Annotated
 
 from jax.typing import ArrayLike
 
+from .. import limits
 from ..arguments import Numbers
-from . import limits
 from .arrays import Reals
 from .containers import Names
 from .scalars import Number, Whole

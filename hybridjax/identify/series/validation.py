@@ -166,8 +166,8 @@ def validate(
         lags = max(int(sum(enough)), 1)
     if (_with_past(records, lags).max(axis=0) < _FEWEST_SAMPLES).any():
         raise DefinitionError(
-            f"`lags` is {lags}, and the records are too short for it: no section was sampled {_FEWEST_SAMPLES} "
-            "times with so many samples before it in its record."
+            f"`lags` is {lags}, and the records are too short for it: no section was sampled "
+            f"{_FEWEST_SAMPLES} times with so many samples before it in its record."
         )
     auto, white = _whiteness(records, e, N, lags)
     cross, independent = _independence(records, e, N, lags)

@@ -1,8 +1,8 @@
-"""Numbers as a paper writes them."""
+"""What objects print."""
 
 import pytest
 
-from hybridjax._core.words import p_value
+from hybridjax._core.text import p_value
 
 
 @pytest.mark.parametrize(

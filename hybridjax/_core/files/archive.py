@@ -21,11 +21,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import jaxtyped
 
-from .. import __version__
-from ..errors import DefinitionError, FileFormatError, HybridJaxError
-from . import limits
+from ... import __version__
+from ...errors import DefinitionError, FileFormatError, HybridJaxError
+from .. import limits
+from ..signal import Signal
 from .npz import damaged, read_arrays
-from .signal import Signal
 from .writing import replacing
 
 
@@ -187,7 +187,7 @@ def _moderate(value: Any) -> bool:
     """Whether no whole number in it is larger than a header may declare."""
     if isinstance(value, tuple):
         return all(map(_moderate, value))
-    return not isinstance(value, int) or abs(value) <= limits.COUNT
+    return not isinstance(value, int) or abs(value) <= limits.DECLARED
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:

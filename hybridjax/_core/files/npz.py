@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import FileFormatError
-from . import limits
+from ...errors import FileFormatError
+from .. import limits
 
 
 _HEADERS = {

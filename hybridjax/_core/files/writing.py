@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..errors import DefinitionError
+from ...errors import DefinitionError
 
 
 @contextlib.contextmanager

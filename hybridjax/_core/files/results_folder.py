@@ -12,8 +12,8 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
-from ..errors import DefinitionError
-from . import limits
+from ...errors import DefinitionError
+from .. import limits
 from .writing import made_folder, replacing, temporary_name
 
 
