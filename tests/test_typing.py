@@ -4,6 +4,7 @@ that say what they take."""
 import importlib
 import inspect
 import json
+import os
 import pathlib
 import re
 import subprocess
@@ -26,12 +27,39 @@ hj.section_map(cycle, phase, 0, 0)(cycle.anchor.q[:4, 0])
 hj.fit_series([data, hj.Record(data.u[0], data.y[0], n_sections=32)], order=2).multipliers
 hj.plot.cycle(cycle, sections=hj.place_sections(cycle, phase)).ax.set_title("hopper")
 recording.trials[0].values.shape
+hj.Guess("flight", jnp.array([0.2, 4.5]), 0)
+hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), [0.3, 1.9], anchor=0.5)
+hj.Crossing("vM", "falling", 0.1, charts=("flight",))
+hj.Settings(rtol=1e-8, atol=1e-9, max_steps=100)
+hj.Scheduled(0.5, offset=0.1)
+hj.models.VerticalHopper(k=jnp.array(11.0)).k + 1.0
+largest: complex = complex(cycle.multipliers[0])
+print(abs(cycle.multipliers).max(), branch.multipliers.shape, float(cycle.period) + 1)
+hj.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]]).htf([0.1, 0.2])
+hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
+hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
+hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
 """
 
 
-def test_a_users_script_has_no_errors(tmp_path):
-    """The README's sessions as one script, checked by pyright's engine in its basic mode."""
-    script = "\n\n".join(BLOCK.findall((ROOT / "README.md").read_text())) + MORE
+@pytest.fixture(scope="module")
+def script():
+    """The README's sessions as one script."""
+    return "\n\n".join(BLOCK.findall((ROOT / "README.md").read_text())) + MORE
+
+
+def test_a_users_script_has_no_errors_in_mypy(tmp_path, script):
+    (tmp_path / "session.py").write_text(script)
+    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--cache-dir=cache"]
+    paths = {**os.environ, "MYPYPATH": str(ROOT)}
+    found = subprocess.run(
+        [*command, "session.py"], cwd=tmp_path, env=paths, capture_output=True, text=True
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
+    """In its basic mode."""
     (tmp_path / "session.py").write_text(script)
     about = {"typeCheckingMode": "basic", "include": ["session.py"], "extraPaths": [str(ROOT)]}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(about))

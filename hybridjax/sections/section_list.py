@@ -28,7 +28,9 @@ class SectionList(AbstractSections):
         """**Raises:** `DefinitionError` for an empty list."""
         self.items = tuple(items)
         if not self.items:
-            raise DefinitionError("`items` must hold at least one Crossing or AtEvent.")
+            raise DefinitionError(
+                "a list of sections needs at least one Crossing or AtEvent, but `items` is empty."
+            )
 
     @property
     def n_sections(self) -> int:

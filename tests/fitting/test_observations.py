@@ -36,7 +36,7 @@ def records(**options):
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))), r"the shape \(8, 1\)"),
         (lambda: hj.ObservedCycle(SECTIONS, times=np.full(8, np.nan)), "finite"),
         (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero at all sections"),
-        (lambda: hj.ObservedCycle(SECTIONS, period=1.0, period_std=0.0), "must be a positive number"),
+        (lambda: hj.ObservedCycle(SECTIONS, period=1.0, period_std=0.0), "must be a positive"),
         (lambda: hj.ObservedCycle("apex", period=1.0), "`sections` must be"),
     ],
 )

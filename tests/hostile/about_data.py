@@ -38,6 +38,7 @@ from .values import (
 )  # fmt: skip
 
 
+LIMIT = ["1", 1j, NAN, 0.0, -1.0, True, [1.0, 2.0], Other(), TRACED]  # infinite: none
 FEW = [*COUNT, 10**6]
 
 INPUT = [None, *OUTPUT]
@@ -80,7 +81,7 @@ def estimates(t):
         data=t.repeated, order=2, skip=1
     ), {
         "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
-        "multipliers": ["x", 3, [NAN], [[0.5]], [], [2.0], Other()],
+        "multipliers": ["x", 3, [NAN], [[0.5]], [], [0.5j], Other()],
     }  # fmt: skip
     htf = instance(t.model, t.data)
     yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
@@ -119,7 +120,7 @@ def estimates(t):
         "htf": htf, "max_order": FEW, "harmonics": HARMONICS, "max_steps": COUNT,
         "overhang": optional([*WHOLE, 10**6]),
     }  # fmt: skip
-    yield "multiplier_bound", hj.identify.multiplier_bound, dict(model=t.model, htf=t.estimate), {
+    yield "multiplier_bound", hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain), {
         "model": instance(t.design), "htf": htf, "overhang": optional([*WHOLE, 10**6]),
     }  # fmt: skip
     dims = ["x", 2.5, NAN, 0, -1, [3], [2.5] * 6, ["2"] * 6, 10**6, Other()]
@@ -233,16 +234,16 @@ def recordings(t):
     yield "estimate_phase", hj.recordings.estimate_phase, dict(
         recording=t.recording, definition=angle
     ), {
-        "recording": instance(t.record), "definition": definition, "bandwidth": optional(POSITIVE),
+        "recording": instance(t.record), "definition": definition, "bandwidth": LIMIT,
         "causal": FLAG,
     }  # fmt: skip
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
     taken = {
         "recording": instance(t.record), "phase": definition, "inputs": SIGNAL, "outputs": SIGNAL,
-        "n_sections": [*optional(LIMITED), 8.5], "bandwidth": optional(POSITIVE), "sampled": WORD,
-        "timing": optional(WORD), "drift": optional(POSITIVE),
+        "n_sections": [*optional(LIMITED), 8.5], "bandwidth": LIMIT, "sampled": WORD,
+        "timing": optional(WORD), "drift": LIMIT,
     }  # fmt: skip
-    yield "section_data", hj.recordings.section_data, take, taken | {"max_gap": optional(POSITIVE)}
+    yield "section_data", hj.recordings.section_data, take, taken | {"max_gap": LIMIT}
     yield (
         "identify_recording",
         hj.identify_recording,
@@ -282,7 +283,7 @@ def recordings(t):
         recording=t.recording, phase=t.phase, command=command, n_sections=2
     ), {
         "recording": instance(t.record), "phase": instance(PHASE), "n_sections": LIMITED,
-        "command": [None, 3, "x", ["c"], {}, {"c": "x"}, {3: command["c"]},
+        "command": [None, 3, "x", ["c"], {"c": "x"}, {3: command["c"]},
                     {"c": np.zeros(3)}, {"c": command["c"] * NAN}, {"c": command["c"] + 1j}],
     }  # fmt: skip
     yield "write_design", hj.recordings.write_design, dict(path="d.csv", design=t.one_input), {

@@ -107,7 +107,7 @@ def systems(t):
 def sections(t):
     yield "Crossing", hj.Crossing, dict(function="y", direction="falling", value=0.0), {
         "function": CALLABLE[:2] + CALLABLE[3:], "direction": WORD, "value": FINITE,
-        "charts": ["plane", 3, (3,), (), ("plane", "plane"), Other()],
+        "charts": [3, (3,), (), ("plane", "plane"), Other()],
     }  # fmt: skip
     yield "AtEvent", hj.AtEvent, dict(name="hit"), {"name": NEW_NAME}
     yield "ClockPhase", hj.ClockPhase, dict(n_sections=8, anchor=0.0), {
@@ -154,6 +154,7 @@ def cycles(t):
         "systems": [*instance(PHASE), [], [3], [t.system, PHASE]], "guess": instance(t.system),
         "scale": SIZES, "settings": ["fast", 1e-9, PHASE], "execution": EXECUTION,
     }  # fmt: skip
+    yield "LimitCycles.__getitem__", t.cycles.__getitem__, dict(i=0), {"i": [*INTEGER, HUGE]}
     yield "LimitCycles.summary", t.cycles.summary, {}, {"limit": WHOLE}
     yield "continuation", hj.continuation, dict(
         cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05
@@ -161,6 +162,7 @@ def cycles(t):
         "cycle": instance(t.system), "parameter": NAME, "step": POSITIVE, "max_points": COUNT,
         "values": [None, "ab", 0.1j, (), (0.2, 0.3), (0.1, NAN), (0.1, INF), (0.1, 0.1), TRACED],
     }  # fmt: skip
+    yield "Branch.__getitem__", t.branch.__getitem__, dict(k=0), {"k": [*INTEGER, HUGE]}
     yield "Branch.find", t.branch.find, dict(kind="fold"), {"kind": WORD}
     yield "Branch.largest", t.branch.largest, dict(output="x"), {"output": NAME}
 
@@ -172,7 +174,7 @@ def linear(t):
         "A": array(A), "B": array(B), "C": array(C), "D": optional(array(D)),
         "dims": ["x", [3], [3, 2] * 2, [3.5, 2] * 3, [-1] * 6, [9] * 6, [NAN] * 6, [1j] * 6],
         "inputs": NEW_NAMES, "outputs": NEW_NAMES,
-        "coordinates": ["x", 3, [], [[3]] * 6, [("a", "a", "b")] * 6],
+        "coordinates": ["x", 3, [], [[3]] * 6],
     }  # fmt: skip
     square = [np.eye(2)] * 3
     blocks = [None, "x", 3, [], square[:2], [np.eye(3), *square[1:]], [[[NAN]]] * 3, [[[1j]]] * 3]
@@ -211,6 +213,7 @@ def linear(t):
     }  # fmt: skip
     htf = t.estimate
     yield "HTF.harmonic", htf.harmonic, dict(m=0), {"m": INTEGER}
+    yield "HTF.__getitem__", htf.__getitem__, dict(m=0), {"m": INTEGER}
     yield "HTF.select", htf.select, dict(harmonics=0), {"harmonics": [None, *HARMONICS, 5]}
     yield "HTF.at", htf.at, dict(f=f[:2]), {"f": [*array(f[:2], empty=True), f[:2] + 0.01]}
     yield "HTF.interpolate", htf.interpolate, dict(f=f[:2]), {"f": array(f[:2], empty=True)}
@@ -252,7 +255,7 @@ def designs(t):
         "channel": [None, "x", good["channel"][:-1], good["channel"] + 1, Other()],
         "amplitude": array(good["amplitude"]), "phase": array(good["phase"]),
         "n_sections": LIMITED, "periods": LIMITED, "experiments": LIMITED,
-        "input_names": [None, "u", (), (3,), ("u", "v", "v"), Other()],
+        "input_names": [None, (), (3,), ("u", "v", "v"), Other()],
         "highest_harmonic": optional(WHOLE),
     }  # fmt: skip
     yield "Design.inputs", t.design.inputs, {}, {
@@ -309,7 +312,8 @@ def experiments(t):
         "u": array(u), "start": ["x", np.zeros(9), Other()], "system": ["x", 3, PHASE],
     }  # fmt: skip
     yield "steady_start", hj.experiments.steady_start, dict(response=t.response, u=u), {
-        "response": instance(PHASE), "u": array(u), "system": ["x", 3, PHASE], "accuracy": POSITIVE,
+        "response": instance(PHASE)[:-1], "u": array(u),
+        "system": ["x", 3, PHASE], "accuracy": POSITIVE,
     }  # fmt: skip
     yield "simulate_experiments", hj.experiments.simulate_experiments, dict(
         ldtp=t.model, design=t.design
@@ -321,7 +325,8 @@ def experiments(t):
         "std": NONNEGATIVE, "seed": SEED,
     }  # fmt: skip
     yield "add_noise", hj.experiments.add_noise, dict(data=t.data, std=0.1), {
-        "data": instance(t.design), "std": [*optional(NONNEGATIVE), [0.1] * 3], "seed": SEED,
+        "data": instance(t.design), "std": ["1", 1j, NAN, True, INF, -1.0, [0.1] * 3, Other()],
+        "seed": SEED,
         "snr": ["x", 1j, NAN, Other(), 10.0],
     }  # fmt: skip
     yield "odd_part", hj.experiments.odd_part, dict(data=t.data), {"data": instance(t.design)}

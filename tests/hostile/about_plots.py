@@ -73,7 +73,7 @@ def calls(t):
         "found": instance(t.found), "input": [None, "f", 9, 0.5, NAN, True],
     } | look  # fmt: skip
     yield "plot.multiplier_regions", plot.multiplier_regions, dict(fit=t.fit), {
-        "fit": instance(t.rational), "plain": ["x", [NAN], [[0.5]], Other()], "ax": AXES,
+        "fit": instance(t.rational), "plain": ["x", [NAN], Other()], "ax": AXES,
     }  # fmt: skip
     yield "plot.phase", plot.phase, dict(found=t.phase), {"found": instance(PHASE), "ax": AXES}
     yield "plot.section_data", plot.section_data, dict(data=t.section_data), {

@@ -11,6 +11,7 @@ import tempfile
 import warnings
 
 import equinox as eqx
+import jax
 import matplotlib
 import numpy as np
 from matplotlib import pyplot
@@ -23,7 +24,12 @@ from .values import Right, Traced, label
 
 
 PACKAGE = str(pathlib.Path(hj.__file__).parent)
-SECONDS = 5  # what no refusal takes
+SECONDS = 5  # of computing, which no refusal takes
+# What messages call an argument that they do not name.
+CALLED = {
+    "frequencies": "f =", "line": "f =", "channel": "input", "frame": "column|signals",
+    "definition": "phase",
+}  # fmt: skip
 
 
 class Hang(BaseException):
@@ -42,12 +48,13 @@ def attempt(function, good: dict, name: str, value) -> str:
     def call(given):
         return function(**(good | {name: given}))
 
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             if isinstance(value, Traced):
-                eqx.filter_jit(lambda given: (call(given), 0)[1])(traceable(good.get(name, 1)))
+                arrays, rest = eqx.partition(traceable(good.get(name, 1)), eqx.is_array)
+                jax.make_jaxpr(lambda given: (call(eqx.combine(given, rest)), 0)[1])(arrays)
             else:
                 call(value)
     except Hang:
@@ -57,13 +64,14 @@ def attempt(function, good: dict, name: str, value) -> str:
     except Exception as error:
         return f"FOREIGN: {type(error).__name__}: {error}"[:200]
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return "" if right or isinstance(value, Traced) else "ACCEPTED"
 
 
 def traceable(value):
     """Numbers as arrays, so that `jit` traces them."""
-    return np.asarray(value) if isinstance(value, int | float | tuple | list) else value
+    numbers = value if isinstance(value, tuple | list) else [value]
+    return np.asarray(value) if all(isinstance(x, int | float) for x in numbers) else value
 
 
 def told(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
@@ -80,7 +88,9 @@ def told(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
     if isinstance(value, Traced) and re.search("JAX|jit", text):
         return ""
     quoted = re.findall(r"'(\w+)'", text)
-    named = re.search(rf"\b{re.escape(name.removesuffix('s'))}", text)
+    keys = map(str, value) if isinstance(value, dict) else ()
+    words = [name.removesuffix("s"), CALLED.get(name, name), *keys]
+    named = any(re.search(rf"\b({word})", text, re.IGNORECASE) for word in words)
     named = named or set(good) & set(re.findall(r"`(\w+)", text))
     named = named or any(word in repr(value) for word in quoted)
     return "" if named or repr(value) in text else f"UNNAMED {name}: {text}"
@@ -98,7 +108,7 @@ def rows(things: Things, only: list[str]):
 def main() -> None:
     hj.enable_x64()
     matplotlib.use("agg")
-    signal.signal(signal.SIGALRM, ring)
+    signal.signal(signal.SIGPROF, ring)
     found, home = {}, os.getcwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)

@@ -81,6 +81,11 @@ class Things:
         return hj.estimate_htf(self.data, (-1, 0, 1))
 
     @ft.cached_property
+    def uncertain(self):
+        e = self.estimate
+        return hj.HTF(e.f, e.H, e.harmonics, 6, variance=np.full(e.H.shape, 1e-6))
+
+    @ft.cached_property
     def exact(self):
         return self.model.htf(self.estimate.f, (-1, 0, 1))
 

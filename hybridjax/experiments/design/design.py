@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from ..._core.arguments import Numbers, names
 from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
+from ..._core.boundary.containers import Names
 from ..._core.boundary.kinds import (
     Count,
     ExperimentCount,
@@ -73,7 +74,7 @@ class Design(eqx.Module):
     n_sections: SectionCount = eqx.field(static=True)
     periods: PeriodCount = eqx.field(static=True)
     experiments: ExperimentCount = eqx.field(static=True)
-    input_names: tuple[str, ...] = eqx.field(static=True, default=("u",))
+    input_names: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
     highest_harmonic: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

@@ -162,8 +162,10 @@ def _require_periodic(data: ExperimentData) -> None:
 
 
 def _polynomial(multipliers) -> Float[np.ndarray, " d"]:
+    if len(multipliers) == 0:
+        raise DefinitionError("`multipliers` must hold one or more.")
     c = np.poly(np.asarray(multipliers))[1:]
-    if np.abs(np.imag(c)).max(initial=0) > _REAL or len(c) == 0:
+    if np.abs(np.imag(c)).max() > _REAL:
         raise DefinitionError(f"`multipliers` must be real or in conjugate pairs: {multipliers}.")
     return np.real(c)
 

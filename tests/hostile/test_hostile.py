@@ -1,0 +1,52 @@
+"""Hostile calls: each is refused at once, in a sentence that names what is wrong."""
+
+import inspect
+import json
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from ..test_typing import public
+
+
+# Public names that the table leaves out, each for a reason.
+CALLED_BY_THE_ENGINE = {
+    "AbstractLevels", "AbstractObservation", "AbstractSections", "AtEvent", "BoundSections",
+    "BuckConverter", "Chart", "ClockPhase", "Crossing", "KinematicPhase", "Lanes", "ObservedSeries",
+    "PaddleJuggler", "PlacedSections", "Plan", "ProcessNoise", "ReturnMap", "SLIPRunner",
+    "SectionList", "Settings", "Structure", "TwoLeggedBar", "VerticalHopper", "Winding",
+}  # fmt: skip
+SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    """What came of every call, in a process without this one's check of types."""
+    run = subprocess.run(
+        [sys.executable, "-m", "tests.hostile.run"],
+        capture_output=True, text=True, timeout=600, cwd=pathlib.Path(__file__).parents[2],
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+def test_hostile_calls_are_refused(outcome):
+    wrong = [f"{call}: {what}" for call, what in outcome["calls"].items() if what]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_hostile_calls_write_nothing(outcome):
+    assert outcome["files"] == []
+
+
+def test_all_public_names_are_called(outcome):
+    """All functions, and all methods but constructors of what only this package makes."""
+    called = {call.partition("(")[0].removeprefix("plot.") for call in outcome["calls"]}
+    for name, function in (each.values for each in public()):
+        owner, _, method = name.partition(".")
+        takes = set(inspect.signature(function).parameters) - {"self", "cls"}
+        if not takes or method == "__init__" or owner in CALLED_BY_THE_ENGINE | SLOW_TO_MAKE:
+            continue
+        assert name.removesuffix(".__call__") in called
