@@ -1,4 +1,3 @@
-import inspect
 import pathlib
 
 import hypothesis
@@ -36,11 +35,6 @@ class no_compilation:
     def __exit__(self, *_):
         jax.monitoring.unregister_event_duration_listener(self.listen)
         assert not self.count, f"{self.count} programs were compiled"
-
-
-def unchecked(function):
-    """`function` without the check of types in these tests, which would be the first to refuse."""
-    return inspect.unwrap(function)
 
 
 @pytest.fixture(scope="session")
