@@ -107,7 +107,9 @@ def _column_of_times(path: Path, headers: list[str], time: str) -> str:
     names = {x: split_header(x)[0] for x in headers}
     exact = [x for x, name in names.items() if time in (x, name)]
     alike = exact or [x for x, name in names.items() if name.lower() == time.lower()]
-    if len(alike) != 1:
+    if len(alike) > 1:
+        raise FileFormatError(f"'{path}' has two columns '{time}'.")
+    if not alike:
         raise DefinitionError(
             f"'{path}' has no column '{time}'; its columns are {', '.join(names.values())}."
         )

@@ -189,6 +189,9 @@ def test_vicon(tmp_path, separator):
     path.write_text(VICON.replace("500", "400"))
     with pytest.raises(FileFormatError, match="frames differ in rate"):
         hj.read_recording(path)
+    path.write_text(VICON.replace("\n2,1,3.5", "\n1,1,3.5"))
+    with pytest.raises(FileFormatError, match="frames that are missing, or not in order"):
+        hj.read_recording(path)
     path.write_text(VICON[: VICON.index("\n\n")])
     assert hj.read_recording(path).notes == ()
 
@@ -243,7 +246,11 @@ def test_ends_of_lines(tmp_path, end, missing):
         ("time;a\n0,5;1\n1.5;2\n0.5,2;1\n", "line 3: there are points beside"),
         ("time;a\n0,5;1\n1.5;2\n", "line 3: there are points beside"),
         ("Subject 3\ntime,a\n0,1\n1,2\n", "line 1: 'Subject 3' names one column"),
-        ("time (ms),time (s)\n0,1\n1,2\n", "no column 'time'"),
+        ("time (ms),time (s)\n0,1\n1,2\n", "two columns 'time'"),
+        ('{"a": "' + "x" * 200000 + '"}', "no column 'time'|no samples"),
+        (VICON[:60], "is not a number|fields"),
+        ("a\nb\n" * 30, "is not a number"),
+        ("\xff\xd8\xff\xe0" * 20, "no samples"),
     ],
 )
 def test_bad_csv(tmp_path, text, message):

@@ -18,6 +18,10 @@ from .lines import is_comment
 _MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
 
 
+# Characters of a field that a message shows. Doubled: longer messages.
+_SHOWN = 40
+
+
 class Columns(NamedTuple):
     """What a file holds: columns by their headers, and what was assumed to read them."""
 
@@ -40,7 +44,12 @@ def split_line(line: str, separator: str) -> list[str]:
     """The fields of a line, without blanks around them. Blanks before a unit separate nothing."""
     if not separator:
         return re.split(r"\s+(?![(\[])", line.strip()) if line.strip() else []
-    return [x.strip() for x in next(csv.reader([line], delimiter=separator), [])]
+    if '"' not in line:
+        return [x.strip() for x in line.split(separator)] if line else []
+    try:
+        return [x.strip() for x in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:  # a field of more than 100 kB, which is none
+        return [line]
 
 
 def split_names(line: str, separator: str) -> list[str]:
@@ -123,7 +132,7 @@ def _by_line(table: Table) -> Float[np.ndarray, "n k"]:
             k = row.index(None)
             raise FileFormatError(
                 f"'{table.path}', line {number}: column '{table.headers[k]}' holds "
-                f"'{fields[k]}', which is not a number."
+                f"'{fields[k][:_SHOWN]}', which is not a number."
             )
         rows.append(row)
     return np.array(rows, float).reshape(-1, count)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import FileFormatError
-from .lines import is_comment
 from .table import Columns, Table, read_table, split_names, to_number
 
 
@@ -34,8 +33,13 @@ def read_vicon(path: Path, lines: list[str]) -> Columns:
         columns = {name.lower(): name for name in found.values}
         frame = found.values.pop(columns[_FRAME])
         sub = found.values.pop(columns.get(_SUBFRAME, ""), np.zeros(len(frame)))
+        if (
+            not np.isfinite(frame + sub).all()
+            or (np.diff(frame + sub / (sub.max() + 1)) <= 0).any()
+        ):
+            raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
         parts = int(sub.max()) + 1
-        clocks.append((frame, sub, parts, to_number(lines[start + 1].strip(" ,;\t")) / parts))
+        clocks.append((frame, sub, parts, float(lines[start + 1].strip(" ,;\t")) / parts))
         notes += found.notes
         twice = found.values.keys() & values.keys()
         if twice:
@@ -62,10 +66,10 @@ def _blocks(lines: list[str]) -> list[tuple[int, int]]:
     """First line of each block, and the one after its last."""
     starts = [
         k
-        for k in range(len(lines) - 3)
+        for k in range(len(lines) - _HEADER + 1)
         if lines[k + 3].strip('" ').lower().startswith(_FRAME)
-        and to_number(lines[k + 1].strip(" ,;\t") or "?") is not None
-        and not is_comment(lines[k])
+        and (to_number(lines[k + 1].strip(" ,;\t")) or 0) > 0
+        and _names(lines[k : k + _HEADER])[1][0].lower() == _FRAME
     ]
     stops = []
     for start in starts:
