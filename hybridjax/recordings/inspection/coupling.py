@@ -35,8 +35,11 @@ _ODD, _NONE = 0.8, 0.4
 # where a part's own input is displaced as is best for that part, if that is right. Doubled: more is
 # reported, also by chance.
 _BETTER = 0.5
+# How many times the usual power such a part leaves unexplained, at least. Doubled: what is
+# displaced by little passes.
+_WORSE = 1.5
 # How many times the usual power is left unexplained where something else acted, and what share of
-# what the input explains. Doubled: weaker disturbances pass.
+# what the input explains is much. Doubled: weaker disturbances pass.
 _DISTURBED, _MUCH = 9.0, 0.25
 
 
@@ -105,14 +108,16 @@ def _odd(name: str, answers: list["_Answer"], names: tuple[str, ...]) -> list[Fi
     moves = np.arange(N) - N // 2
     moved = np.array([[a.unexplained(int(m))[0] for m in moves] for a in answers])
     common = moved[:, np.argmin(moved.sum(axis=0))]
-    displaced = moved.min(axis=1) < _BETTER * common
+    displaced = (moved.min(axis=1) < _BETTER * common) & (common > _WORSE * np.median(common))
     spans: dict[str, list[str]] = {}
     for k, a in enumerate(answers):
-        best = a.gain(int(moves[np.argmin(moved[k])]))
+        best = int(moves[np.argmin(moved[k])])
+        answer, unsure = a.gain(best)
+        clear = answer > _CLEAR * unsure and np.divide(*a.unexplained(best)) < _MUCH
         verdict = ""
         if gain[k] < -max(_NONE * usual, _CLEAR * error[k]):
             verdict = "sign"
-        elif displaced[k] and best[0] > _CLEAR * best[1]:
+        elif displaced[k] and clear:
             verdict = "displaced"
         elif gain[k] < _NONE * usual and gain[k] + _CLEAR * error[k] < _ODD * usual:
             verdict = "none"
