@@ -76,7 +76,7 @@ def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
 
     **Raises:** `FileFormatError` if it is no such table, or has experiments of different lengths.
     """
-    columns = read_columns(Path(path))
+    columns = read_columns(Path(path)).values
     needed = ("experiment", "cycle", "section", "phase")
     if not set(needed) <= set(columns):
         raise FileFormatError(f"'{path}' has no columns {', '.join(needed)}: no table by phase.")
@@ -126,6 +126,13 @@ def add_command(
         signals |= dict(zip(command, added.T, strict=True))
         units = dict(zip(recording.signals, recording.units, strict=True))
         trials.append(
-            Recording(trial.time, signals, events=trial.events, units=units, name=trial.name)
+            Recording(
+                trial.time,
+                signals,
+                events=trial.events,
+                units=units,
+                name=trial.name,
+                notes=recording.notes,
+            )
         )
     return Recording.join(trials)

@@ -1,6 +1,6 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,12 +9,18 @@ from jaxtyping import Float
 
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
+from .headers import seconds, split_header, time_unit
 from .smoothing import bridgeable, spline
 
 
 # Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
 # nothing changes, this is rounding.
 _BISECTIONS = 50
+
+
+# Times between samples are irregular if those at this part from either end differ by more than that
+# part of their median. Doubled: fewer recordings are said to be irregular.
+_TAIL, _IRREGULAR = 0.05, 0.1
 
 
 class Trial(eqx.Module):
@@ -41,11 +47,13 @@ class Recording(eqx.Module):
 
     - `trials`: one or several `Trial`s with the same signals.
     - `signals`: their names. `units`: a unit for each, "" where none was given.
+    - `notes`: what was assumed where files were read.
     """
 
     trials: tuple[Trial, ...]
     signals: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -55,15 +63,16 @@ class Recording(eqx.Module):
         events: Mapping[str, Any] | None = None,
         units: Mapping[str, str] | None = None,
         name: str = "trial",
+        notes: Sequence[str] = (),
     ):
         """A recording of one trial; `join` puts several together.
 
         **Arguments:**
 
-        - `time` (n,): of the samples, in seconds, say; strictly increasing.
+        - `time` (n,): of the samples, in seconds; strictly increasing.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing.
         - `events`: times of events by name, such as foot strikes.
-        - `units`: by name. `name`: of the trial.
+        - `units`: by name. `name`: of the trial. `notes`: what to tell readers of results.
 
         **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
         backwards, and infinite values; it names the sample.
@@ -90,10 +99,13 @@ class Recording(eqx.Module):
             raise DefinitionError(f"{where}: time is not a finite number at sample {bad}.")
         if (np.diff(time) <= 0).any():
             bad = int(np.argmax(np.diff(time) <= 0)) + 1
-            how = "repeats" if time[bad] == time[bad - 1] else "runs backwards"
+            repeats = time[bad] == time[bad - 1]
+            how = "repeats" if repeats else "runs backwards"
+            remedy = "export it with more digits, or leave doubled samples out"
             raise DefinitionError(
                 f"{where}: time {how} at sample {bad} ({time[bad - 1]:.10g}, then "
-                f"{time[bad]:.10g}); sort the samples, or make a trial of each part."
+                f"{time[bad]:.10g}); "
+                f"{remedy if repeats else 'sort the samples, or make a trial of each part'}."
             )
         found = {}
         for key, values in (events or {}).items():
@@ -110,6 +122,7 @@ class Recording(eqx.Module):
         self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), found, name),)
         self.signals = tuple(columns)
         self.units = tuple((units or {}).get(key, "") for key in columns)
+        self.notes = tuple(notes)
 
     @classmethod
     def from_frame(
@@ -123,18 +136,23 @@ class Recording(eqx.Module):
     ) -> "Recording":
         """A trial from a table with named columns: of pandas, polars, pyarrow, or a dictionary.
 
-        **Arguments:** `time`: the column with the times; all others are signals. The rest as for
-        `Recording`.
+        **Arguments:** `time`: the column with the times; all others are signals. Units may stand in
+        the names, `time (ms)` and `force (N)`. The rest as for `Recording`.
 
-        **Raises:** `DefinitionError` if there is no such column, and as `Recording`.
+        **Raises:** `DefinitionError` if there is no such column, for an unknown unit of time, and
+        as `Recording`.
         """
         names = [str(key) for key in getattr(frame, "column_names", None) or frame.keys()]
         if time not in names:
             raise DefinitionError(
                 f"trial '{name}' has no column '{time}'; its columns are {', '.join(names)}."
             )
-        signals = {key: np.asarray(frame[key]) for key in names if key != time}
-        return cls(np.asarray(frame[time]), signals, events=events, units=units, name=name)
+        scale = seconds(f"trial '{name}'", time, time_unit(time))
+        t = scale * _numbers(f"trial '{name}'", time, frame[time])
+        found = {key: split_header(key) for key in names if key != time}
+        signals = {plain: np.asarray(frame[key]) for key, (plain, _) in found.items()}
+        own = {plain: unit for plain, unit in found.values() if unit}
+        return cls(t, signals, events=events, units=own | dict(units or {}), name=name)
 
     @staticmethod
     def join(recordings: Iterable["Recording"]) -> "Recording":
@@ -164,7 +182,11 @@ class Recording(eqx.Module):
                 trials += other.trials
                 continue
             trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
-        return eqx.tree_at(lambda r: r.trials, first, tuple(trials))
+        notes = tuple(dict.fromkeys(note for other in recordings for note in other.notes))
+        signals = dict(zip(first.signals, first.trials[0].values.T, strict=True))
+        units = dict(zip(first.signals, first.units, strict=True))
+        joined = Recording(first.trials[0].time, signals, units=units, notes=notes)
+        return eqx.tree_at(lambda r: r.trials, joined, tuple(trials))
 
     def mark(
         self, event: str, crossing: Crossing, *, bandwidth: int | float = np.inf
@@ -223,16 +245,20 @@ class Recording(eqx.Module):
         parts = []
         for t in self.trials:
             step = np.diff(t.time)
+            middle = float(np.median(step))
+            low, high = np.quantile(step, [_TAIL, 1 - _TAIL])
+            how = "irregular; " if high - low > _IRREGULAR * middle else ""
             missing = int(np.isnan(t.values).any(axis=1).sum())
             events = "".join(f", {len(v)} {k}" for k, v in t.events.items())
             parts.append(
-                f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g}, every "
-                f"{np.median(step):.4g} (longest {step.max():.4g})"
+                f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
+                f"{middle:.4g} s ({1 / middle:.4g} Hz; {how}longest {step.max():.4g} s)"
                 + (f", {missing} with gaps" if missing else "")
                 + events
             )
         pairs = zip(self.signals, self.units, strict=True)
         names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
+        parts += [f"  ({note})" for note in self.notes]
         return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
 
 

@@ -14,7 +14,7 @@ from .drift import check_drift
 from .phase.estimation import PhaseDefinition, estimate_phase
 from .phase.winding import Phase, Winding
 from .recording import Recording, Trial
-from .smoothing import bridgeable, gaps, inside, means, nearest, spline
+from .smoothing import FEWEST, bridgeable, gaps, inside, means, nearest, spline
 
 
 # The longest gap that a spline bridges: so many times from section to section, but not less than
@@ -177,6 +177,12 @@ class _Sampler:
         sampled: Literal["mean", "middle"],
     ):
         self.time, self.sampled = trial.time, sampled
+        for name in (*inputs, *outputs):
+            seen = int(np.isfinite(trial.values[:, recording.column(name)]).sum())
+            if seen < FEWEST:
+                raise DefinitionError(
+                    f"trial '{trial.name}' has {seen} samples of {name}: leave the trial out."
+                )
         self.inputs = [trial.values[:, recording.column(name)] for name in inputs]
         self.outputs = [trial.values[:, recording.column(name)] for name in outputs]
         self.curves = [spline(trial.time, x, bandwidth) for x in self.outputs]
@@ -189,7 +195,7 @@ class _Sampler:
         k = np.arange(np.ceil(first - _ROUNDING), np.floor(last + _ROUNDING) + 1).astype(int)
         if len(k) <= n_sections:
             return None
-        t = winding.when(k / n_sections)
+        t = np.clip(winding.when(k / n_sections), *winding.time[[0, -1]])
         section = _GAP_SECTIONS * period / n_sections
 
         def holes(x):

@@ -74,8 +74,9 @@ def bridgeable(
 def gaps(
     time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: int | float
 ) -> Float[np.ndarray, "g 2"]:
-    """First and last times of the stretches without a sample that are longer than `longest`."""
-    there = time[seen]
+    """First and last times of the stretches without a sample that are longer than `longest`: first
+    the time before all samples, which begins at -inf, last that after them."""
+    there = np.concatenate([[-np.inf], time[seen], [np.inf]])
     wide = np.flatnonzero(np.diff(there) > longest)
     return np.stack([there[wide], there[wide + 1]], axis=1)
 

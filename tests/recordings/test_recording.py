@@ -81,7 +81,7 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
 
 
 _PART = st.sampled_from(
-    ["1.5", "-2e-3", "nan", "e", "E+", ".", "-", " ", "NaN", "N", "A", "%", "_"]
+    ["1.5", "-2e-3", "nan", "e", "E+", ".", "-", " ", "NaN", "N", "A", "$", "_"]
 )
 _FIELD = st.lists(_PART, max_size=3).map("".join)
 
@@ -89,15 +89,133 @@ _FIELD = st.lists(_PART, max_size=3).map("".join)
 @given(st.lists(st.lists(_FIELD, min_size=1, max_size=3), min_size=1, max_size=3))
 def test_what_is_no_number_is_not_read_as_one(tmp_path_factory, rows):
     file = tmp_path_factory.mktemp("table") / "x.csv"
+    rows = [["1.5"] * len(rows[0]), *rows]  # no row of units
     file.write_text("\n".join(["a,b,c"[: 2 * len(rows[0]) - 1], *map(",".join, rows)]) + "\n")
     try:
-        found = read_columns(file)
+        found = read_columns(file).values
     except FileFormatError:
         return
-    rows = [row for row in rows if any(map(str.strip, row))]
+    width = len(rows[0])
+    rows = [row[:width] for row in rows if any(map(str.strip, row))]
     missing = {"", "nan", "na"}
     numbers = [[np.nan if x.strip().lower() in missing else float(x) for x in r] for r in rows]
     np.testing.assert_array_equal(np.stack(list(found.values()), axis=1), numbers)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("time (s);F (µN)\n0,5;1\n1,5;-2,5e-1\n", "latin-1"),  # a European spreadsheet
+        ("time (s)\tF (µN)\n0,5\t1\n1,5\t-0,25\n", "utf-16"),
+        ("time;F\ns;µN\n0.5;1\n1.5;-0.25\n", "utf-8"),  # units in a row of their own
+        ("time,F,\n(s),[µN],\n0.5,1,\n1.5,-0.25,\n", "utf-8-sig"),
+        ("# by hand\ntime (s),F (µN)\n0.5,1\n// a note\n\n1.5,-0.25\n", "utf-8"),
+        ("% numpy.savetxt\n% time (s) F (µN)\n0.5 1\n1.5 -0.25\n", "utf-8"),
+        ("Time (s)   F (µN)\n0.5   1\n 1.5  -0.25\n", "utf-8"),
+        (",time (s),F (µN)\n0,0.5,1\n1,1.5,-0.25\n", "utf-8"),  # the index of pandas
+        ('"time (s)","F (µN)"\n"0.5","1"\n"1.5","-0.25"\n', "utf-8"),
+        ("time_ms,F (µN)\n500,1\n1500,-0.25\n", "utf-8"),
+        ("time (min);F (µN)\n0.00833333333333333333;1\n0.025;-0.25\n", "utf-8"),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_what_spreadsheets_write(tmp_path, text, encoding, end):
+    (tmp_path / "x.csv").write_text(text.replace("\n", end), encoding=encoding, newline="")
+    found = hj.read_recording(tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time")
+    assert found.signals == ("F",) and found.units == ("µN",)
+    np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)
+    np.testing.assert_array_equal(found.trials[0].values[:, 0], [1.0, -0.25])
+
+
+OPENSIM = """Coordinates
+version=1
+nRows=2
+nColumns=3
+inDegrees=yes
+
+endheader
+time\tpelvis_ty\tforce_vx
+0.5\t1\t2
+1.5\t-0.25\t3
+"""
+VICON = """Devices
+1000
+,,Imported Plate - Force,,
+Frame,Sub Frame,Fx,Fy,
+,,N,N,
+1,0,0.5,1,
+1,1,1.5,2,
+2,0,2.5,3,
+2,1,3.5,4,
+
+Trajectories
+500
+,,subject:TOE,,
+Frame,Sub Frame,X,Y,
+,,mm,mm,
+1,0,10,20,
+2,0,11,21,
+"""
+
+
+@pytest.mark.parametrize("blanks", ["\t", "  "])
+def test_opensim(tmp_path, blanks):
+    path = tmp_path / "walk.mot"
+    path.write_text(OPENSIM.replace("\t", blanks))
+    found = hj.read_recording(path)
+    assert found.signals == ("pelvis_ty", "force_vx")
+    assert found.notes == ("angles are in degrees",)
+    np.testing.assert_array_equal(found.trials[0].values, [[1, 2], [-0.25, 3]])
+    path.write_text(OPENSIM.replace("nRows=2", "nRows=3"))
+    with pytest.raises(FileFormatError, match="2 rows, but its header says 3"):
+        hj.read_recording(path)
+
+
+@pytest.mark.parametrize("separator", [",", "\t", ";"])
+def test_vicon(tmp_path, separator):
+    """Two blocks of different rates on one axis of time."""
+    path = tmp_path / "walk.csv"
+    path.write_text(VICON.replace(",", separator))
+    found = hj.read_recording(path)
+    plate, toe = "Imported Plate - Force", "TOE"
+    assert found.signals == (f"{plate}.Fx", f"{plate}.Fy", f"{toe}.X", f"{toe}.Y")
+    assert found.units == ("N", "N", "mm", "mm")
+    np.testing.assert_allclose(found.trials[0].time, [0, 0.001, 0.002, 0.003])
+    nan = np.nan
+    np.testing.assert_array_equal(
+        found.trials[0].values[:, 1:3].T, [[1, 2, 3, 4], [10, nan, 11, nan]]
+    )
+    assert any("different rates" in note for note in found.notes)
+    path.write_text(VICON.replace("500", "400"))
+    with pytest.raises(FileFormatError, match="frames differ in rate"):
+        hj.read_recording(path)
+    path.write_text(VICON.replace("\n2,1,3.5", "\n1,1,3.5"))
+    with pytest.raises(FileFormatError, match="frames that are missing, or not in order"):
+        hj.read_recording(path)
+    path.write_text(VICON[: VICON.index("\n\n")])
+    assert hj.read_recording(path).notes == ()
+
+
+def test_the_unit_of_time(tmp_path):
+    """Seconds, whatever the file says; assumed, and said, where it says nothing."""
+    np.savez(tmp_path / "x.npz", **{"time (ms)": T, "a": T, "event e": [1500.0, 2500.0]})
+    found = hj.read_recording(tmp_path / "x.npz")
+    np.testing.assert_allclose(found.trials[0].time, T / 1000)
+    np.testing.assert_allclose(found.trials[0].events["e"], [1.5, 2.5])
+    assert found.notes == ()
+    frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T}, time="time (ms)")
+    np.testing.assert_allclose(frame.trials[0].time, T / 1000)
+    assert frame.signals == ("a",) and frame.unit("a") == "N"
+    (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
+    both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
+    assert both.notes == ("the times in 'frame' have no unit: taken as seconds",)
+    assert "(the times in 'frame' have no unit: taken as seconds)" in repr(both)
+    assert "every 1 s (1 Hz; longest 1 s)" in repr(both)
+    uneven = hj.Recording(np.array([0, 1, 2.5, 3, 4.2]), {"a": T})
+    assert "every 1.1 s (0.9091 Hz; irregular; longest 1.5 s)" in repr(uneven)
+    (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
+    with pytest.raises(hj.DefinitionError, match="are in 'samples', which is no known unit"):
+        hj.read_recording(tmp_path / "y.csv")
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
@@ -116,13 +234,23 @@ def test_ends_of_lines(tmp_path, end, missing):
         ("", "is empty"),
         ("time,a\n", "has a header, but no samples"),
         ("0,1\n1,2\n", "begins with numbers"),
-        ("\n1,2\n", "no line with the names"),
+        ("\n1,2\n", "begins with numbers"),
+        ("\n,,\n# a\n", "no line with the names"),
         ("time,a\n0,1\n1,x\n", "line 3: column 'a' holds 'x', which is not a number"),
         ("time,a\n0,1\n1,2-3\n", "line 3: column 'a' holds '2-3', which is not a number"),
         ("time,a\n0,1\n1\n", "line 3: 1 fields, but the header names 2"),
         ("time,a\n0,1\n1,2,3\n4\n", "line 3: 3 fields, but the header names 2"),
         ("time,a,a\n0,1,1\n1,2,2\n", "two columns 'a'"),
         ("t,a\n0,1\n1,2\n", "no column 'time'; its columns are t, a"),
+        ("time,a\n0,5,1,2\n1,5,1,3\n", "line 2: 4 fields, .* another separator"),
+        ("time;a\n0,5;1\n1.5;2\n0.5,2;1\n", "line 3: there are points beside"),
+        ("time;a\n0,5;1\n1.5;2\n", "line 3: there are points beside"),
+        ("Subject 3\ntime,a\n0,1\n1,2\n", "line 1: 'Subject 3' names one column"),
+        ("time (ms),time (s)\n0,1\n1,2\n", "two columns 'time'"),
+        ('{"a": "' + "x" * 200000 + '"}', "no column 'time'|no samples"),
+        (VICON[:60], "is not a number|fields"),
+        ("a\nb\n" * 30, "is not a number"),
+        ("\xff\xd8\xff\xe0" * 20, "no samples"),
     ],
 )
 def test_bad_csv(tmp_path, text, message):
@@ -142,9 +270,10 @@ def test_other_bad_files(tmp_path):
     (tmp_path / "x.npz").write_text("not")
     with pytest.raises(hj.errors.FileFormatError, match="not an NPZ file"):
         hj.read_recording(tmp_path / "x.npz")
-    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(hj.errors.FileFormatError, match="not a text file"):
-        hj.read_recording(tmp_path / "b.csv")
+    for no_text in (b"time,a\x00\x01", b"\xff\xfe\x00\xd8\x00"):
+        (tmp_path / "b.csv").write_bytes(no_text)
+        with pytest.raises(hj.errors.FileFormatError, match="not a text file"):
+            hj.read_recording(tmp_path / "b.csv")
     with pytest.raises(hj.DefinitionError, match="no file to read"):
         hj.read_recording()
 

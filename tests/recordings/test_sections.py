@@ -1,5 +1,6 @@
 """Section data against closed forms, its masks, tables of designs, and the command."""
 
+import html
 import json
 
 import equinox as eqx
@@ -51,6 +52,18 @@ def test_gaps_are_masked_and_cut(wave):
     assert 0 < data.missing < 0.1
 
 
+def test_nothing_is_made_up_before_and_after_a_signal(wave):
+    """A signal that begins later than the events that are the phase, and ends earlier."""
+    t, (f, x, _) = wave.trials[0].time, wave.trials[0].values.T
+    late, early = np.where(t < 3.3, np.nan, x), np.where(t > 17.3, np.nan, f)
+    recording = hj.Recording(t, {"f": early, "x": late}, events={"top": np.arange(-1.0, 25)})
+    data = sample(recording, hj.AtEvent("top"), outputs="x", n_sections=8)
+    (record,), (times,) = data.records, data.times
+    assert times[0] == 0.0 and times[-1] < 20.0
+    np.testing.assert_array_equal(np.isnan(record.y[:, 0]), times < 3.29)
+    np.testing.assert_array_equal(np.isnan(record.u[:, 0]), times + 1 / 8 > 17.31)
+
+
 def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
     """Where the phase was not seen, sections are not known to be sections, nor their times."""
     t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
@@ -68,13 +81,35 @@ def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
         assert not np.isnan(record.u).any()
 
 
+def test_short_stretches_between_missed_events_and_a_pause(rhythm):
+    """They count where they can; what is left out is counted and said."""
+    marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)
+    dirty = hj.testing.spoil(
+        marked, ("x", "v"), hj.testing.Dirt(noise=1e-3, lost_events=10, doubled_events=10)
+    )
+    (trial,) = dirty.trials
+    kept = np.abs(trial.time - 77) > 3.4
+    events = {k: v[np.abs(v - 77) > 3.4] for k, v in trial.events.items()}
+    signals = dict(zip(dirty.signals, trial.values[kept].T, strict=True))
+    paused = hj.Recording(trial.time[kept], signals, events=events)
+    found = hj.identify_recording(
+        paused, hj.AtEvent("top"), inputs="force", outputs=("x", "v"), n_sections=8, order=1
+    )
+    assert found.fit.contains([MULTIPLIER], 0.999).all()
+    assert found.phase.dropped == 9  # one lies in the pause
+    assert len(found.data.records) == 11 and found.phase.cycles + found.phase.missed == 199
+    held = found.held_out.validation
+    assert held.left_out == 1 and "compared, left out: 1" in repr(found)
+    assert held.independent and held.fit.min() > 50
+
+
 def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
     """Two tenths of a cycle, five times, where cycles begin: sections are left out, or right."""
     t, values = rhythm.trials[0].time, rhythm.trials[0].values
     names, top = rhythm.signals, hj.Crossing("v", "falling")
     rng, hidden = np.random.default_rng(0), values.copy()
     for at in rng.choice(np.arange(10, 190), 5, replace=False):
-        start = at - rng.uniform(0.02, 0.18)
+        start = at + 0.5 - rng.uniform(0.02, 0.18)
         hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
     options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
     clean, dirty = (
@@ -187,10 +222,18 @@ def test_the_command(files, tmp_path):
     assert summary["held_out_fit_percent"][0] > 80
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 7 and "<script" not in page
+    top = page[: page.index("<img")]
+    assert f"<strong>{found.real:.4f}</strong> <span>95 % region: ±" in top
+    assert "64 Hz, for 200 s" in top and "from force (N) to x (m), v (m/s)" in top
+    assert all(f'<p class="warn">{html.escape(w)}</p>' in top for w in summary["warnings"])
+    assert all(f"<li>{html.escape(x)}</li>" in top for x in summary["left_out"])
+    assert summary["sampling_rates"] == pytest.approx([64, 64])
+    assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+    assert "p &lt; 0.001" in page or "p = " in page
     assert hj.load(out / "fit.npz").contains([MULTIPLIER], 0.999).all()
     assert hj.load(out / "htf.npz").variance is not None
     rows = (out / "sections.csv").read_text().splitlines()
-    assert rows[0] == "trial,record,cycle,section,time,force (N),x (m),v (m/s)"
+    assert rows[0] == "trial,record,cycle,section,time (s),force (N),x (m),v (m/s)"
     assert len(rows) > 16 * 190
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png", ".pdf"}
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -229,6 +272,18 @@ def test_the_command_writes_nothing_half(files, tmp_path, more, message):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(SystemExit, match="holds other files"):
         identify(files, tmp_path)
+
+
+def test_a_trial_without_a_signal(wave):
+    t, values = wave.trials[0].time, wave.trials[0].values
+    for column, name in ((0, "f"), (1, "x")):
+        hidden = values.copy()
+        hidden[4:, column] = np.nan
+        one = hj.Recording(t, dict(zip("fxv", hidden.T, strict=True)), name="second")
+        both = hj.Recording.join([wave, one])
+        phase = hj.recordings.estimate_phase(both, lambda t, signals: 2 * np.pi * t)
+        with pytest.raises(hj.DefinitionError, match=f"trial 'second' has 4 samples of {name}"):
+            sample(both, phase)
 
 
 def test_constant_input(wave):

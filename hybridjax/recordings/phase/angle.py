@@ -170,7 +170,7 @@ def _turns_per_time(angles: Sequence[Angle]) -> float:
 
 def _monotone(time: Float[np.ndarray, " n"], phase: Float[np.ndarray, " n"]) -> Winding | None:
     seen = np.isfinite(time)
-    unseen = gaps(time, seen, bridgeable(time, seen))
+    unseen = gaps(time, seen, bridgeable(time, seen))[1:-1]
     low = np.maximum.accumulate(phase)
     high = np.minimum.accumulate(phase[::-1])[::-1]
     phase = (low + high) / 2

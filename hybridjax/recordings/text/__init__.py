@@ -1,0 +1,1 @@
+"""Tables in text files, as spreadsheets and laboratories write them."""
