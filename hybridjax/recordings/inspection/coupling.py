@@ -31,11 +31,15 @@ _CLEAR = 4.0
 # Of the usual gain, what is odd; and what is none. Doubled: what is displaced by little is
 # reported; or what has a weak answer.
 _ODD, _NONE = 0.8, 0.4
-# Of what is left unexplained, what is left where the input is displaced by some sections, if that
-# is right. Doubled: more is reported, also by chance.
+# Of what is left unexplained where all inputs are displaced as is best for all parts, what is left
+# where a part's own input is displaced as is best for that part, if that is right. Doubled: more is
+# reported, also by chance.
 _BETTER = 0.5
+# How many times the usual power such a part leaves unexplained, at least. Doubled: what is
+# displaced by little passes.
+_WORSE = 1.5
 # How many times the usual power is left unexplained where something else acted, and what share of
-# what the input explains. Doubled: weaker disturbances pass.
+# what the input explains is much. Doubled: weaker disturbances pass.
 _DISTURBED, _MUCH = 9.0, 0.25
 
 
@@ -100,30 +104,29 @@ def _odd(name: str, answers: list["_Answer"], names: tuple[str, ...]) -> list[Fi
         return [Finding("no answer", "warned", text)]
     left, explained = np.array([a.unexplained() for a in answers]).T
     disturbed = left > np.maximum(_DISTURBED * np.median(left), _MUCH * explained)
+    N = answers[0].part.u.shape[1]
+    moves = np.arange(N) - N // 2
+    moved = np.array([[a.unexplained(int(m))[0] for m in moves] for a in answers])
+    common = moved[:, np.argmin(moved.sum(axis=0))]
+    displaced = (moved.min(axis=1) < _BETTER * common) & (common > _WORSE * np.median(common))
     spans: dict[str, list[str]] = {}
     for k, a in enumerate(answers):
-        verdict = _verdict(
-            a, float(gain[k]) / usual, _CLEAR * float(error[k]) / usual, bool(disturbed[k])
-        )
+        best = int(moves[np.argmin(moved[k])])
+        answer, unsure = a.gain(best)
+        clear = answer > _CLEAR * unsure and np.divide(*a.unexplained(best)) < _MUCH
+        verdict = ""
+        if gain[k] < -max(_NONE * usual, _CLEAR * error[k]):
+            verdict = "sign"
+        elif displaced[k] and clear:
+            verdict = "displaced"
+        elif gain[k] < _NONE * usual and gain[k] + _CLEAR * error[k] < _ODD * usual:
+            verdict = "none"
+        elif disturbed[k]:
+            verdict = "disturbed"
         if verdict:
             where = f"trial '{names[a.part.trial]}', {a.part.start:.4g}-{a.part.end:.4g} s"
             spans.setdefault(verdict, []).append(where)
     return [_finding(name, verdict, where) for verdict, where in spans.items()]
-
-
-def _verdict(a: "_Answer", gain: float, unsure: float, disturbed: bool) -> str:
-    """What is odd about a part, whose gain is relative to the usual one; "" if nothing is."""
-    if gain < -max(_NONE, unsure):
-        return "sign"
-    N = a.part.u.shape[1]
-    moves = [m for m in range(-N // 2, N // 2 + 1) if m]
-    best = min(moves, key=lambda m: a.unexplained(m)[0])
-    moved, error = a.gain(best)
-    if a.unexplained(best)[0] < _BETTER * a.unexplained()[0] and moved > _CLEAR * error:
-        return "displaced"
-    if gain < _NONE and gain + unsure < _ODD:
-        return "none"
-    return "disturbed" if disturbed else ""
 
 
 def _finding(name: str, verdict: str, where: list[str]) -> Finding:

@@ -43,13 +43,11 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
             for t, parts in zip(recording.trials, phase.stretches, strict=True)
         ]
     )
-    for s, trial in enumerate(recording.trials):
-        rest = np.arange(len(mean)) != s
-        if not rest.any() or np.isnan(mean[s]).any() or np.isnan(mean[rest]).any(axis=(1, 2)).all():
-            continue
-        usual = np.nanmedian(mean[rest], axis=0)
-        text = _difference(mean[s], usual, trial.name, outputs)
-        found += [] if text is None else [text]
+    known = np.flatnonzero(np.isfinite(mean).all(axis=(1, 2)))
+    for s in known if len(known) > 1 else ():
+        usual = np.median(mean[known[known != s]], axis=0)
+        difference = _difference(mean[s], usual, recording.trials[s].name, outputs)
+        found += [] if difference is None else [difference]
     return found
 
 

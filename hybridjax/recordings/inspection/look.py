@@ -39,7 +39,7 @@ def inspect(
     """
     inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    names = [*inputs, *outputs]
+    names = [name for name in (*inputs, *outputs) if _recorded(recording, name)]
     found: list[Finding] = []
     clean = recording
     periods = [
@@ -59,7 +59,7 @@ def inspect(
     once = [not rows.all() for rows in known]
     clean, empty = _without_empty(_masked(clean, names, known), outputs, once)
     found += empty
-    found += other_settings(clean, inputs, outputs) + clocks(clean)
+    found += other_settings(clean, names, outputs) + clocks(clean)
     return Inspection(tuple(found), clean)
 
 
@@ -80,6 +80,12 @@ def refuse(findings: Sequence[Finding]) -> None:
     for finding in findings:
         if finding.action == "refused":
             raise DefinitionError(finding.text)
+
+
+def _recorded(recording: Recording, name: str) -> bool:
+    """Whether there is any sample of a signal."""
+    k = recording.column(name)
+    return any(bool(np.isfinite(t.values[:, k]).any()) for t in recording.trials)
 
 
 def _signal(recording: Recording, name: str, periods: list[float], is_input: bool) -> Signal:

@@ -27,26 +27,21 @@ _REGULAR, _NEARLY_ALL, _JUMP = 0.01, 0.95, 5.0
 
 
 def other_settings(
-    recording: Recording, inputs: tuple[str, ...], outputs: tuple[str, ...]
+    recording: Recording, names: list[str], outputs: tuple[str, ...]
 ) -> list[Finding]:
     """Trials in which a signal has another unit or zero, or two outputs have changed places."""
     if len(recording.trials) < 2:
         return []
-    names = inputs + outputs
     columns = [recording.column(name) for name in names]
-    low, middle, high = np.stack(
-        [
-            np.nanquantile(t.values[:, columns], [_TAIL, 0.5, 1 - _TAIL], axis=0)
-            for t in recording.trials
-        ],
-        axis=1,
-    )
+    levels = [[_levels(t.values[:, k]) for k in columns] for t in recording.trials]
+    low, middle, high = np.moveaxis(np.array(levels), 2, 0)
     width = high - low
     found = []
     for s, trial in enumerate(recording.trials):
         rest = np.arange(len(recording.trials)) != s
         usual, range_ = np.median(middle[rest], axis=0), np.median(width[rest], axis=0)
-        swapped = _swapped(middle[s], width[s], usual, range_, len(inputs))
+        places = [k for k, name in enumerate(names) if name in outputs]
+        swapped = _swapped(middle[s], width[s], usual, range_, places)
         if swapped is not None:
             a, b = (names[k] for k in swapped)
             text = f"{a} and {b} have changed places in trial '{trial.name}': swap its columns."
@@ -78,21 +73,27 @@ def other_settings(
     return found
 
 
+def _levels(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+    """Where a signal is: a low, the middle and a high quantile; NaN if it is nowhere."""
+    x = x[np.isfinite(x)]
+    return np.quantile(x, [_TAIL, 0.5, 1 - _TAIL]) if len(x) else np.full(3, np.nan)
+
+
 def _swapped(
     middle: Float[np.ndarray, " k"],
     width: Float[np.ndarray, " k"],
     usual: Float[np.ndarray, " k"],
     range_: Float[np.ndarray, " k"],
-    first: int,
+    places: list[int],
 ) -> tuple[int, int] | None:
-    """Two outputs (from the place `first` on), each of which is where the other one usually is."""
+    """Two of these signals, each of which is where the other one usually is."""
 
     def alike(i, j):
         ratio = width[i] / range_[j] if width[i] > 0 and range_[j] > 0 else np.inf
         near = abs(middle[i] - usual[j]) < min(width[i], range_[j])
         return near and 1 / _ALIKE < ratio < _ALIKE
 
-    for i, j in combinations(range(first, len(width)), 2):
+    for i, j in combinations(places, 2):
         if alike(i, j) and alike(j, i) and not (alike(i, i) or alike(j, j)):
             return i, j
     return None

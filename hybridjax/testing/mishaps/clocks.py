@@ -1,6 +1,7 @@
 """Mishaps of time: of stamps, of clocks that differ, and of events."""
 
 import numpy as np
+from jaxtyping import Bool
 
 from ...recordings.recording import Recording, Trial
 from .change import (
@@ -33,7 +34,7 @@ def pause(recording: Recording, names: Names, rng: np.random.Generator, cycles: 
     """Nothing is recorded for a while in the middle of each trial."""
 
     def interrupt(trial: Trial) -> Trial:
-        def away(t: Column) -> Column:
+        def away(t: Column) -> Bool[np.ndarray, " n"]:
             return np.abs(t - trial.time.mean()) > cycles / 2 * period_of(trial, names)
 
         events = {k: t[away(t)] for k, t in trial.events.items()}
