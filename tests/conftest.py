@@ -37,11 +37,6 @@ class no_compilation:
         assert not self.count, f"{self.count} programs were compiled"
 
 
-def unchecked(function):
-    """`function` without the check of types in these tests, which would be the first to refuse."""
-    return getattr(function, "__wrapped__", function)
-
-
 @pytest.fixture(scope="session")
 def reference():
     """Independent high-precision results for the paper's hopper; see tests/data/README.md."""
