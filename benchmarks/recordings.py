@@ -1,6 +1,7 @@
-"""Recordings to multipliers: errors, dirt, mishaps, coverage, a walker, time and memory.
+"""Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, time and memory.
 
-python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [walker] [size] [coverage]
+python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [coverage]
+[short] [losses]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -242,6 +243,111 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
     print("\n" + ", ".join(f"{n} {v}" for v, n in counts.items()), flush=True)
 
 
+def spikes(seeds=50, strides=300, noise=1e-4, n_sections=16):
+    print(f"\nSpikes of 20 standard deviations: {seeds} seeds, {strides} strides, noise {noise:g}")
+    recordings, true = hopper(strides, range(seeds))
+    crossing = hj.Crossing("vM", "falling")
+    for name, phase in (("apex", crossing), ("angle", phase_of("angle", n_sections))):
+        for signals in (("yM", "vM"), ("u", "yM", "vM")):
+            clean = None
+            for share in (0.0, 1e-3, 1e-2):
+                found, said, left_out = [], [], 0
+                for seed, recording in enumerate(recordings):
+                    dirty = spoil(recording, ("yM", "vM"), Dirt(noise=noise, seed=seed))
+                    dirty = spoil(dirty, signals, Dirt(spikes=share, seed=seed))
+                    data = hj.recordings.section_data(
+                        dirty, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections
+                    )
+                    fit = hj.fit_series(data.records, 2, check=False)
+                    found.append(distance(fit.multipliers, true))
+                    said.append(fit.standard_errors[0])
+                    left_out += sum(data.spikes)
+                clean = clean or rms(found)
+                print(
+                    f"{name:5s} {100 * share:3g} % of {', '.join(signals)}: rms error "
+                    f"{rms(found):.1e} ({rms(found) / clean:.2f} times the clean one), said "
+                    f"{rms(said):.1e}, {left_out / seeds:.0f} samples left out",
+                    flush=True,
+                )
+
+
+# Multipliers, inputs and outputs of linear systems of 8 sections.
+LINEAR = {
+    "a complex pair": ((0.5 + 0.5j, 0.5 - 0.5j), 1, 2),
+    "a real one": ((0.6,), 1, 1),
+    "two real ones": ((0.7, -0.4), 1, 2),
+    "two real ones, two inputs": ((0.7, -0.4), 2, 2),
+}
+
+
+def linear_system(multipliers, nu, ny, n_sections=8, seed=5):
+    """Random, but with these multipliers."""
+    rng, d = np.random.default_rng(seed), len(multipliers)
+    A = [np.linalg.qr(rng.normal(size=(d, d)))[0] for _ in range(n_sections - 1)]
+    z = np.asarray(multipliers)
+    shape = np.diag(z.real)
+    if np.iscomplexobj(z):
+        shape = np.array([[z[0].real, -z[0].imag], [z[0].imag, z[0].real]])
+    turn = rng.normal(size=(d, d)) + 2 * np.eye(d)
+    A.append(turn @ shape @ np.linalg.inv(np.linalg.multi_dot([*A[::-1], turn])))
+    B, C = rng.normal(size=(n_sections, d, nu)), rng.normal(size=(n_sections, ny, d))
+    return hj.LDTP.from_blocks(A, list(B), list(C), [np.zeros((ny, nu))] * n_sections)
+
+
+def white_records(model, strides, seeds, noise):
+    """White inputs from the limit cycle, and outputs with `noise(rng, shape)`, of their size."""
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=(strides * model.n_sections, len(model.inputs)))
+        y = np.array(model.simulate(u))
+        y += y.std(axis=0) * noise(rng, y.shape)
+        about = dict(inputs=model.inputs, outputs=model.outputs)
+        yield hj.Record(u, y, n_sections=model.n_sections, **about)
+
+
+def coverage_of(label, records, multipliers, **options):
+    true = np.asarray(multipliers)
+    fits = [hj.fit_series(r, len(true), check=False, **options) for r in records]
+    hits = np.sum([f.contains(true) for f in fits], axis=0)
+    found = np.sqrt(np.mean([f.compare(true).error ** 2 for f in fits], axis=0))
+    said = np.sqrt(np.mean([f.standard_errors**2 for f in fits], axis=0))
+    for k, z in enumerate(true):
+        if np.imag(z) >= 0:
+            p = stats.binomtest(int(hits[k]), len(fits), 0.95).pvalue
+            print(
+                f"{label}, {z:.2g}: {hits[k]} of {len(fits)} ({100 * hits[k] / len(fits):.1f} %), "
+                f"p = {p:.2g}; rms error {found[k]:.1e}, said / rms {said[k] / found[k]:.2f}",
+                flush=True,
+            )
+
+
+def short(seeds=400, strides=200):
+    print(f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, 8 sections, 20 dB")
+    for label, (multipliers, nu, ny) in LINEAR.items():
+        model = linear_system(multipliers, nu, ny)
+        records = white_records(model, strides, seeds, lambda rng, n: 0.1 * rng.normal(size=n))
+        coverage_of(label, records, multipliers)
+
+
+NOISES_OF_LOSSES = {
+    "normal": lambda rng, n: 0.1 * rng.normal(size=n),
+    "Student's of 3 degrees": lambda rng, n: 0.1 * rng.standard_t(3, size=n),
+    "1 % off by 20": lambda rng, n: (
+        0.1 * rng.normal(size=n) + 20 * rng.choice([-1, 0, 1], n, p=[0.005, 0.99, 0.005])
+    ),
+}
+
+
+def losses(seeds=200, strides=200):
+    print(f"\nLosses of fit_series: {seeds} seeds, {strides} strides, 8 sections")
+    multipliers, nu, ny = LINEAR["a complex pair"]
+    model = linear_system(multipliers, nu, ny)
+    for label, noise in NOISES_OF_LOSSES.items():
+        for loss in ("squares", "huber", "student"):
+            records = white_records(model, strides, seeds, noise)
+            coverage_of(f"{label}, {loss}", records, multipliers, loss=loss, distortion=False)
+
+
 def walker(seeds=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
@@ -328,17 +434,14 @@ def write_trials(files, minutes, rate):
         np.savetxt(file, table, "%.7g", delimiter=",", header=header, comments="")
 
 
+ALL = (
+    "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "coverage", "short",
+    "losses",
+)  # fmt: skip
+
 if __name__ == "__main__":
     hj.enable_x64()
-    for name in sys.argv[1:] or (
-        "errors",
-        "parts",
-        "dirt",
-        "mishaps",
-        "walker",
-        "size",
-        "coverage",
-    ):
+    for name in sys.argv[1:] or ALL:
         start = time.process_time()
         globals()[name]()
         print(f"({time.process_time() - start:.0f} CPU s)")

@@ -133,6 +133,11 @@ def advise(
     warnings += [] if validation is None else _about_what_is_left(validation)
     if data.missing > _MANY_MISSING:
         warnings.append(f"Gaps: {100 * data.missing:.0f} % of the samples are missing.")
+    warnings += [
+        f"Spikes: {count} samples of {name} stuck out of all around them, and were left out."
+        for name, count in zip(data.signals, data.spikes, strict=True)
+        if count
+    ]
     # Variances go down with the number of strides that the unknowns leave over.
     now = max(sampled - unknown, 1)
     later = np.array([max(n - (R * nu + d + 1), 0) for n in _STRIDES], float)

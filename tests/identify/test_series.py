@@ -135,6 +135,59 @@ def test_process_noise_is_seen_in_the_residuals(small):
     assert covered(hits, runs)
 
 
+def test_standard_errors_of_short_records_are_not_too_large(small):
+    """Numerators take a fifth of each error; the misfit says the same as white noise's size."""
+    ratios = []
+    for seed in range(12):
+        data = record(small, 4 * 80, seed, 0.3)
+        sizes = [
+            hj.fit_series(data, 2, distortion=False, errors=errors).standard_errors[0]
+            for errors in ("residuals", "white")
+        ]
+        ratios.append(sizes[0] / sizes[1])
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.08)
+
+
+OUTLIERS = {
+    "none": lambda rng, shape: rng.normal(size=shape),
+    "heavy tails": lambda rng, shape: rng.standard_t(3, size=shape),
+    "spikes": lambda rng, shape: (
+        rng.normal(size=shape) + 300 * (rng.random(shape) < 0.01) * rng.choice([-1, 1], shape)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", OUTLIERS)
+def test_robust_losses(small, kind):
+    """As good as squares for normal errors, better where some are far off; regions hold."""
+    true, runs, fits = small.multipliers, 8, {}
+    for loss in ("squares", "huber", "student"):
+        fits[loss] = []
+        for seed in range(runs):
+            data = record(small, 4 * 100, seed)
+            noise = 0.1 * OUTLIERS[kind](np.random.default_rng(seed), data.y.shape)
+            data = hj.Record(data.u, data.y + noise, n_sections=4)
+            fits[loss].append(
+                hj.fit_series(data, 2, loss=loss, distortion=False, check=loss != "squares")
+            )
+    rms = {
+        loss: np.sqrt(np.mean([f.compare(true).error[0] ** 2 for f in found]))
+        for loss, found in fits.items()
+    }
+    for loss in ("huber", "student"):
+        assert covered(sum(fit.contains(true).all() for fit in fits[loss]), runs)
+        said = np.sqrt(np.mean([fit.standard_errors[0] ** 2 for fit in fits[loss]]))
+        assert said == pytest.approx(rms[loss], rel=0.5)
+        assert all(fit.result == hj.Result.OK for fit in fits[loss])
+        worse = {"none": 1.25, "heavy tails": 1.1, "spikes": 0.2}[kind]
+        assert rms[loss] < worse * rms["squares"]
+
+
+def test_losses_leave_exact_data_alone(small):
+    fit = hj.fit_series(record(small, 4 * 80), 2, loss="huber")
+    assert fit.compare(small.multipliers).max_error < 1e-8
+
+
 def test_experiments_are_used_from_their_start(hopper, multipliers):
     """The transient that a window of periods avoids is information here."""
     data = hj.experiments.simulate_experiments(hopper, hj.multisine(periods=40), discard=0)
@@ -246,6 +299,8 @@ def test_bad_records(small):
         hj.fit_series(record(small, 40), 2)
     with pytest.raises(hj.DefinitionError, match="`order` must be an integer from 1"):
         hj.fit_series(good, 0)
+    with pytest.raises(hj.DefinitionError, match="allowed for with the loss 'squares'"):
+        hj.fit_series(good, 2, loss="huber", distortion=True)
     with pytest.raises(hj.DefinitionError, match="input u is zero"):
         hj.fit_series(hj.Record(0 * good.u, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match="output y1 is zero or missing"):

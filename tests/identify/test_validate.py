@@ -50,6 +50,23 @@ def test_a_wrong_model_is_refused(small):
     assert "with the input: yes" in repr(found)
 
 
+def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
+    """White noise, and a response to the inputs of the last samples that the model lacks."""
+    noticed, runs, N = 0, 40, 4
+    for seed in range(runs):
+        data = record(small, N * 80, seed, 0.5)
+        rng = np.random.default_rng(1000 + seed)
+        hidden = rng.choice([-1.0, 1.0], N)[np.arange(N * 80) % N] * data.u[:, 0]
+        size = np.sqrt(np.mean(np.asarray(small.simulate(data.u))[:, 1] ** 2))
+        found = hj.validate(small, data)
+        data.y[:, 1] += found.visible[1] * size * hidden / np.sqrt(np.mean(hidden**2))
+        noticed += hj.validate(small, data).independence[1] < found.level / 2
+    assert covered(noticed, runs, 0.8)
+    assert "noticed in four of five such data: " in repr(found)
+    more = hj.validate(small, record(small, N * 320, 0, 0.5)).visible
+    np.testing.assert_allclose(more / found.visible, 0.5, rtol=0.15)
+
+
 def test_process_noise_is_correlated_in_time_only(small):
     data = record(small, 4 * 300, 0)
     hidden = np.random.default_rng(1).normal(size=data.u.shape)

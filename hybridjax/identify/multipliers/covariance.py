@@ -69,8 +69,16 @@ class GradientCovariance(NamedTuple):
     """The covariance of a gradient whose parts depend on their neighbors."""
 
     matrix: Float[np.ndarray, "d d"]
-    terms: float
-    """How many of its terms stand for one that is independent."""
+    weights: Float[np.ndarray, " lags"]
+    """Of products of parts that are 1, 2, ... cycles apart."""
+
+    def freedom(self, shares: Float[np.ndarray, "S T d"]) -> float:
+        """The degrees of freedom it was estimated with, from what each part is expected to add to
+        it (Satterthwaite 1946): products of different parts are independent terms, too."""
+        total = (shares**2).sum(axis=(0, 1))
+        for k, w in enumerate(self.weights, 1):
+            total += 2 * w**2 * (shares[:, k:] * shares[:, :-k]).sum(axis=(0, 1))
+        return float(1 / total.mean())
 
 
 def serial_covariance(score: Float[np.ndarray, "S T d"], lags: int) -> GradientCovariance:
@@ -82,7 +90,8 @@ def serial_covariance(score: Float[np.ndarray, "S T d"], lags: int) -> GradientC
     gradient = np.einsum("sti,stj->ij", score, score)
     lag = np.arange(1, 2 * lags + 2) / (2 * lags + 2)
     weights = np.where(lag < 0.5, 1 - 6 * lag**2 + 6 * lag**3, 2 * (1 - lag) ** 3)
+    weights = weights[: score.shape[1] - 1]
     for k, w in enumerate(weights, 1):
-        product = np.einsum("sti,stj->ij", score[:, k:], score[:, : max(score.shape[1] - k, 0)])
+        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
         gradient += w * (product + product.T)
-    return GradientCovariance(gradient, 1 + 2 * float((weights**2).sum()))
+    return GradientCovariance(gradient, weights)

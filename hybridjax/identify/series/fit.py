@@ -263,8 +263,8 @@ def _covariance(
     share = np.einsum("ij,stjk,lk->stil", half, parts, half).reshape(*parts.shape[:2], d * d)
     taken = np.trace(serial_covariance(share, lags).matrix)
     corrected = gradient.matrix / max(1 - taken / d, _SMALLEST_FREEDOM)
-    covariance = sandwich(curvature, corrected, parts.reshape(-1, d, d))
-    return covariance._replace(freedom=covariance.freedom / gradient.terms)
+    own = share[..., :: d + 1]  # the diagonals
+    return sandwich(curvature, corrected)._replace(freedom=gradient.freedom(own))
 
 
 def _require_signals(grid: CycleGrid) -> None:

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance, correlated_cycles, sandwich, serial_covariance
+from ..multipliers.covariance import Covariance, correlated_cycles, serial_covariance
 from ..multipliers.denominator import Denominator
 from .shared_state import (
     SharedStateModel,
@@ -180,10 +180,9 @@ def denominator_of(fit: SharedStateFit, errors: Literal["residuals", "white"]) -
     error = np.linalg.solve(own, error[..., None])[..., 0]
     mine = slopes @ (to_c @ hessian @ root).T
     score = np.einsum("stad,sta->std", mine, error)
-    parts = np.einsum("stad,stae->stde", mine, mine)
+    shares = (mine**2).sum(axis=2)
     gradient = serial_covariance(score, correlated_cycles(np.linalg.eigvals(model.A), T))
-    scaled = sandwich(np.eye(d), gradient.matrix, parts.reshape(-1, d, d))
-    covariance = Covariance(half @ scaled.matrix @ half.T, scaled.freedom / gradient.terms)
+    covariance = Covariance(half @ gradient.matrix @ half.T, gradient.freedom(shares))
     return Denominator(c, covariance, converged)
 
 

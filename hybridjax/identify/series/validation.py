@@ -16,6 +16,7 @@ from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.record import Record, RecordedData, uninterrupted_records
 from ...linear.ldtp import LDTP
+from .power import smallest_visible
 from .series_fit import SeriesFit
 from .simulation import can_be_compared, simulate_record
 
@@ -44,6 +45,9 @@ class Validation(eqx.Module):
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
       input: a small one says that the model is wrong.
     - `level`: of both tests, for all outputs together.
+    - `visible` (ny,): the smallest misfit that the test of independence would notice in four of
+      five such data: rms of what lagged inputs do to the output that the model lacks, relative to
+      the rms of the simulated output. Smaller errors of a model pass.
     - `autocorrelation` (N, lags, ny): of the residual at each section with those 1, 2, ... samples
       earlier. `cross_correlation` (N, lags, ny, nu): of the residual with the inputs 0, 1, ...
       samples earlier. Both in units of their standard deviation where there is no correlation.
@@ -57,6 +61,7 @@ class Validation(eqx.Module):
     noise: Float[np.ndarray, " ny"]
     whiteness: Float[np.ndarray, " ny"]
     independence: Float[np.ndarray, " ny"]
+    visible: Float[np.ndarray, " ny"]
     autocorrelation: Float[np.ndarray, "N lags ny"]
     cross_correlation: Float[np.ndarray, "N lags ny nu"]
     measured: Float[np.ndarray, "n ny"]
@@ -94,6 +99,10 @@ class Validation(eqx.Module):
         )
         if self.left_out:
             rows.append(f"records too short to be compared, left out: {self.left_out}")
+        seen = ", ".join(
+            f"{100 * x:.2g} % of {name}" for x, name in zip(self.visible, self.outputs, strict=True)
+        )
+        rows.append(f"misfits that would be noticed in four of five such data: {seen}")
         return "\n".join(rows)
 
 
@@ -170,14 +179,17 @@ def validate(
             f"{_FEWEST_SAMPLES} times with so many samples before it in its record."
         )
     auto, white = _whiteness(records, e, N, lags)
-    cross, independent = _independence(records, e, N, lags)
     longest = max(range(len(records)), key=lambda k: len(records[k].u))
     shown = slice(0, len(records[longest].u) - records[longest].lead)  # later inputs are unknown
+    cross, independent, ratios = _independence(records, e, N, lags)
+    size = np.sqrt(np.mean(np.concatenate(simulated) ** 2, axis=0))
+    hidden = np.array([smallest_visible(r, level / len(outputs)) for r in ratios])
     return Validation(
         fit=100 * (1 - noise / spread),
         noise=noise,
         whiteness=white,
         independence=independent,
+        visible=np.where(size > 0, hidden * noise / np.where(size > 0, size, 1.0), np.inf),
         autocorrelation=auto,
         cross_correlation=cross,
         measured=records[longest].y[shown],
@@ -253,15 +265,19 @@ def _whiteness(
 
 def _independence(
     records: Sequence[Record], e: Sequence[np.ndarray], N: int, lags: int
-) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"]]:
-    """Correlations with earlier inputs, and the p-values."""
+) -> tuple[
+    Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], list[list[tuple[int, int]]]
+]:
+    """Correlations with earlier inputs, the p-values, and the degrees of freedom of the F ratios of
+    each output."""
     section = _sections(records)
     ny, nu = e[0].shape[1], records[0].u.shape[1]
     now = np.concatenate(e)
     past = [np.concatenate([_earlier(r.u, lag) for r in records]) for lag in range(lags)]
     past = np.stack(past, axis=1)
     z = np.zeros((N, lags, ny, nu))
-    square, freedom = np.zeros(ny), np.zeros(ny)
+    square: Float[np.ndarray, " ny"] = np.zeros(ny)
+    ratios: list[list[tuple[int, int]]] = [[] for _ in range(ny)]
     for n in range(N):
         inputs, residual = past[section == n], now[section == n]
         for i in range(ny):
@@ -280,5 +296,6 @@ def _independence(
             inside = ((left.T @ r) ** 2).sum()
             ratio = (inside / a) / ((r @ r - inside) / b)
             square[i] += stats.norm.isf(np.clip(stats.f.sf(ratio, a, b), 1e-300, 1 - 1e-16))
-            freedom[i] += 1
-    return z, stats.norm.sf(square / np.sqrt(np.maximum(freedom, 1)))
+            ratios[i].append((a, b))
+    count = np.array([len(r) for r in ratios])
+    return z, stats.norm.sf(square / np.sqrt(np.maximum(count, 1))), ratios

@@ -1,0 +1,124 @@
+"""Isolated spikes are found; steps, kinks, impacts and pulses are not."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.recordings.spikes import input_spikes, spike_heights, without_spikes
+
+
+T = np.arange(20000) / 500
+WAVE = np.sin(2 * np.pi * T)
+
+
+def noisy(x, noise=1e-3, seed=0):
+    return x + noise * np.random.default_rng(seed).normal(size=len(x))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-1])
+def test_all_spikes_are_found_and_little_else(noise):
+    """Two per cent of all samples, so that many are neighbors."""
+    rng = np.random.default_rng(1)
+    clean = noisy(WAVE, noise)
+    struck = rng.random(len(T)) < 0.02
+    struck &= np.convolve(struck, [1, 1, 1, 1], "same") < 4  # three in a row at most
+    x = clean + struck * rng.choice([-15, 15], len(T))
+    found = spike_heights(x)
+    assert (found != 0)[struck].mean() > 0.999 and (found != 0)[~struck].mean() < 1e-3
+    np.testing.assert_allclose(np.abs(found[struck & (found != 0)]), 15, atol=1)
+    kept = without_spikes(x)
+    np.testing.assert_array_equal(np.isnan(kept), found != 0)
+    np.testing.assert_array_equal(kept[found == 0], x[found == 0])
+
+
+def pulse(width):
+    """Of half a sine, once in a second; the first sample is not zero."""
+    x, shape = np.zeros(len(T)), np.sin(np.pi * (np.arange(width) + 0.5) / width)
+    for first in range(100, len(T) - width, 500):
+        x[first : first + width] += shape
+    return x
+
+
+RINGING = np.exp(-40 * (T % 1)) * np.where(np.arange(len(T)) % 2, 1, -1)
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        WAVE,
+        np.abs(WAVE),
+        T % 1,
+        np.where(WAVE >= 0, 1.0, -1.0),
+        np.round(WAVE, 2),
+        np.round(noisy(WAVE, 2e-3), 2),
+        WAVE + pulse(6),
+        WAVE + np.ceil(pulse(4)),
+        WAVE + RINGING,
+        np.random.default_rng(0).normal(size=len(T)),
+        np.zeros(len(T)),
+        np.arange(5.0),
+    ],
+    ids=[
+        "wave", "bounce", "sawtooth", "steps", "quantized", "noisy-quantized", "pulses",
+        "short-pulses", "ringing", "noise", "nothing", "few",
+    ],
+)  # fmt: skip
+def test_what_is_no_spike(x):
+    for values in (x, x + 1e-5 * np.random.default_rng(3).normal(size=len(x))):
+        assert not spike_heights(values).any()
+
+
+def test_pulses_are_the_input_and_spikes_are_not():
+    """Single samples stand out of a smooth force only as errors."""
+    single = np.zeros(len(T))
+    single[np.random.default_rng(2).integers(0, len(T), 100)] = 10.0
+    assert (input_spikes(noisy(WAVE) + single) != 0)[single > 0].all()
+    assert not input_spikes(single).any()
+    assert not input_spikes(noisy(single, 0.1)).any()
+    force = hj.testing.random_force(40, 500, 8)[:, 0]
+    assert not input_spikes(force).any()
+    assert not input_spikes(np.repeat(np.random.default_rng(0).normal(size=5000), 4)).any()
+
+
+def test_impacts_are_part_of_the_motion(wave):
+    """A transient of one sample in every cycle stays, those in between are left out."""
+    t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
+    impact = np.zeros(len(t))
+    impact[30::100] = 3.0
+    spikes = np.zeros(len(t))
+    spikes[[417, 985, 1250]] = -4.0
+    options = dict(inputs="f", outputs=("x", "v"), n_sections=8)
+    phase = hj.KinematicPhase(8, position="x", velocity="v")
+
+    def sampled(more):
+        return hj.recordings.section_data(
+            hj.Recording(t, {"f": f, "x": x + more, "v": v}), phase, **options
+        )
+
+    assert sampled(impact).spikes == (0, 0, 0)
+    both = sampled(impact + spikes)
+    assert both.spikes == (0, 3, 0) and "; spikes left out: x 3)" in repr(both)
+    np.testing.assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
+    assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05
+
+
+@pytest.mark.parametrize("share, most", [(1e-3, 1.3), (1e-2, 2.0)])
+def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle, share, most):
+    """Sixteen sections of four samples each, spikes in force and outputs."""
+    Dirt, spoil = hj.testing.Dirt, hj.testing.spoil
+    clean = spoil(hopper_recording, ("yM", "vM"), Dirt(noise=1e-4))
+    dirty = spoil(clean, ("u", "yM", "vM"), Dirt(spikes=share, seed=1))
+    fits = []
+    for recording in (clean, dirty):
+        data = hj.recordings.section_data(
+            recording, hj.Crossing("vM", "falling"), inputs="u", outputs=("yM", "vM"),
+            n_sections=16,
+        )  # fmt: skip
+        fits.append(hj.fit_series(data, order=2, distortion=False))
+    struck = [int((a != b).sum()) for a, b in zip(
+        clean.trials[0].values.T, dirty.trials[0].values.T, strict=True)]  # fmt: skip
+    assert np.abs(np.subtract(data.spikes, struck)).max() <= 0.05 * max(struck) + 1
+    assert fits[1].standard_errors[0] < most * fits[0].standard_errors[0]
+    assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
+    said = hj.recordings.advise(data, fits[1]).warnings
+    assert any(w.startswith("Spikes: ") for w in said)
