@@ -1,4 +1,4 @@
-"""Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, time and memory.
+"""Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [coverage]
 [short] [losses]
