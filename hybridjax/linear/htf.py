@@ -23,7 +23,7 @@ _SAME_FREQUENCY = 1e-9
 # A gap between frequencies is interpolated if it is no wider than so many of the widest step
 # (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
 _WIDEST_GAP = 2
-Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative")]
+Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
 
 # Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
 _SILENT_LINE = 1e-10

@@ -96,7 +96,7 @@ def new_figure(
     return figure, axes
 
 
-Resolution = Annotated[int, Whole(1, 10_000)]
+Resolution = Annotated[int, Whole(10, 10_000)]
 """Dots per inch."""
 AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""

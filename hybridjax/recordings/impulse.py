@@ -94,6 +94,10 @@ def impulse_responses(
     if lags < 2:
         raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
     reach = int(np.ceil(_PUSH_REACH * width * N))
+    if reach >= lags:
+        raise DefinitionError(
+            f"`width` is {width:g} periods, too wide for responses of {cycles:g} cycles."
+        )
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width * N, 1e-9)) ** 2)
     responses = _responses(fit, max(fit.lead + lags + reach, R))
     h, slope, root = (_pushed(x, weights / weights.sum(), lags, fit.lead) for x in responses)

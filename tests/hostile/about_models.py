@@ -154,7 +154,7 @@ def cycles(t):
         "systems": [*instance(PHASE), [], [3], [t.system, PHASE]], "guess": instance(t.system),
         "scale": SIZES, "settings": ["fast", 1e-9, PHASE], "execution": EXECUTION,
     }  # fmt: skip
-    yield "LimitCycles.__getitem__", t.cycles.__getitem__, dict(i=0), {"i": [*INTEGER, HUGE]}
+    yield "LimitCycles.__getitem__", t.cycles.__getitem__, dict(i=0), {"i": INTEGER}
     yield "LimitCycles.summary", t.cycles.summary, {}, {"limit": WHOLE}
     yield "continuation", hj.continuation, dict(
         cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05
@@ -162,7 +162,7 @@ def cycles(t):
         "cycle": instance(t.system), "parameter": NAME, "step": POSITIVE, "max_points": COUNT,
         "values": [None, "ab", 0.1j, (), (0.2, 0.3), (0.1, NAN), (0.1, INF), (0.1, 0.1), TRACED],
     }  # fmt: skip
-    yield "Branch.__getitem__", t.branch.__getitem__, dict(k=0), {"k": [*INTEGER, HUGE]}
+    yield "Branch.__getitem__", t.branch.__getitem__, dict(k=0), {"k": INTEGER}
     yield "Branch.find", t.branch.find, dict(kind="fold"), {"kind": WORD}
     yield "Branch.largest", t.branch.largest, dict(output="x"), {"output": NAME}
 

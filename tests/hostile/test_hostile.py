@@ -21,15 +21,20 @@ CALLED_BY_THE_ENGINE = {
 SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
 
 
-@pytest.fixture(scope="module")
-def outcome():
-    """What came of every call, in a process without this one's check of types."""
+def printed(*command):
+    """By a process without this one's check of types."""
     run = subprocess.run(
-        [sys.executable, "-m", "tests.hostile.run"],
-        capture_output=True, text=True, timeout=600, cwd=pathlib.Path(__file__).parents[2],
+        [sys.executable, "-m", *command],
+        capture_output=True, text=True, timeout=1800, cwd=pathlib.Path(__file__).parents[2],
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    """What came of every call."""
+    return printed("tests.hostile.run")
 
 
 def test_hostile_calls_are_refused(outcome):
@@ -50,3 +55,13 @@ def test_all_public_names_are_called(outcome):
         if not takes or method == "__init__" or owner in CALLED_BY_THE_ENGINE | SLOW_TO_MAKE:
             continue
         assert name.removesuffix(".__call__") in called
+
+
+def test_random_arguments_are_taken_or_refused():
+    names = "HTF", "LDTP", "Record", "Design.from_lines", "impulse_responses", "estimate_htf"
+    assert printed("tests.hostile.fuzz", "--examples", "20", *names) == {}
+
+
+@pytest.mark.slow
+def test_many_random_arguments_are_taken_or_refused():
+    assert printed("tests.hostile.fuzz", "--examples", "100") == {}

@@ -120,9 +120,9 @@ class Things:
         return hj.identify.amplitude_sweep(self.run, self.model, self.data.u, [1.0, 2.0])
 
     def run(self, u):
-        return hj.ExperimentData(
-            u, [self.model.simulate(one) for one in u], n_sections=6, periods=16
-        )
+        y = np.stack([self.model.simulate(one) for one in u])
+        noise = 1e-3 * np.random.default_rng(2).normal(size=y.shape)
+        return hj.ExperimentData(u, y + noise, n_sections=6, periods=16)
 
     @ft.cached_property
     def recording(self):

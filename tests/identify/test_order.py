@@ -1,5 +1,6 @@
 """The number of multipliers: found by rank and by criteria, refused where it is too high; AAA."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -88,4 +89,4 @@ def test_aaa_finds_the_roots_of_the_multipliers(exact, multipliers):
     with pytest.raises(hj.DefinitionError, match="no input 'v'"):
         hj.identify.fit_aaa(exact, input="v")
     with pytest.raises(hj.DefinitionError, match="H_1 holds NaN"):
-        hj.identify.fit_aaa(hj.HTF(exact.f, exact.H * np.nan, exact.harmonics, 32), 1)
+        hj.identify.fit_aaa(eqx.tree_at(lambda h: h.H, exact, exact.H * np.nan), 1)

@@ -159,7 +159,7 @@ def test_what_is_no_phase(wave):
         (hj.Crossing("x", "falling", value=3.0), "x never crosses 3, falling"),
         (hj.Crossing(lambda t, q: q[0], "falling"), "names a signal, and no charts"),
         (hj.Crossing("x", "falling", charts=("a",)), "names a signal, and no charts"),
-        (lambda t, s: t[1:], "returned the shape"),
+        (lambda t, s: t[1:], "must return an angle for each of"),
         (lambda t, s: 0 * t, "the phase does not wind"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
