@@ -53,7 +53,7 @@ TAKEN = [
     (Mapping[str, float], {"a": 1}, {"a": 1.0}),
     (SignalNames, "a", ("a",)),
     (SignalNames, ["a", "b"], ("a", "b")),
-    (SignalNames, (), ()),
+    (Annotated[SignalNames, Names(empty=True)], (), ()),
     (type[hj.HybridSystem], hj.models.VerticalHopper, hj.models.VerticalHopper),
     (int | str, "a", "a"),
 ]
@@ -91,6 +91,7 @@ REFUSED = [
     (Mapping[str, int], [1], "must be a mapping such as {name: value}, not [1]"),
     (SignalNames, ["a", "a"], "must name each only once, not ('a', 'a')"),
     (SignalNames, ["a", 3], "a sequence of distinct names, not ['a', 3]"),
+    (SignalNames, (), "must be a name, or a sequence of distinct names, not ()"),
     (Callable, 3, "must be a function, not 3"),
     (hj.Output, 3, "must be an Output, not 3"),
     (hj.LDTP, "x", "must be an LDTP, not 'x'"),

@@ -148,15 +148,15 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
     ],
 )
 def test_bad_families(define, message):
-    with pytest.raises((hj.DefinitionError, TypeError), match=f"{message}|type"):
+    with pytest.raises(hj.DefinitionError, match=message):
         define()
 
 
 @pytest.mark.parametrize(
     "sections, message",
     [
-        ("x", "sections are a family such as ClockPhase|'sections'"),
-        (None, "sections are a family such as ClockPhase|'sections'"),
+        ("x", "`sections` must be an AbstractSections, .* not 'x'"),
+        (None, "`sections` must be an AbstractSections, .* not None"),
         ([AtEvent("bounce")], "there is no event 'bounce'"),
         ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
         ([Crossing("x", "falling", charts=("a",))], "there is no chart 'a'"),
@@ -165,7 +165,7 @@ def test_bad_families(define, message):
     ],
 )
 def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):
-    with pytest.raises((hj.DefinitionError, TypeError), match=message):
+    with pytest.raises(hj.DefinitionError, match=message):
         hj.place_sections(vanderpol_cycle, sections)
 
 

@@ -208,7 +208,7 @@ def test_more_bad_arguments():
         hj.find_limit_cycle(hj.models.BouncingBall())
     with pytest.raises(hj.DefinitionError, match="leave out `section`"):
         hj.find_limit_cycle(hj.models.VerticalHopper(), section=hj.AtEvent("touchdown"))
-    with pytest.raises(hj.DefinitionError, match="parameter `M` of VerticalHopper is nan"):
+    with pytest.raises(hj.DefinitionError, match="`M` must be a finite number, not nan"):
         hj.find_limit_cycle(hj.models.VerticalHopper(M=np.nan))
     with pytest.raises(hj.DefinitionError, match="clock's period must be positive"):
         hj.find_limit_cycle(hj.models.VerticalHopper(omega=-1.0))

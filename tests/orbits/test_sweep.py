@@ -97,10 +97,9 @@ def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
 
 def test_systems_that_are_alike_or_undefined(wheel):
     """Neither takes the others down with it."""
-    slopes = [0.08] * 9 + [np.nan, 0.08]
-    found = hj.find_limit_cycles(
-        [hj.models.RimlessWheel(slope=x) for x in slopes], wheel, execution=FOUR
-    )
+    slopes = jnp.array([0.08] * 9 + [np.nan, 0.08])
+    wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
+    found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
     np.testing.assert_array_equal(found.failed, [9])
     alike = hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR)
     assert alike.ok.all()

@@ -99,7 +99,10 @@ def replaced(**changes):
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
         (Anything(ROOM, (TO_B, TO_B)), "two transitions are called 'go'"),
-        (eqx.tree_at(lambda s: s.k, HOPPER, np.inf), "parameter `k` of VerticalHopper is inf"),
+        (
+            eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)),
+            "parameter `k` of VerticalHopper is inf",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(system, message):
@@ -120,15 +123,17 @@ def test_an_input_that_the_system_does_not_have():
 
 
 def test_directions_have_two_names():
-    with pytest.raises(hj.DefinitionError, match="transition 'go': direction is 'down'"):
+    with pytest.raises(
+        hj.DefinitionError, match="`direction` must be 'falling' or 'rising', not 'down'"
+    ):
         hj.Transition("go", "a", "b", lambda t, q, u: q[0], "down")
-    with pytest.raises((hj.DefinitionError, TypeError), match="direction.*down"):
+    with pytest.raises(hj.DefinitionError, match="direction.*down"):
         hj.Crossing("x", "down")
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, np.nan, np.inf])
 def test_a_schedule_needs_a_positive_period(period):
-    with pytest.raises(hj.DefinitionError, match="period of a schedule"):
+    with pytest.raises(hj.DefinitionError, match="`period` must be a positive number"):
         hj.Scheduled(period)
 
 

@@ -56,7 +56,7 @@ def kind_of(hint: Any) -> Kind | None:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         own = [x for x in hint.__metadata__ if isinstance(x, Kind)]
-        return own[0] if own else kind_of(arguments[0])
+        return own[-1] if own else kind_of(arguments[0])
     if origin is Literal:
         return OneOf(*arguments)
     if origin in (Union, types.UnionType):
