@@ -40,10 +40,11 @@ def random_force(
             f"`bandwidth` must be less than half of the {rate:g} samples per second, but is "
             f"{bandwidth:g}."
         )
-    if duration * rate * inputs > PERIODS:
+    samples = (duration * rate + 2 * _TRANSIENT * rate / bandwidth) * inputs
+    if not samples <= PERIODS:
         raise DefinitionError(
-            f"`duration` times `rate` is {duration * rate * inputs:.3g} samples of all inputs, "
-            f"more than {PERIODS}."
+            f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples of all inputs, more "
+            f"than {PERIODS}."
         )
     n = round(duration * rate)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")

@@ -207,8 +207,8 @@ def linear(t):
     ), {
         "f": array(f), "H": [*array(H.real)[:7], H[:1], H[..., :1], H * NAN], "n_sections": LIMITED,
         "harmonics": [None, *HARMONICS], "inputs": NEW_NAMES, "outputs": NEW_NAMES,
-        "source": [None, 3], "variance": optional([*array(size), -size]),
-        "noise_variance": optional([*array(size), -size]),
+        "source": [None, 3], "variance": ["abc", size[:1], -size, size + 1j],
+        "noise_variance": ["abc", size[:1], -size, size + 1j],
         "variance_freedom": optional([*array(f), -f - 1]),
     }  # fmt: skip
     htf = t.estimate

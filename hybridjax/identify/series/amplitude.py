@@ -87,6 +87,8 @@ def amplitude_sweep(
     **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
     """
     free_start = start == "free"
+    if 0 in np.shape(u):
+        raise DefinitionError("`u` must hold one sample or more.")
     factors = np.sort(np.asarray(amplitudes))
     if not len(factors):
         raise DefinitionError("`amplitudes` must hold one amplitude or more.")
