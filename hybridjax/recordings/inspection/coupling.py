@@ -231,7 +231,7 @@ def _parts(data: SectionData, r: int, sections: int) -> list[_Part]:
         rows = np.arange(1, b - a - ahead)
         used = [known[rows + c] for c in range(-1, ahead + 1)]
         used += [np.isfinite(y[rows + c]).all(axis=1) for c in (-1, 0)]
-        rows = rows[np.all(used, axis=0)]
+        rows = rows[np.stack(used).all(axis=0)]
         t = data.times[r][where]
         u, y = np.nan_to_num(u), np.nan_to_num(y)
         part = _Part(data.trials[r], float(t[0]), float(t[-1]), u, y, sections, rows, ahead)

@@ -99,7 +99,7 @@ def _masked(recording: Recording, names: list[str], bad: Rows) -> Recording:
     trials = []
     for trial, rows in zip(recording.trials, bad, strict=True):
         values = trial.values.copy()
-        values[np.ix_(rows, columns)] = np.nan
+        values[:, columns] = np.where(rows[:, None], np.nan, values[:, columns])
         trials.append(Trial(trial.time, values, trial.events, trial.name))
     return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
 
