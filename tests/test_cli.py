@@ -88,7 +88,7 @@ def test_reproduce_draws_its_figures(results):
     ("arguments", "message"),
     [
         (["--param", "q=1"], "no parameter 'q'; parameters are m, M"),
-        (["--param", "M=nan"], "parameter `M` of VerticalHopper is nan"),
+        (["--param", "M=nan"], "VerticalHopper: `M` must be a finite number"),
         (["--experiments", "10"], "10 experiments are too few"),
         (["--keep", "84"], "leaves no cycle to discard"),
         (["--out", "/dev/null/x"], "cannot write to '/dev/null/x'"),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.text import p_value
 
 from .conftest import KINEMATIC, OUTPUTS
 
@@ -86,10 +85,3 @@ def test_results_print_briefly(hopper_cycle, placed_kinematic, kinematic_ldtp, h
     assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(hopper_cycle)
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
     assert "27 in flight, 5 in stance; dimension 2 to 4" in repr(placed_kinematic)
-
-
-@pytest.mark.parametrize(
-    "p, text", [(4e-11, "p < 0.001"), (0.0012, "p = 0.0012"), (0.3, "p = 0.3"), (1.0, "p = 1")]
-)
-def test_p_values(p, text):
-    assert p_value(np.float64(p)) == text

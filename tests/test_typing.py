@@ -135,7 +135,7 @@ UNCHECKED = {
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "EventTimes",
         "Identifiability", "Identification", "ImpulseResponses", "Lanes", "LimitCycle",
-        "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
+        "LimitCycles", "Finding", "Inspection", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
         "OutputLevels", "ParameterGuesses", "Phase", "PlacedSections", "Plan", "Plot",
         "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from .boundary.checked import checked
+
 
 Item = TypeVar("Item")
 
@@ -46,6 +48,7 @@ _running: list[Call] = []
 _enabled: bool | None = None
 
 
+@checked
 def enable_progress(enabled: bool = True) -> None:
     """Let long calls say what they are doing, wherever standard error goes; with `False`, nowhere.
 

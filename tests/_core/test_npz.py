@@ -79,7 +79,7 @@ DECLARED = {
     "periods": (dict(periods=10**12), "periods is 1000000000000"),
     "experiments": (dict(experiments=10**12), "experiments is 1000000000000"),
     "experiments that are not there": (dict(experiments=10**6), "at least one frequency"),
-    "a window": (dict(n_sections=10**6, periods=10**6), "more samples than an experiment"),
+    "a window": (dict(n_sections=10**5, periods=10**6), "more samples than an experiment"),
     "a fraction": (dict(n_sections=4.5), "n_sections is 4.5"),
     "a text": (dict(n_sections="4"), "n_sections is '4'"),
     "nothing": (dict(periods=None), "periods is None"),

@@ -199,7 +199,7 @@ def test_folders_without_experiments(tmp_path, arguments):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (dict(chunk=0), "chunk is the number"),
+        (dict(chunk=0), "`chunk` must be an integer from 1"),
         (dict(share=(2, 2)), "0 <= rank < size"),
     ],
 )

@@ -169,7 +169,7 @@ def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
     yield "fit_model", hj.fit_model, both, shared | {
-        "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT, "progress": FLAG,
+        "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT,
     }  # fmt: skip
     yield "identifiability", hj.fitting.identifiability, both, shared
     yield "spectral_radius", hj.fitting.spectral_radius, dict(model=t.model), {
@@ -253,9 +253,26 @@ def recordings(t):
     yield "SectionData.experiments", t.section_data.experiments, dict(periods=4), {
         "periods": LIMITED,
     }  # fmt: skip
+    yield "inspect", hj.recordings.inspect, dict(
+        recording=t.recording, inputs="f", outputs=("x", "v")
+    ), {"recording": instance(t.record), "inputs": SIGNAL, "outputs": SIGNAL}  # fmt: skip
+    yield "inspect_cycles", hj.recordings.inspect_cycles, dict(
+        recording=t.recording, phase=t.phase, data=t.section_data
+    ), {
+        "recording": instance(t.record), "phase": [None, "x", 3, Other()],
+        "data": instance(t.record),
+    }  # fmt: skip
+    about = dict(input="f", outputs=("x", "v"), event="strike")
+    yield "mishandle", hj.testing.mishandle, dict(
+        recording=t.recording, mishap="white noise", **about
+    ), {
+        "recording": instance(t.record), "mishap": WORD, "input": SIGNAL, "outputs": SIGNAL,
+        "event": [None, 3, Other()], "seed": SEED,
+    }  # fmt: skip
     data = instance(t.record, t.data)
     yield "advise", hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit), {
-        "data": data, "fit": instance(t.structured),
+        "data": data, "fit": instance(t.structured), "validation": optional(instance(t.data)),
+        "findings": ["x", 3, [3], Other()],
     }  # fmt: skip
     yield "plain_regression", hj.recordings.plain_regression, dict(data=t.record, order=2), {
         "data": [*instance(t.design), [], [3]], "order": FEW,

@@ -93,6 +93,7 @@ def told(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
     named = any(re.search(rf"\b({word})", text, re.IGNORECASE) for word in words)
     named = named or set(good) & set(re.findall(r"`(\w+)", text))
     named = named or any(word in repr(value) for word in quoted)
+    named = named or (isinstance(value, str) and value != "" and value in text)
     return "" if named or repr(value) in text else f"UNNAMED {name}: {text}"
 
 

@@ -205,6 +205,8 @@ def _wrong_field(thing: eqx.Module) -> str | None:
 
 def _matches(value: Any, hint: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return _matches(value, arguments[0])
     if origin is types.UnionType or origin is typing.Union:
         return any(_matches(value, option) for option in arguments)
     if origin is tuple:  # tuple[X, ...], the only form in use

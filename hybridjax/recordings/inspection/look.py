@@ -6,6 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import SignalNames
 from ...errors import DefinitionError
 from ..data import SectionData
 from ..phase.winding import Phase
@@ -24,9 +26,8 @@ from .settings import clocks, other_settings
 _SWING, _TAIL = 0.25, 0.1
 
 
-def inspect(
-    recording: Recording, *, inputs: str | Sequence[str], outputs: str | Sequence[str]
-) -> Inspection:
+@checked
+def inspect(recording: Recording, *, inputs: SignalNames, outputs: SignalNames) -> Inspection:
     """Look for what is wrong with a recording, before anything is computed from it.
 
     Numbers that stand for "no value", frozen, clipped and overflowing signals; signals, trials and
@@ -37,8 +38,6 @@ def inspect(
 
     **Raises:** `DefinitionError` for names that are not there.
     """
-    inputs = (inputs,) if isinstance(inputs, str) else tuple(inputs)
-    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     names = [name for name in (*inputs, *outputs) if _recorded(recording, name)]
     found: list[Finding] = []
     clean = recording
@@ -63,6 +62,7 @@ def inspect(
     return Inspection(tuple(found), clean)
 
 
+@checked
 def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> tuple[Finding, ...]:
     """What can be seen when the phase is known: trials of other periods and cycles, slow changes of
     the outputs, inputs that the outputs do not answer."""

@@ -1,10 +1,12 @@
 """What goes wrong in laboratories, by name."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Seed, SignalNames
 from ...errors import DefinitionError
 from ...recordings.recording import Recording
 from .change import Names
@@ -123,14 +125,15 @@ EVENT_MISHAPS: dict[str, Mishap] = {
 """What may happen to recorded events, by name."""
 
 
+@checked
 def mishandle(
     recording: Recording,
     mishap: str,
     *,
     input: str,
-    outputs: Sequence[str],
+    outputs: SignalNames,
     event: str,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Recording:
     """What a poor laboratory would have recorded.
 
@@ -141,11 +144,15 @@ def mishandle(
     - `input`, two or more `outputs`: names of signals. `event`: of one that comes once in each
       cycle. `seed`: of what happens at random.
 
-    **Raises:** `DefinitionError` for an unknown mishap, and where the result is no recording: a
+    **Raises:** `DefinitionError` for an unknown mishap or signal, and where the result is no recording: a
     clock that runs backwards.
     """
     known = MISHAPS | EVENT_MISHAPS
     if mishap not in known:
-        raise DefinitionError(f"there is no mishap '{mishap}'; there are {', '.join(known)}.")
-    names = Names(input, tuple(outputs), event)
+        raise DefinitionError(
+            f"there is no mishap '{mishap}': see `hj.testing.MISHAPS` and `EVENT_MISHAPS`."
+        )
+    for name in (input, *outputs):
+        recording.column(name)
+    names = Names(input, outputs, event)
     return known[mishap](recording, names, np.random.default_rng(seed))

@@ -40,7 +40,7 @@ def in_signals(
     columns = [recording.column(name) for name in names]
 
     def changed(trial: Trial) -> Trial:
-        values = trial.values.copy()
+        values = np.array(trial.values)
         for k in columns:
             values[:, k] = change(trial, values[:, k])
         return with_samples(trial, trial.time, values)

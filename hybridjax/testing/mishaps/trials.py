@@ -37,7 +37,7 @@ def swapped_columns(recording: Recording, names: Names, rng: np.random.Generator
     i, j = (recording.column(name) for name in names.outputs[:2])
 
     def swap(trial: Trial) -> Trial:
-        values = trial.values.copy()
+        values = np.array(trial.values)
         values[:, [i, j]] = values[:, [j, i]]
         return with_samples(trial, trial.time, values)
 
