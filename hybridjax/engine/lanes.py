@@ -5,8 +5,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, cond, lane, namespace, on_host
 from ..systems.structure import Structure
 
 
@@ -39,7 +40,7 @@ def for_each_chart(
         def present(out, a=a, here=here):
             return work(a, here, out)
 
-        out = jax.lax.cond(here.any(), present, lambda out: out, out)
+        out = cond(here.any(), present, lambda out: out, out)
     return out
 
 
@@ -51,8 +52,8 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     """
     if x.shape[-1] < mask.shape[0]:
         return x
-    one = jax.lax.dynamic_slice_in_dim(x, jnp.argmax(mask), 1, axis=-1)
-    return jnp.where(mask, x, one)
+    xp = namespace(x)
+    return xp.where(mask, x, lane(x, xp.argmax(mask)))
 
 
 def needed(mask: Bool[Array, " L"], tree):
@@ -62,6 +63,8 @@ def needed(mask: Bool[Array, " L"], tree):
     zero cotangents. At another chart's states these may meet infinite derivatives, and zero times
     infinity is NaN: it must not reach states or parameters.
     """
+    if on_host(mask):
+        return tree
     some = mask.any()
 
     def cut(x):

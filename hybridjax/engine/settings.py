@@ -3,9 +3,10 @@
 import functools as ft
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from .._core.executor import Array, as_numbers, namespace
 from .._core.precision import at_precision
 from ..errors import DefinitionError
 from .solver.step import Step
@@ -41,12 +42,10 @@ ROUNDING = 4e-15, 2e-6
 _TIMES_ROUNDING = 10.0
 
 
-def _number(x) -> Array:
-    return jnp.asarray(x, float)
-
-
 def _numbers(x) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
+    if x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64):
+        return x  # the host's
+    return as_numbers(x)
 
 
 class Settings(eqx.Module):
@@ -56,9 +55,9 @@ class Settings(eqx.Module):
     `rtol * |q[k]| + atol * scale[a, k]`.
     """
 
-    rtol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    rtol: Float[Array, ""] = eqx.field(converter=_numbers, default=SIMULATION)
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""] = eqx.field(converter=_number, default=SIMULATION)
+    atol: Float[Array, ""] = eqx.field(converter=_numbers, default=SIMULATION)
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True, default=256)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
@@ -74,7 +73,8 @@ class Settings(eqx.Module):
         is small, those that the states usually have, which must be known."""
         if self.scale is None:
             raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
-        own = ft.reduce(jnp.maximum, map(jnp.abs, q))
+        xp = namespace(q[0])
+        own = ft.reduce(xp.maximum, map(xp.abs, q))
         usual = self.scale[a, : len(own)].reshape(len(own), -1)
         return own + self.atol / self.rtol * usual
 
@@ -94,8 +94,9 @@ class Settings(eqx.Module):
         """
         if self.scale is not None:
             return self.rtol * self.size(a, q, step.q)
-        own = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
-        change = jnp.abs(tau) * jnp.maximum(jnp.abs(step.f0), jnp.abs(step.f1))
-        rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * jnp.abs(tau) * rounding
-        tolerance = self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
-        return jnp.maximum(tolerance, jnp.finfo(own.dtype).tiny)  # where all is at rest at zero
+        xp = namespace(q)
+        own = xp.maximum(xp.abs(q), xp.abs(step.q))
+        change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
+        rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * xp.abs(tau) * rounding
+        tolerance = self.rtol * own + self.atol * xp.maximum(own, change) + rounding
+        return xp.maximum(tolerance, xp.finfo(own.dtype).tiny)  # where all is at rest at zero

@@ -9,7 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first
+from .._core.executor import namespace
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -24,7 +25,7 @@ from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .cycle import LimitCycle
 from .guess import begin, check_beginning, check_section, guessed_lane
-from .newton import Solution, solve
+from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
 
@@ -38,8 +39,6 @@ _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
-# Steps of Levenberg and Marquardt before a cycle is given up.
-_DAMPED_STEPS = 64
 # The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
 # monodromy up to this part of it. Doubled, half as much loss is noticed.
 _CONSERVED = 1e-6
@@ -133,7 +132,7 @@ def find_limit_cycle(
         multiplicity = 1 if multiplicity is None else multiplicity
         lane, period = guessed_lane(system, guess), system.period()
         near = sizes_near(
-            system, int(lane.chart[0]), lane.t[0], lane.q[:, 0],
+            system, int(lane.chart[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
@@ -145,7 +144,7 @@ def find_limit_cycle(
     conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
     map = dataclasses.replace(map, conserved=conserved)
     if traced:
-        return _cycle(map, solve(map, False, True), guess.event_sequence)
+        return _cycle(map, solve(map, True), guess.event_sequence)
     _check_values(system, map.anchor, conserved)
     map, solution = _in_own_sizes(map, _solve(map), given)
     codes = np.ravel(solution.turn.codes)
@@ -179,7 +178,7 @@ def _solve(map: ReturnMap) -> Solution:
         solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
     if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
-        second = solve(map, True, False, _DAMPED_STEPS)
+        second = solve_damped(map)
         solution = second if int(second.result) == Result.OK else solution
     return solution
 
@@ -285,13 +284,13 @@ def _check_clock(cycle: LimitCycle) -> None:
         )
 
 
-@quick_jit
+@host_first
 def _at_anchor(cycle: LimitCycle):
     """The field at the anchor (d,) and one period later, the guards there (G,) and their rates."""
-    s, anchor = Structure(cycle.system), cycle.anchor
-    u, later = jnp.zeros((s.nu, 1)), anchor.t + cycle.period
+    s, anchor, xp = Structure(cycle.system), cycle.anchor, namespace(cycle.period)
+    u, later = xp.zeros((s.nu, 1)), anchor.t + cycle.period
     f = [slopes(s, t, anchor.chart, anchor.q, u)[:, 0] for t in (anchor.t, later)]
-    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), jnp.ones(1, bool))
+    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
     return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
 
 

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
+from .._core.executor import Array, Definition
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
 from ..systems.structure import Structure as Structure
@@ -51,7 +52,7 @@ class BoundSections(eqx.Module):
         return cls(never, jnp.full(n_sections, -1, jnp.int32), levels)
 
 
-class AbstractSections(eqx.Module):
+class AbstractSections(Definition):
     """A family of N Poincaré sections, in the order in which a limit cycle meets them.
 
     A family is a definition: it holds functions and numbers, and belongs to no cycle.

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.executor import Definition, as_numbers
 from ..errors import DefinitionError
 from ..systems.output import Output
 from ..systems.structure import Structure
@@ -18,10 +19,10 @@ Direction = Literal["falling", "rising"]
 
 def number(x: ArrayLike) -> Array:
     """`x` as a floating-point array, so that families can be differentiated in their numbers."""
-    return jnp.asarray(x, float)
+    return as_numbers(x)
 
 
-class Crossing(eqx.Module):
+class Crossing(Definition):
     """A section: the level set `function = value`, crossed in a stated direction.
 
     In a recording (`hj.recordings.estimate_phase`) it is the beginning of each cycle.

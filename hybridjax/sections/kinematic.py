@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.executor import as_numbers
 from ..engine.target import AbstractLevels
 from ..systems.structure import Structure
 from .abstract import (
@@ -23,7 +24,7 @@ from .crossing import Crossing
 
 
 def _pair(x: ArrayLike | Sequence[ArrayLike] | None) -> Array | None:
-    return None if x is None else jnp.asarray(x, float)
+    return None if x is None else as_numbers(x)
 
 
 class KinematicPhase(AbstractSections):

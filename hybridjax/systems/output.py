@@ -5,8 +5,10 @@ from typing import Any
 
 import equinox as eqx
 
+from .._core.executor import Definition
 
-class Output(eqx.Module):
+
+class Output(Definition):
     """A named scalar output z = h(t, q, u).
 
     **Fields:**

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from .._core.compilation.kernel import kernel
 from .._core.lanes.per_lane import PerLane, by_lane, shared
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
@@ -67,6 +68,16 @@ class Structure:
         return by_lane(
             lambda system, *rest: function(Structure(system), *rest), self.source, *trees
         )
+
+    def kernel(self, function: Callable, *static: Hashable, trees: tuple = ()) -> Callable:
+        """`function(*static, system, *trees, *arguments)` for arrays of the host, compiled (see
+        `_core/compilation/kernel.py`)."""
+        name = function, static
+        known = self._made.get(name)
+        if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
+            known = kernel(function, static, (self.source, *trees)), trees
+            self._made[name] = known
+        return known[0]
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:
@@ -214,7 +225,6 @@ def check_system(system: Any) -> None:
     if not system.charts():
         raise DefinitionError(f"{type(system).__name__} has no charts.")
     s = Structure(system)
-    t, u = jnp.zeros(()), jnp.zeros(s.nu)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         for unknown in set(chart.inputs or ()) - set(system.inputs):
             raise DefinitionError(
@@ -223,7 +233,7 @@ def check_system(system: Any) -> None:
             )
         if len(set(chart.states)) < len(chart.states):
             raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
-        shape = _shape(f"field of chart '{name}'", lambda q, a=a: s.field(a, t, q, u), s.dims[a])
+        shape = _shape(f"field of chart '{name}'", lambda t, q, u, a=a: s.field(a, t, q, u), s, a)
         if shape != (s.dims[a],):
             raise DefinitionError(
                 f"the field of chart '{name}' returns shape {shape}, but the chart has the "
@@ -239,10 +249,10 @@ def check_system(system: Any) -> None:
         a, b = s.chart_index(tr.source), s.chart_index(tr.target)
         label = f"transition '{tr.name}' ({tr.source} -> {tr.target})"
         if not isinstance(tr.guard, Scheduled):
-            shape = _shape(f"guard of {label}", lambda q, g=g: s.guard(g, t, q, u), s.dims[a])
+            shape = _shape(f"guard of {label}", lambda t, q, u, g=g: s.guard(g, t, q, u), s, a)
             if shape != ():
                 raise DefinitionError(f"the guard of {label} returns shape {shape}, not a number.")
-        shape = _shape(f"reset of {label}", lambda q, g=g: s.reset(g, t, q, u), s.dims[a])
+        shape = _shape(f"reset of {label}", lambda t, q, u, g=g: s.reset(g, t, q, u), s, a)
         if shape != (s.dims[b],):
             raise DefinitionError(
                 f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
@@ -250,9 +260,12 @@ def check_system(system: Any) -> None:
             )
 
 
-def _shape(what: str, function: Callable, n: int) -> tuple[int, ...]:
+def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:
+    shapes = (), (s.dims[a],), (s.nu,)
     try:
-        return jax.eval_shape(function, jax.ShapeDtypeStruct((n,), jnp.result_type(float))).shape
+        return jax.eval_shape(
+            function, *(jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes)
+        ).shape
     except DefinitionError:
         raise
     except Exception as error:

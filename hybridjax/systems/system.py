@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.executor import Definition, as_numbers
 from .chart import Chart
 from .output import Output
 from .transition import Transition
@@ -28,18 +28,18 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     """
     metadata = {"doc": doc, "unit": unit}
     options = {} if default is None else {"default": default}
-    return eqx.field(converter=lambda x: jnp.asarray(x, float), metadata=metadata, **options)
+    return eqx.field(converter=as_numbers, metadata=metadata, **options)
 
 
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    time: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    state: Float[Array, " n"] = eqx.field(converter=as_numbers)
+    time: Float[Array, ""] = eqx.field(converter=as_numbers, default=0.0)
 
 
-class HybridSystem(eqx.Module):
+class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
     ```python

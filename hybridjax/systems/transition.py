@@ -4,10 +4,11 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from .._core.executor import Array, as_numbers, namespace
+from .._core.tracing import is_traced
 from ..errors import DefinitionError
 
 
@@ -17,14 +18,19 @@ Direction = Literal["falling", "rising"]
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
 
-    period: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    offset: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float), default=0.0)
+    period: Float[Array, ""] = eqx.field(converter=as_numbers)
+    offset: Float[Array, ""] = eqx.field(converter=as_numbers, default=0.0)
 
     def __check_init__(self):
-        if not isinstance(self.period, jax.core.Tracer) and not 0 < self.period < jnp.inf:
+        if not is_traced(self.period) and not 0 < float(self.period) < np.inf:
             raise DefinitionError(
                 f"the period of a schedule must be positive and finite; it is {self.period}."
             )
+
+    def numbers(self, t: Array) -> tuple[Array, Array]:
+        """`offset` and `period`, as arrays of the kind of t."""
+        xp = namespace(t)
+        return xp.asarray(self.offset), xp.asarray(self.period)
 
 
 def _identity(t, q, u):
