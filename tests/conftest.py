@@ -1,11 +1,14 @@
+import contextlib
 import pathlib
 
 import hypothesis
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compilation import compile
 
 
 hj.enable_x64()
@@ -20,6 +23,21 @@ KINEMATIC = hj.KinematicPhase(
     32, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
 OUTPUTS = ("yM", "vM")
+
+
+@contextlib.contextmanager
+def unchecked_host():
+    """On the host, checks of types take ten times as long as what they check. The same code is
+    checked where JAX traces it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+compile.at_ease = unchecked_host
 
 
 class no_compilation:

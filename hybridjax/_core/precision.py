@@ -44,7 +44,7 @@ def require_x64(*trees: Any) -> None:
 
 def at_precision(double: float, single: float) -> float:
     """A threshold that is a matter of rounding, for the precision that JAX computes in."""
-    return single if jnp.result_type(float) == jnp.float32 else double
+    return double if jax.config.read("jax_enable_x64") else single
 
 
 def single_precision() -> contextlib.AbstractContextManager:

@@ -1,7 +1,5 @@
 """What happens at events: resets, arming, schedules, and the signs of Zeno."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +65,7 @@ def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> La
     """
     zero = width(lanes.t, span, seen.rate)
     armed = (lanes.armed & (seen.value >= -zero)[:-1]) | (seen.value > zero)[:-1]
-    return dataclasses.replace(lanes, armed=armed & mine(s, lanes.chart)[:-1])
+    return lanes._replace(armed=armed & mine(s, lanes.chart)[:-1])
 
 
 def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
@@ -99,7 +97,7 @@ def rearm(
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     due = together & other & (xp.abs(value) <= zero) & (rate < 0)
     armed = ((value > zero) | due) & mine(s, lanes.chart)[:-1]
-    return dataclasses.replace(lanes, armed=xp.where(fired >= 0, armed, lanes.armed))
+    return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
 def _noise(

@@ -48,7 +48,7 @@ def flow_jacobian(
     jacobian, end = tape_jacobian(s, lanes, target, tape, of_states, wanted)
     if wanted is not True:
         end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
-    ends = dataclasses.replace(moved.lanes, t=end[0], q=end[1:])
+    ends = moved.lanes._replace(t=end[0], q=end[1:])
     moved = moved._replace(lanes=ends)
     return jacobian, moved, tape
 

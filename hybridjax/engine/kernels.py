@@ -16,6 +16,11 @@ from .solver.step import Step, rk_step
 from .target import AbstractLevels
 
 
+# Lanes of functions that are called for single points (in landings) as well as for all moves of a
+# tape, and of one that is called for hundreds of points. Twice as many: hardly a difference.
+_POINTS, _MANY_POINTS = 4, 16
+
+
 def field(
     s: Structure,
     a: int,
@@ -24,7 +29,7 @@ def field(
     u: Float[np.ndarray, "nu #L"],
 ) -> Float[np.ndarray, "n c L"]:
     """The field of chart a, and its derivatives."""
-    return s.kernel(_field, a)(t, q, u)
+    return s.kernel(_field, a, lanes=_POINTS)(t, q, u)
 
 
 def step(
@@ -83,7 +88,7 @@ def outputs(
     u: Float[np.ndarray, "nu #L"],
 ) -> Float[np.ndarray, "ny c L"]:
     """Outputs in chart a, and their derivatives."""
-    return s.kernel(_outputs, a, trees=(items,))(t, q, u)
+    return s.kernel(_outputs, a, trees=(items,), lanes=_POINTS)(t, q, u)
 
 
 def levels(
@@ -95,7 +100,7 @@ def levels(
     q: Float[np.ndarray, "n L"],
 ) -> Float[np.ndarray, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    return s.kernel(_levels, a, n_sections, trees=(levels,))(t, q)
+    return s.kernel(_levels, a, n_sections, trees=(levels,), lanes=_MANY_POINTS)(t, q)
 
 
 def _field(a: int, system: HybridSystem, t, q, u):

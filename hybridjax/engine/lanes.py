@@ -1,6 +1,7 @@
 """Lanes: the hybrid states of many trajectories that move side by side."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ from .._core.executor import Array, cond, lane, namespace, on_host
 from ..systems.structure import Structure
 
 
-class Lanes(eqx.Module):
+class Lanes(NamedTuple):
     """L hybrid states. States are padded with zeros to the largest chart's dimension d."""
 
     t: Float[Array, " L"]
@@ -50,7 +51,7 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     A chart's functions are thus never evaluated at another chart's states, where they might be
     undefined; NaN there would poison reverse-mode derivatives even if it is masked afterwards.
     """
-    if x.shape[-1] < mask.shape[0]:
+    if x.shape[-1] < mask.shape[0] or (on_host(mask) and mask.all()):
         return x
     xp = namespace(x)
     return xp.where(mask, x, lane(x, xp.argmax(mask)))

@@ -68,35 +68,37 @@ class Settings(eqx.Module):
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
 
-    def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
-        """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`
-        is small, those that the states usually have, which must be known."""
-        if self.scale is None:
-            raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
-        xp = namespace(q[0])
-        own = ft.reduce(xp.maximum, map(xp.abs, q))
-        usual = self.scale[a, : len(own)].reshape(len(own), -1)
-        return own + self.atol / self.rtol * usual
 
-    def tolerance(
-        self,
-        a: int,
-        q: Float[Array, "n L"],
-        tau: Float[Array, " #L"],
-        step: Step,
-        rounding: Float[Array, "n L"],
-    ) -> Float[Array, "n L"]:
-        """The error that a step over tau from states `q` of chart a may have.
+def size(settings: Settings, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
+    """Sizes of states of chart a against which errors are judged: those of `q`, and where `q` is
+    small, those that the states usually have, which must be known."""
+    if settings.scale is None:
+        raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
+    xp = namespace(q[0])
+    own = ft.reduce(xp.maximum, map(xp.abs, q))
+    usual = settings.scale[a, : len(own)].reshape(len(own), -1)
+    return own + settings.atol / settings.rtol * usual
 
-        Where the usual sizes are not known, a state is taken to be as large as it is at the ends
-        of the step, or as it would become at the rates there if that is more. Rounding errors are
-        allowed: its own, and the `rounding` errors of its rate.
-        """
-        if self.scale is not None:
-            return self.rtol * self.size(a, q, step.q)
-        xp = namespace(q)
-        own = xp.maximum(xp.abs(q), xp.abs(step.q))
-        change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
-        rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * xp.abs(tau) * rounding
-        tolerance = self.rtol * own + self.atol * xp.maximum(own, change) + rounding
-        return xp.maximum(tolerance, xp.finfo(own.dtype).tiny)  # where all is at rest at zero
+
+def tolerance(
+    settings: Settings,
+    a: int,
+    q: Float[Array, "n L"],
+    tau: Float[Array, " #L"],
+    step: Step,
+    rounding: Float[Array, "n L"],
+) -> Float[Array, "n L"]:
+    """The error that a step over tau from states `q` of chart a may have.
+
+    Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
+    step, or as it would become at the rates there if that is more. Rounding errors are allowed: its
+    own, and the `rounding` errors of its rate.
+    """
+    if settings.scale is not None:
+        return settings.rtol * size(settings, a, q, step.q)
+    xp = namespace(q)
+    own = xp.maximum(xp.abs(q), xp.abs(step.q))
+    change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
+    rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * xp.abs(tau) * rounding
+    found = settings.rtol * own + settings.atol * xp.maximum(own, change) + rounding
+    return xp.maximum(found, xp.finfo(own.dtype).tiny)  # where all is at rest at zero

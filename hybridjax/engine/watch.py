@@ -89,7 +89,7 @@ class ChartFlow(NamedTuple):
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, self.target.index)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
-        level = len(self.rows) > len(guards)
+        level = levels is not None and shared(levels).present(self.s, a)
 
         def one(s, levels, t, q, u, i, f):
             def all_of_them(t, q):
@@ -135,7 +135,9 @@ def chart_flow(
 ) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
     index = only(here, target.index)
-    return ChartFlow(s, a, only(here, u), dataclasses.replace(target, index=index))
+    if index is not target.index:
+        target = dataclasses.replace(target, index=index)
+    return ChartFlow(s, a, only(here, u), target)
 
 
 def slopes(
@@ -143,7 +145,7 @@ def slopes(
     t: Float[Array, " L"],
     chart: Int[Array, " L"],
     q: Float[Array, "d L"],
-    u: Float[Array, "nu L"],
+    u: Float[Array, "nu #L"],
 ) -> Float[Array, "d L"]:
     """The field at every lane."""
 

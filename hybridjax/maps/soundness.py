@@ -3,6 +3,7 @@ order."""
 
 import numpy as np
 
+from .._core.compilation.compile import at_ease
 from .._core.executor import to_host
 from .._core.results import Result
 from ..engine import kernels
@@ -99,7 +100,7 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     steepness = np.ones(placed.n_sections)
     if placed.bound.levels is None:
         return counts, steepness
-    with np.errstate(all="ignore"):
+    with at_ease():
         more, fastest, rate = _levels_along(to_host(placed))
     state_based = np.isinf(np.asarray(placed.bound.time)) & (event < 0)
     counts = np.where(state_based, 1 + more, counts)

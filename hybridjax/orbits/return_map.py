@@ -153,7 +153,7 @@ class ReturnMap(eqx.Module):
         lanes = arm(s, lanes, seen, self.expected[None])
         if isinstance(self.base, AtEvent):
             own = np.arange(len(s.transitions))[:, None] == s.transition_index(self.base.name)
-            lanes = dataclasses.replace(lanes, armed=lanes.armed & ~own)
+            lanes = lanes._replace(armed=lanes.armed & ~own)
         return lanes
 
     def turn(self, q: Float[Array, " d"]) -> Return:

@@ -47,6 +47,10 @@ class Structure:
         self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
         self.d = max(self.dims)
         self.nu = len(system.inputs)
+        out = [[g for g, tr in enumerate(self.transitions) if tr.source == n] for n in self.names]
+        by_clock = [isinstance(tr.guard, Scheduled) for tr in self.transitions]
+        self._guards = [[g for g in own if not by_clock[g]] for own in out]
+        self._schedules = [[g for g in own if by_clock[g]] for own in out]
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
@@ -69,13 +73,15 @@ class Structure:
             lambda system, *rest: function(Structure(system), *rest), self.source, *trees
         )
 
-    def kernel(self, function: Callable, *static: Hashable, trees: tuple = ()) -> Callable:
+    def kernel(
+        self, function: Callable, *static: Hashable, trees: tuple = (), lanes: int = 1
+    ) -> Callable:
         """`function(*static, system, *trees, *arguments)` for arrays of the host, compiled (see
         `_core/compilation/kernel.py`)."""
         name = function, static
         known = self._made.get(name)
         if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
-            known = kernel(function, static, (self.source, *trees)), trees
+            known = kernel(function, static, (self.source, *trees), lanes), trees
             self._made[name] = known
         return known[0]
 
@@ -104,14 +110,11 @@ class Structure:
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a."""
-        return [g for g, tr in self._out(a) if not isinstance(tr.guard, Scheduled)]
+        return self._guards[a]
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
-        return [g for g, tr in self._out(a) if isinstance(tr.guard, Scheduled)]
-
-    def _out(self, a: int):
-        return [(g, tr) for g, tr in enumerate(self.transitions) if tr.source == self.names[a]]
+        return self._schedules[a]
 
     def guard(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""

@@ -9,61 +9,63 @@ import functools as ft
 from collections.abc import Callable, Hashable
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from .compile import compiler_options
 
 
-# Lanes of one call: more are done in several calls, fewer are filled up, so that one program serves
-# all. Twice as many: linearizing a tape takes half as many calls, and each of them somewhat longer.
-_LANES = 4
 # Programs that are kept. Twice as many: twice as many systems can be taken turns with.
 _KEPT = 1024
 
 
-def kernel(function: Callable, static: tuple[Hashable, ...], trees: Any) -> Callable:
+def kernel(function: Callable, static: tuple[Hashable, ...], trees: Any, lanes: int) -> Callable:
     """`function(*static, *trees, *arguments)`, compiled, as a function of NumPy's arrays.
 
     `function` belongs to a module, so that it is the same whenever it is asked for. Arguments and
     results have lanes on their last axis; an argument may have one lane where others have more.
+
+    The program is for this number of `lanes`: more are done in several calls, fewer are filled up,
+    so that it serves all. (XLA runs the smallest programs, of a thousand operations, in the thread
+    that calls them, and hands others to another one, which takes longer than they do.)
     """
-    arrays, rest = eqx.partition(trees, _is_array)
-    leaves, structure = jax.tree_util.tree_flatten(rest)
-    kinds = tuple(map(type, leaves))  # 1, 1.0 and True are equal, and not the same
-    program = _program(function, static, structure, tuple(leaves), kinds)
-    arrays = jax.device_put(arrays)
+    leaves, structure = jax.tree_util.tree_flatten(trees)
+    arrays = jax.device_put([x for x in leaves if _is_array(x)])
+    # (1, 1.0 and True are equal, and not the same.)
+    rest = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
+    program = _program(function, static, structure, rest)
 
     def call(*arguments):
-        lanes = max(x.shape[-1] for x in arguments)
-        filled = -(-lanes // _LANES) * _LANES
-        arguments = [_fill(x, lanes, filled) for x in arguments]
-        if filled == _LANES:
-            return np.asarray(program(arrays, *arguments))[..., :lanes]
-        blocks = [slice(k, k + _LANES) for k in range(0, filled, _LANES)]
+        L = max(x.shape[-1] for x in arguments)
+        if L == lanes == 1:
+            return np.asarray(program(arrays, *arguments))
+        filled = -(-L // lanes) * lanes
+        arguments = [_fill(x, L, filled) for x in arguments]
+        blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
         parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
-        return np.concatenate(parts, axis=-1)[..., :lanes]
+        return np.concatenate(parts, axis=-1)[..., :L]
 
     return call
 
 
 @ft.lru_cache(_KEPT)
-def _program(function, static, structure, leaves, kinds):
+def _program(function, static, structure, rest):
     def run(arrays, *arguments):
-        rest = jax.tree_util.tree_unflatten(structure, leaves)
-        return function(*static, *eqx.combine(arrays, rest), *arguments)
+        arrays = iter(arrays)
+        leaves = [next(arrays) if x is None else x[1] for x in rest]
+        trees = jax.tree_util.tree_unflatten(structure, leaves)
+        return function(*static, *trees, *arguments)
 
     return jax.jit(run, compiler_options=compiler_options())
 
 
-def _fill(x: np.ndarray, lanes: int, filled: int) -> np.ndarray:
-    """x with so many lanes, those beyond its own copies of its first."""
+def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
+    """x with so many lanes, those beyond L copies of its first."""
     if x.shape[-1] == 1:
         return np.repeat(x, filled, axis=-1)
-    if filled == lanes:
+    if filled == L:
         return x
-    return np.concatenate([x, np.repeat(x[..., :1], filled - lanes, axis=-1)], axis=-1)
+    return np.concatenate([x, np.repeat(x[..., :1], filled - L, axis=-1)], axis=-1)
 
 
 def _is_array(x: Any) -> bool:

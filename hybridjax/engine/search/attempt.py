@@ -11,6 +11,7 @@ from ...systems.structure import Structure
 from ..events import width
 from ..hermite import NEAR, control_points, root_near_end
 from ..lanes import for_each_chart, only
+from ..settings import size, tolerance
 from ..solver.step import Step, rounding_error
 from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 from .aim import Aim
@@ -116,10 +117,10 @@ def attempt(
                 lambda: rounding_error(flow.field, t + tau, step.q, step.f1),
                 lambda: xp.zeros_like(q),
             )
-        tolerance = task.settings.tolerance(a, q, tau, step, rounding)
-        error = xp.max(xp.abs(step.error) / tolerance, axis=0, initial=0.0)
+        allowed = tolerance(task.settings, a, q, tau, step, rounding)
+        error = xp.max(xp.abs(step.error) / allowed, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * task.settings.size(a, q, step.q)
+            aside = _ASIDE * size(task.settings, a, q, step.q)
             direction = np.cos(1.0 + np.arange(n))[:, None]
             near = cond(
                 some & tangents,
@@ -141,7 +142,7 @@ def attempt(
         if not in_step:
             home = cond(
                 (which >= 0).any(),
-                lambda: _go_home(flow, before, which, step, tolerance, t, tau, aim.reach, task),
+                lambda: _go_home(flow, before, which, step, allowed, t, tau, aim.reach, task),
                 lambda: home,
             )
             moved = tau + xp.where(home.lands, home.past, 0.0)
@@ -151,9 +152,9 @@ def attempt(
         middle = 0.5 * (q + home.q) + 0.125 * moved * (step.f0 - home.f)
         true = flow.watch(t + 0.5 * moved, middle, home.f).value
         cubic = 0.5 * (ends[0] + ends[1]) + 0.125 * (ends[2] - ends[3])
-        size = xp.abs(ends[0]) + xp.abs(ends[1]) + xp.abs(true)
+        around = xp.abs(ends[0]) + xp.abs(ends[1]) + xp.abs(true)
         fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
-        bent = xp.abs(true - cubic) > _BEND * size + width(t, task.span, fastest)
+        bent = xp.abs(true - cubic) > _BEND * around + width(t, task.span, fastest)
         bent = bent.any(axis=0)
 
         points = control_points(*ends)
@@ -185,7 +186,7 @@ def _go_home(
     before: Watch,
     which: Int[Array, " L"],
     step: Step,
-    tolerance: Float[Array, "n #L"],
+    allowed: Float[Array, "n #L"],
     t: Float[Array, " L"],
     tau: Float[Array, " L"],
     reach: Float[Array, " L"],
@@ -201,7 +202,7 @@ def _go_home(
     first = xp.where(near, first, 0.0)
     end = flow.settle(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(reach > 0, reach, 1.0)
-    rough = xp.max(end.error / tolerance * xp.where(share > 0, share, 0.0) ** 2, axis=0)
+    rough = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
     rounding = at_precision(*_LAST_CORRECTION_OF_SPAN) * task.span
     fine = xp.abs(end.last) <= _LAST_CORRECTION * xp.abs(tau + end.past) + rounding
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(rough) <= 1.0)

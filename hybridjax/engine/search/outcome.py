@@ -4,8 +4,6 @@ As long as no watched function comes near to a zero in any lane, little has to b
 otherwise `eventfully` finds out what happened.
 """
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -219,7 +217,7 @@ def _reset(
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
-        new = dataclasses.replace(lanes, q=q, chart=chart)
+        new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(_of(seen.value, fired))
         new = rearm(s, new, after, fired, together, task.span, task.u, residue)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from ..._core.executor import Array, namespace
 from ...systems.structure import Structure
 from ..lanes import Lanes, for_each_chart, only
-from ..settings import Settings
+from ..settings import Settings, size
 from ..watch import chart_field
 
 
@@ -52,7 +52,7 @@ def initial_step(
         q = only(here, lanes.q[: s.dims[a]])
         f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
         known = settings.scale is not None
-        rates = xp.abs(f) / (settings.size(a, q) if known else xp.abs(q))
+        rates = xp.abs(f) / (size(settings, a, q) if known else xp.abs(q))
         rate = xp.max(xp.where(xp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
         time = xp.where(rate > 0, 1 / rate, xp.inf)
         part = _FIRST_STEP * (settings.rtol / _FIRST_RTOL) ** (1 / 7)
