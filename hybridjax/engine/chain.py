@@ -140,27 +140,24 @@ def _step(s: Structure, a: int, t, q, u, h):
     the start, and the field (n, M) at the end."""
     n, M = q.shape
     m = 2 + n + s.nu
-    stages, slopes = [], []
+    stages = len(VERNER76.b_sol) + 1
+    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
     rows = [np.zeros(0), *VERNER76.a_lower, VERNER76.b_sol]
-    for row, c in zip(rows, [0.0, *VERNER76.c, 1.0], strict=True):
-        slope, dslope = np.zeros((n, M)), np.zeros((M, n, m))
-        for weight, k, dk in zip(row, stages, slopes, strict=False):
-            if weight:
-                slope += weight * k
-                dslope += weight * dk
+    for i, (row, c) in enumerate(zip(rows, [0.0, *VERNER76.c, 1.0], strict=True)):
+        slope = (row @ K.reshape(stages, -1)[:i]).reshape(n, M)
+        dslope = (row @ dK.reshape(stages, -1)[:i]).reshape(M, n, m)
         state, dstate = q + h * slope, straight + h[:, None, None] * dslope
         dstate[:, :, -1] += slope.T
         expanded = kernels.field(s, a, t + c * h, state, u)
         by_t, by_q, by_u = _split(np.moveaxis(expanded, -1, 0), n)
-        dk = by_q @ dstate
-        dk[:, :, 0] += by_t[:, :, 0]
-        dk[:, :, 1 + n : -1] += by_u
-        dk[:, :, -1] += c * by_t[:, :, 0]
-        stages.append(expanded[:, 0])
-        slopes.append(dk)
-    return state, dstate, stages[-1]
+        dK[i] = by_q @ dstate
+        dK[i, :, :, 0] += by_t[:, :, 0]
+        dK[i, :, :, 1 + n : -1] += by_u
+        dK[i, :, :, -1] += c * by_t[:, :, 0]
+        K[i] = expanded[:, 0]
+    return state, dstate, K[-1]
 
 
 def _split(expanded, n: int):

@@ -54,7 +54,7 @@ def watched(
     index: Int[np.ndarray, " #L"],
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index)
+    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32))
 
 
 def reset(

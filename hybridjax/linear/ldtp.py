@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.arguments import Numbers, names, real_array, require_finite
+from .._core.executor import from_host
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.tracing import is_traced
@@ -350,7 +351,7 @@ def _dimensions(dims, n_sections, d):
         dims = np.asarray(dims)
         if np.any((dims < 1) | (dims > d)):
             raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
-    return jnp.asarray(dims)
+    return from_host(dims)
 
 
 def _check_padding(ldtp):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.compilation.compile import host_first
-from .._core.executor import Array, namespace, on_host
+from .._core.executor import Array, namespace, on_host, to_host
 from .._core.lanes.per_lane import by_lane
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -61,7 +61,7 @@ def linearize(
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
         inputs=names, outputs=z.names,
-        coordinates=None if traced else placed.coordinates(),
+        coordinates=None if traced else to_host(placed).coordinates(),
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Where the sections of a family lie on a limit cycle."""
 
+import collections
 import dataclasses
 from typing import NamedTuple
 
@@ -41,6 +42,10 @@ _LONGEST_WAY = 1.5
 # is on it. Doubled: so is one twice as far.
 _SAME_PHASE = 1e-9
 
+# Sections that were placed last, since the same family on the same cycle is asked for again and
+# again (by `linearize`, then by `run_experiments`). Twice as many: twice the memory.
+_recent: collections.deque[PlacedSections] = collections.deque(maxlen=4)
+
 
 def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     """Find a family's sections on a cycle, and check them.
@@ -53,10 +58,16 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     tangentially, or meets out of order.
     """
     family = as_family(sections)
+    for known in list(_recent):
+        if known.cycle is cycle and known.family is family:
+            return known
     family.check(Structure(cycle.system))
     placed, first = _place(cycle, family)
     if not is_traced((cycle, family)):
         refuse_unsound(placed, int(first))
+        # The program has made copies of what it was given.
+        placed = dataclasses.replace(placed, cycle=cycle, family=family)
+        _recent.append(placed)
     return placed
 
 

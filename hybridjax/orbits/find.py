@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.compilation.compile import host_first
-from .._core.executor import namespace
+from .._core.executor import as_numbers, namespace
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -132,7 +132,7 @@ def find_limit_cycle(
         multiplicity = 1 if multiplicity is None else multiplicity
         lane, period = guessed_lane(system, guess), system.period()
         near = sizes_near(
-            system, int(lane.chart[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
+            system, int(np.asarray(lane.chart)[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
@@ -197,7 +197,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     )
     if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
         size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
-        distance = jnp.asarray(np.max(np.abs(solution.turn.residual) / size))
+        distance = as_numbers(np.max(np.abs(solution.turn.residual) / size))
         return own, solution._replace(turn=solution.turn._replace(distance=distance))
     again = solve(own)
     if int(again.result) not in (Result.OK, Result.SINGULAR):
@@ -266,7 +266,7 @@ def _check_conserved(cycle: LimitCycle) -> None:
 def _check_clock(cycle: LimitCycle) -> None:
     """Raise where the cycle of a clocked system is not what it seems to be."""
     s, system = Structure(cycle.system), cycle.system
-    a, t = int(cycle.anchor.chart[0]), float(cycle.anchor.t[0])
+    a, t = int(cycle.anchor.chart[0]), float(np.asarray(cycle.anchor.t)[0])
     f, later, guards, rates = jax.device_get(_at_anchor(cycle))
     f, later = f[: s.dims[a]], later[: s.dims[a]]
     slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)

@@ -41,6 +41,8 @@ def kernel(function: Callable, static: tuple[Hashable, ...], trees: Any, lanes: 
             return np.asarray(program(arrays, *arguments))
         filled = -(-L // lanes) * lanes
         arguments = [_fill(x, L, filled) for x in arguments]
+        if filled == lanes:
+            return np.asarray(program(arrays, *arguments))[..., :L]
         blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
         parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
         return np.concatenate(parts, axis=-1)[..., :L]
