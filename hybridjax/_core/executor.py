@@ -8,7 +8,7 @@ arrays themselves: functions come from their `namespace`, and those below do for
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -16,8 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 
-Array = jax.Array | np.ndarray | np.generic
-"""An array of either executor."""
+if TYPE_CHECKING:
+    Array = jax.Array  # what users get
+else:
+    Array = jax.Array | np.ndarray | np.generic
+    """An array of either executor."""
 
 
 class Definition(eqx.Module):
