@@ -7,7 +7,10 @@ for a few lanes that is the quicker way to a first answer. Nothing switches betw
 arrays themselves: functions come from their `namespace`, and those below do for both what differs.
 """
 
-from collections.abc import Callable
+import contextlib
+import contextvars
+import time
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -26,6 +29,26 @@ else:
 class Definition(eqx.Module):
     """What users write: functions, and numbers that they compute with. Its arrays are always JAX's,
     whoever runs the code around it."""
+
+
+class OutOfTimeError(Exception):
+    """The host has looped for longer than it may."""
+
+
+_deadline = contextvars.ContextVar("deadline", default=float("inf"))
+
+
+@contextlib.contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """A context in which loops of the host end after so many seconds of this thread.
+
+    **Raises:** `OutOfTimeError`, where they do.
+    """
+    before = _deadline.set(time.thread_time() + seconds)
+    try:
+        yield
+    finally:
+        _deadline.reset(before)
 
 
 def on_host(x: Any) -> bool:
@@ -68,7 +91,10 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
     """`jax.lax.while_loop`."""
     if not on_host(jax.tree_util.tree_leaves(carry)[0]):
         return jax.lax.while_loop(going, body, carry)
+    deadline = _deadline.get()
     while going(carry):
+        if time.thread_time() > deadline:
+            raise OutOfTimeError
         carry = body(carry)
     return carry
 

@@ -16,7 +16,6 @@ from .._core.results import Result
 from ..engine.events import start_lanes
 from ..engine.lanes import Lanes
 from ..engine.move import move
-from ..engine.search.search import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
@@ -34,10 +33,6 @@ _ON_SECTION = 1e-6
 # A schedule divides the clock's period if the quotient is this near to a whole number. Doubled,
 # turns that differ twice as much from the last one are taken for equal.
 _WHOLE = 1e-6
-# Steps on the way to the section before it is given up. Doubled, so is the time until then.
-_MOST_STEPS = 1_000_000
-# Steps of one call, so that a long way is soon left to a compiled program. Doubled, half as soon.
-_STEPS_AT_ONCE = 500
 
 
 class _Plane(eqx.Module):
@@ -211,21 +206,13 @@ def _require(moved, doing: str, s: Structure) -> None:
         )
 
 
-def _go(system, lanes, section, target, settings) -> Moved:
-    """One lane to a time, or to one section, however many steps it takes."""
-    settings, h = dataclasses.replace(settings, max_steps=_STEPS_AT_ONCE), None
-    for _ in range(_MOST_STEPS // _STEPS_AT_ONCE):
-        moved = _piece(system, lanes, section, target, settings, h)
-        if int(moved.result[0]) != Result.STEP_LIMIT:
-            break
-        lanes, h = moved.lanes, moved.h
-    return moved
-
-
 @host_first
-def _piece(system, lanes, section, target, settings, h):
-    s, u = Structure(system), namespace(lanes.t).zeros((len(system.inputs), 1))
-    return move(s, lanes, u, _to_section(section, target), settings, h)
+def _go(system, lanes, section, target, settings):
+    """One lane to a time, or to one section, however many steps it takes."""
+    s = Structure(system)
+    settings = dataclasses.replace(settings, max_steps=1_000_000)
+    u = namespace(lanes.t).zeros((s.nu, 1))
+    return move(s, lanes, u, _to_section(section, target), settings)
 
 
 def _to_section(section, target: Target) -> Target:

@@ -184,3 +184,10 @@ def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
     assert [e.name for e in quick.events] == [e.name for e in compiled.events]
     np.testing.assert_allclose(quick.t, compiled.t, rtol=1e-13)
     np.testing.assert_allclose(quick.after, compiled.after, rtol=1e-13)
+
+
+def test_the_host_leaves_a_long_job_to_the_compiled_program(monkeypatch):
+    """While it is at work: one call that would take it longer than compiling does."""
+    monkeypatch.setattr(compile, "_WORTH_COMPILING", 0.1)
+    found = hj.simulate(Decay(level=0.8), "x", [0.9], 100.0)
+    assert len(found.events) == 1 + int((100 - np.log(0.9 / 0.8)) / np.log(1 / 0.8))

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from ..device import on_cpu
-from ..executor import from_host, to_host
+from ..executor import OutOfTimeError, at_most, from_host, to_host
 from ..tracing import is_inside_program, is_traced
 from .garbage_collector import uncollected
 
@@ -69,14 +69,17 @@ def host_first(function: Callable) -> Callable:
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return compiled(*arguments)
-        kind = _kind(arguments)
-        if spent[kind] > _WORTH_COMPILING:
+        kind, begin = _kind(arguments), time.thread_time()
+        left = _WORTH_COMPILING - spent[kind]
+        if left <= 0:
             return compiled(*arguments)
-        begin = time.thread_time()
-        with uncollected, at_ease():
-            result = from_host(function(*to_host(arguments)))
-        spent[kind] += time.thread_time() - begin
-        return result
+        try:
+            with uncollected, at_ease(), at_most(left):
+                return from_host(function(*to_host(arguments)))
+        except OutOfTimeError:
+            return compiled(*arguments)
+        finally:
+            spent[kind] += time.thread_time() - begin
 
     return call
 
