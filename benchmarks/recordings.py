@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
-python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [coverage]
-[short] [losses]
+python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size]
+[coverage] [short] [losses]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.

@@ -4,6 +4,10 @@ Seconds of the wall's clock after the import, for each call in turn: `find_limit
 `linearize`, `run_experiments` (80 experiments, 84 cycles). `cold` begins with an empty cache,
 `cached` with the one that the cold process left. A third process changes a parameter and counts
 what is traced or compiled again, and looks for host callbacks in all programs.
+
+The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
+beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
+hopper's flight up to its touchdown.
 """
 
 import json
@@ -23,11 +27,16 @@ def run(show, options) -> None:
     from .children import call
     from .problems import HOPPER
 
+    yardstick = call("compile", "diffeqsolve")
+    show("diffeqsolve.cpu", yardstick)
     for _, family in HOPPER[:1] if options.quick else HOPPER:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached"):
                 for name, value in call("compile", family, HYBRIDJAX_CACHE=cache).items():
                     show(f"{family}.{state}.{name}", value)
+                    if name.endswith(".cpu"):
+                        multiple = f"{name.removesuffix('.cpu')}.times_diffeqsolve"
+                        show(f"{family}.{state}.{multiple}", value / yardstick)
             folder = str(pathlib.Path(cache, "programs"))
             found = call("compile", family, folder, HYBRIDJAX_CACHE=cache)
         for name, value in found.items():
@@ -45,9 +54,10 @@ def first_calls(family: str, repetition: int = 0):
     own, outputs, design = sections("hopper", family), OUTPUTS["hopper"], hj.paper_design()
 
     def timed(name, work):
-        begin = time.perf_counter()
+        begin, processor = time.perf_counter(), time.process_time()
         result = work()
         seconds[name] = time.perf_counter() - begin
+        seconds[f"{name}.cpu"] = time.process_time() - processor
         return result
 
     cycle = timed("find_limit_cycle", lambda: hj.find_limit_cycle(hopper))
@@ -55,6 +65,32 @@ def first_calls(family: str, repetition: int = 0):
     data = timed("run_experiments", lambda: hj.run_experiments(cycle, own, design, outputs))
     assert data.ok.all()
     return seconds
+
+
+def diffeqsolve() -> float:
+    """CPU seconds of the yardstick."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+    import optimistix as optx
+
+    import hybridjax as hj
+
+    hj.enable_x64()
+    hopper = hj.models.VerticalHopper()
+    flight, u = hopper.charts()["flight"], jnp.zeros(1)
+    term = diffrax.ODETerm(lambda t, q, _: jnp.stack(flight.field(t, q, u)))
+    newton = optx.Newton(rtol=1e-10, atol=1e-10)
+    touchdown = diffrax.Event(lambda t, y, args, **_: y[2], newton)
+    start = jnp.array([2.0, 1.9, 0.0, 0.5])
+    begin = time.process_time()
+    found = diffrax.diffeqsolve(
+        term, diffrax.Dopri8(), 0.0, 1.0, 0.01, start,
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
+        saveat=diffrax.SaveAt(t1=True), event=touchdown,
+    )  # fmt: skip
+    jax.block_until_ready(found.ys)
+    return time.process_time() - begin
 
 
 def main(family: str, folder: str | None) -> None:
@@ -102,4 +138,7 @@ def main(family: str, folder: str | None) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None)
+    if sys.argv[1] == "diffeqsolve":
+        print(json.dumps(diffeqsolve()))
+    else:
+        main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None)

@@ -52,15 +52,16 @@ def real(x: Any) -> jax.Array:
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
     that a definition may be built before. Arrays of JAX remain what they are.
     """
-    if isinstance(x, jax.Array) or _is_double() or is_inside_program():
+    made_by_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x))
+    if made_by_jax or is_inside_program():
         return jnp.asarray(x, float)
-    with _precision(double=True):
-        return jnp.asarray(x, float)
+    with _precision(double=True):  # (No program is compiled for numbers of Python and NumPy.)
+        return jax.device_put(np.asarray(x, float))
 
 
 def at_precision(double: float, single: float) -> float:
     """A threshold that is a matter of rounding, for the precision that JAX computes in."""
-    return single if jnp.result_type(float) == jnp.float32 else double
+    return double if jax.config.read("jax_enable_x64") else single
 
 
 def single_precision() -> contextlib.AbstractContextManager:

@@ -2,8 +2,9 @@
 
 import enum
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Bool, Int
+
+from .executor import Array, namespace
 
 
 class Result(enum.IntEnum):
@@ -50,4 +51,5 @@ def update_result(
     result: Int[Array, "*lanes"], failed: Bool[Array, "*lanes"], code: Result
 ) -> Int[Array, "*lanes"]:
     """Record `code` where `failed`, unless an earlier failure is there already."""
-    return jnp.where((result == Result.OK) & failed, jnp.int32(code), result)
+    xp = namespace(result)
+    return xp.where((result == Result.OK) & failed, xp.int32(code), result)

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from .._core.executor import Array, cond, namespace
+from .lanes import Lanes
 from .tape import Tape
 
 
@@ -24,22 +24,23 @@ class EventLog(NamedTuple):
     """Number of events."""
 
 
-def blank_log(size: int, lanes: int) -> EventLog:
+def blank_log(size: int, lanes: Lanes) -> EventLog:
     """A log of `size` events of each lane, in which nothing is written yet."""
+    xp, L = namespace(lanes.t), lanes.t.shape[0]
     return EventLog(
-        jnp.full((size, lanes), jnp.nan),
-        jnp.full((size, lanes), -1, jnp.int32),
-        jnp.zeros(lanes, jnp.int32),
+        xp.full((size, L), xp.nan),
+        xp.full((size, L), -1, xp.int32),
+        xp.zeros(L, xp.int32),
     )
 
 
 def log_events(log: EventLog, row: Tape) -> EventLog:
     """The log, with the events of one row of a tape."""
-    fired = row.code >= 0
+    xp, fired = namespace(row.code), row.code >= 0
 
     def write():
-        here = fired & (jnp.arange(len(log.time))[:, None] == log.count)
-        time = jnp.where(here, row.t, log.time)
-        return EventLog(time, jnp.where(here, row.code, log.event), log.count + fired)
+        here = fired & (xp.arange(len(log.time))[:, None] == log.count)
+        time = xp.where(here, row.t, log.time)
+        return EventLog(time, xp.where(here, row.code, log.event), log.count + fired)
 
-    return jax.lax.cond(fired.any(), write, lambda: log)
+    return cond(fired.any(), write, lambda: log)

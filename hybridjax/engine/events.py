@@ -1,14 +1,15 @@
 """What happens at events: resets, arming, schedules, and the signs of Zeno."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, cond, namespace, on_host, put, stop_gradient
 from .._core.precision import at_precision
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
+from . import kernels
 from .lanes import Lanes, for_each_chart, needed, only
 from .settings import ROUNDING
 from .watch import Watch
@@ -41,9 +42,10 @@ def start_lanes(
 ) -> Lanes:
     """Lanes with fresh bookkeeping. No guard is armed yet: that is done where they set out."""
     L = t.shape[0]
-    pace = jnp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), float)
-    armed = jnp.asarray(np.zeros((len(s.transitions), L), bool))
-    return Lanes(t, chart, q, armed, jnp.asarray(np.zeros(L, np.int32)), pace)
+    xp = namespace(t)
+    pace = xp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), dtype=float)
+    armed = xp.asarray(np.zeros((len(s.transitions), L), bool))
+    return Lanes(t, chart, q, armed, xp.asarray(np.zeros(L, np.int32)), pace)
 
 
 def width(
@@ -51,7 +53,8 @@ def width(
 ) -> Float[Array, "W L"]:
     """Values of watched functions that count as zero: what their rates make of rounding errors."""
     zero, rounding = at_precision(*ZERO), at_precision(*ROUNDING)
-    return (zero * span + rounding * jnp.abs(t)) * jnp.abs(rate)
+    xp = namespace(rate)
+    return (zero * span + rounding * xp.abs(t)) * xp.abs(rate)
 
 
 def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> Lanes:
@@ -62,7 +65,7 @@ def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> La
     """
     zero = width(lanes.t, span, seen.rate)
     armed = (lanes.armed & (seen.value >= -zero)[:-1]) | (seen.value > zero)[:-1]
-    return eqx.tree_at(lambda x: x.armed, lanes, armed & mine(s, lanes.chart)[:-1])
+    return lanes._replace(armed=armed & mine(s, lanes.chart)[:-1])
 
 
 def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
@@ -88,13 +91,13 @@ def rearm(
     same instant: where another guard of the old chart was at its zero too (`together`), a guard
     other than the one that fired, at zero and falling, is still due.
     """
-    value, rate = seen.value[:-1], seen.rate[:-1]
+    xp, value, rate = namespace(fired), seen.value[:-1], seen.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
-    zero = jnp.maximum(zero, jnp.where(other, 0.0, 4 * residue))
-    due = together & other & (jnp.abs(value) <= zero) & (rate < 0)
+    zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
+    due = together & other & (xp.abs(value) <= zero) & (rate < 0)
     armed = ((value > zero) | due) & mine(s, lanes.chart)[:-1]
-    return eqx.tree_at(lambda x: x.armed, lanes, jnp.where(fired >= 0, armed, lanes.armed))
+    return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
 def _noise(
@@ -107,22 +110,37 @@ def _noise(
         if not rows:
             return out
 
-        def one(s, t, q, u):
-            guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in rows])  # noqa: E731
-            by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
-            return at_precision(*ROUNDING) * (jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q))
-
         n = s.dims[a]
-        noise = s.by_lane(one)(only(here, lanes.t), only(here, lanes.q[:n]), only(here, u))
+        point = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
+        noise = at_precision(*ROUNDING) * _guard_rounding(s, a, *point)
         place = {row: k for k, row in enumerate(rows)}
         each = [
-            jnp.where(here, noise[place[g]], out[g]) if g in place else out[g]
+            xp.where(here, noise[place[g]], out[g]) if g in place else out[g]
             for g in range(len(out))
         ]
-        return jnp.stack(each)
+        return xp.stack(each)
 
-    nothing = jnp.zeros((len(s.transitions), lanes.t.shape[0]))
+    xp = namespace(lanes.t)
+    nothing = xp.zeros((len(s.transitions), lanes.t.shape[0]))
     return for_each_chart(s, lanes.chart, mask, work, nothing)
+
+
+def _guard_rounding(
+    s: Structure, a: int, t: Float[Array, " L"], q: Float[Array, "n L"], u: Float[Array, "nu L"]
+) -> Float[Array, "g L"]:
+    """The change of the guards of chart a by changes of times and states relative to them, whatever
+    the signs of these."""
+
+    if on_host(t):
+        slopes = kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))[:, 1 : 2 + len(q)]
+        return np.sum(np.abs(slopes * np.concatenate([t[None], q])), axis=1)
+
+    def one(s, t, q, u):
+        guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in s.guards(a)])  # noqa: E731
+        by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
+        return jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q)
+
+    return s.by_lane(one)(t, q, u)
 
 
 def apply_resets(
@@ -136,26 +154,34 @@ def apply_resets(
 
         def work(carry, g=g, n=n, b=b, here=here):
             q, chart = carry
-            own = Structure(needed(here, s.source))
-            arguments = needed(here, [only(here, x) for x in (t, q[:n], u)])
-            new = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))(*arguments)
-            new = jnp.zeros_like(q).at[: s.dims[b]].set(new)
-            return jnp.where(here, new, q), jnp.where(here, b, chart)
+            xp, point = namespace(q), [only(here, x) for x in (t, q[:n], u)]
+            if on_host(q):
+                new = kernels.reset(s, g, *point)[:, 0]
+            else:
+                own = Structure(needed(here, s.source))
+                reset = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))
+                new = reset(*needed(here, point))
+            new = put(xp.zeros_like(q), slice(s.dims[b]), new)
+            return xp.where(here, new, q), xp.where(here, b, chart)
 
-        q, chart = jax.lax.cond(here.any(), work, lambda carry: carry, (q, chart))
+        q, chart = cond(here.any(), work, lambda carry: carry, (q, chart))
     return q, chart
 
 
 def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]:
     """Whether the predicates of the transitions `which` hold; True where there is none."""
-    out = jnp.ones(t.shape, bool)
+    xp = namespace(t)
+    out = xp.ones(t.shape, bool)
     for g, transition in enumerate(s.transitions):
         if transition.enabled is not None:
             here = which == g
             n = s.dims[s.chart_index(transition.source)]
             arguments = only(here, t), only(here, q[:n]), only(here, u)
-            holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
-            out = jnp.where(here, holds, out)
+            if on_host(t):
+                holds = kernels.enabled(s, g, *arguments)
+            else:
+                holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
+            out = xp.where(here, holds, out)
     return out
 
 
@@ -167,16 +193,16 @@ def next_schedule(
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
     at `end` happens at `end`.
     """
-    tie = at_precision(*_SAME_TIME)
-    best, which = jnp.full_like(t, jnp.inf), jnp.full_like(chart, -1)
+    xp, tie = namespace(t), at_precision(*_SAME_TIME)
+    best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
-        schedule = transition.guard
-        if isinstance(schedule, Scheduled):
-            k = jnp.floor((t - schedule.offset) / schedule.period + tie) + 1
-            time = schedule.offset + k * schedule.period
-            time = jnp.where(jnp.abs(time - end) <= tie * schedule.period, end, time)
+        if isinstance(transition.guard, Scheduled):
+            offset, period = transition.guard.numbers(t)
+            k = xp.floor((t - offset) / period + tie) + 1
+            time = offset + k * period
+            time = xp.where(xp.abs(time - end) <= tie * period, end, time)
             sooner = (chart == s.chart_index(transition.source)) & (time < best)
-            best, which = jnp.where(sooner, time, best), jnp.where(sooner, g, which)
+            best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)
     return best, which
 
 
@@ -185,12 +211,12 @@ def scheduled_time(
 ) -> Float[Array, " L"]:
     """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
     its period and offset; t itself for other events."""
-    time = t
+    xp, time = namespace(t), t
     for g, transition in enumerate(s.transitions):
-        schedule = transition.guard
-        if isinstance(schedule, Scheduled):
-            k = jax.lax.stop_gradient(jnp.round((t - schedule.offset) / schedule.period))
-            time = jnp.where(fired == g, schedule.offset + k * schedule.period, time)
+        if isinstance(transition.guard, Scheduled):
+            offset, period = transition.guard.numbers(t)
+            k = stop_gradient(xp.round((t - offset) / period))
+            time = xp.where(fired == g, offset + k * period, time)
     return time
 
 
@@ -204,14 +230,14 @@ def keep_pace(
 
     `slow` marks events whose guard is crossed at a vanishing speed.
     """
-    since, gap, streak, total = pace
+    xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
-    ratio = jnp.where(gap > 0, since / jnp.where(gap > 0, gap, 1.0), 0.0)
+    ratio = xp.where(gap > 0, since / xp.where(gap > 0, gap, 1.0), 0.0)
     shrinks = ratio < _ZENO_SHRINKS
-    streak = jnp.where(event, jnp.where(shrinks, streak + 1, 0.0), streak)
-    total = jnp.where(event, jnp.where(shrinks, total + since, 0.0), total)
-    rest = since * ratio / (1 - jnp.minimum(ratio, _ZENO_SHRINKS))
+    streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
+    total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
+    rest = since * ratio / (1 - xp.minimum(ratio, _ZENO_SHRINKS))
     zeno = (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
-    gap, since = jnp.where(event, since, gap), jnp.where(event, 0.0, since)
-    return jnp.stack([since, gap, streak, total]), zeno
+    gap, since = xp.where(event, since, gap), xp.where(event, 0.0, since)
+    return xp.stack([since, gap, streak, total]), zeno

@@ -6,10 +6,9 @@ crossing is found also where the guard dips below zero and returns within the st
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from .._core.executor import Array, namespace
 from .._core.precision import at_precision
 
 
@@ -47,7 +46,7 @@ def first_crossing(
 
     A guard that is not armed at the start counts only after it has become positive.
     """
-    rise = v1 - v0
+    xp, rise = namespace(v1), v1 - v0
     b = 3 * rise - 2 * d0 - d1
     c = d0 + d1 - 2 * rise
 
@@ -59,43 +58,43 @@ def first_crossing(
 
     # Extrema: roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
     disc = b * b - 3 * c * d0
-    pivot = -(b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(disc, 0.0)))
+    pivot = -(b + xp.where(b < 0, -1.0, 1.0) * xp.sqrt(xp.maximum(disc, 0.0)))
     r1 = _divide(pivot, 3 * c)
     r2 = _divide(d0, pivot)
-    r1, r2 = (jnp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
-    sa, sb = jnp.minimum(r1, r2), jnp.maximum(r1, r2)
-    va, vb = jnp.where(sa < 1, cubic(sa), v1), jnp.where(sb < 1, cubic(sb), v1)
+    r1, r2 = (xp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
+    sa, sb = xp.minimum(r1, r2), xp.maximum(r1, r2)
+    va, vb = xp.where(sa < 1, cubic(sa), v1), xp.where(sb < 1, cubic(sb), v1)
 
     first = armed & (va <= 0)
     second = (va > 0) & (vb <= 0) & (sb > sa)
     third = (vb > 0) & (v1 <= 0) & (sb < 1)
-    lo = jnp.where(first, 0.0, jnp.where(second, sa, sb))
-    hi = jnp.where(first, sa, jnp.where(second, sb, 1.0))
+    lo = xp.where(first, 0.0, xp.where(second, sa, sb))
+    hi = xp.where(first, sa, xp.where(second, sb, 1.0))
     found = first | second | third
 
     s = 0.5 * (lo + hi)
     for _ in range(_BRACKETED_STEPS):  # kept inside the shrinking bracket
         value = cubic(s)
-        lo, hi = jnp.where(value > 0, s, lo), jnp.where(value > 0, hi, s)
+        lo, hi = xp.where(value > 0, s, lo), xp.where(value > 0, hi, s)
         guess = s - _divide(value, slope(s))
-        s = jnp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
+        s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
-    scale = jnp.maximum(jnp.abs(v0), jnp.abs(v1))
+    scale = xp.maximum(xp.abs(v0), xp.abs(v1))
     small = at_precision(*TOUCH) * scale
-    touch = near = jnp.zeros_like(armed)
+    touch = near = xp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
-        touch = touch | (dips & (jnp.abs(value) <= small))
+        touch = touch | (dips & (xp.abs(value) <= small))
         near = near | (dips & (value > small) & (value < NEAR * scale))
-    return CubicCrossing(jnp.where(found, s, jnp.inf), touch, near & ~found)
+    return CubicCrossing(xp.where(found, s, xp.inf), touch, near & ~found)
 
 
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
-    rise = v1 - v0
+    xp, rise = namespace(v1), v1 - v0
     b = 3 * rise - 2 * d0 - d1
     c = d0 + d1 - 2 * rise
-    s = jnp.ones_like(v1)
+    s = xp.ones_like(v1)
     for _ in range(_NEWTON_STEPS):
         value = v0 + s * (d0 + s * (b + s * c))
         s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
@@ -112,10 +111,11 @@ def interpolate(x, h, q0, q1, f0, f1):
     )
 
 
-def control_points(v0, v1, d0, d1) -> tuple[jax.Array, ...]:
+def control_points(v0, v1, d0, d1) -> tuple[Array, ...]:
     """The cubic's Bernstein coefficients: it stays between the smallest and the largest of them."""
     return v0, v0 + d0 / 3, v1 - d1 / 3, v1
 
 
 def _divide(a, b):
-    return jnp.where(b == 0, jnp.inf, a / jnp.where(b == 0, 1.0, b))
+    xp = namespace(b)
+    return xp.where(b == 0, xp.inf, a / xp.where(b == 0, 1.0, b))

@@ -5,10 +5,12 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, namespace, on_host
 from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
+from .chain import chain
 from .lanes import Lanes
 from .move import constant, record, retrace
 from .search.search import Moved
@@ -37,15 +39,17 @@ def flow_jacobian(
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
-    u = jnp.zeros((s.nu, lanes.t.shape[0]))
-    source, begin, end = constant((s.source, lanes, target))
-    moved, tape = record(
-        Structure(source), begin, u, end, settings, h, result, new_input, tangents=wanted
-    )
+    u = namespace(lanes.t).zeros((s.nu, lanes.t.shape[0]))
+    still, begin, end = s, lanes, target
+    if not on_host(lanes.t):
+        source, begin, end = constant((s.source, lanes, target))
+        still = Structure(source)
+    moved, tape = record(still, begin, u, end, settings, h, result, new_input, tangents=wanted)
     jacobian, end = tape_jacobian(s, lanes, target, tape, of_states, wanted)
     if wanted is not True:
         end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
-    moved = eqx.tree_at(lambda x: (x.lanes.t, x.lanes.q), moved, (end[0], end[1:]))
+    ends = moved.lanes._replace(t=end[0], q=end[1:])
+    moved = moved._replace(lanes=ends)
     return jacobian, moved, tape
 
 
@@ -59,6 +63,8 @@ def tape_jacobian(
 ) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
     """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
     (t, q) at the targets; both are zeros if they are not `wanted`."""
+    if on_host(lanes.t):
+        return chain(s, lanes, target, tape, of_states)
     columns, end = _push(s.source, lanes, target, tape, of_states, wanted)
     return columns.transpose(2, 1, 0), end
 

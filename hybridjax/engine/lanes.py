@@ -1,16 +1,18 @@
 """Lanes: the hybrid states of many trajectories that move side by side."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, cond, lane, namespace, on_host
 from ..systems.structure import Structure
 
 
-class Lanes(eqx.Module):
+class Lanes(NamedTuple):
     """L hybrid states. States are padded with zeros to the largest chart's dimension d."""
 
     t: Float[Array, " L"]
@@ -39,7 +41,7 @@ def for_each_chart(
         def present(out, a=a, here=here):
             return work(a, here, out)
 
-        out = jax.lax.cond(here.any(), present, lambda out: out, out)
+        out = cond(here.any(), present, lambda out: out, out)
     return out
 
 
@@ -49,10 +51,10 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     A chart's functions are thus never evaluated at another chart's states, where they might be
     undefined; NaN there would poison reverse-mode derivatives even if it is masked afterwards.
     """
-    if x.shape[-1] < mask.shape[0]:
+    if x.shape[-1] < mask.shape[0] or (on_host(mask) and mask.all()):
         return x
-    one = jax.lax.dynamic_slice_in_dim(x, jnp.argmax(mask), 1, axis=-1)
-    return jnp.where(mask, x, one)
+    xp = namespace(x)
+    return xp.where(mask, x, lane(x, xp.argmax(mask)))
 
 
 def needed(mask: Bool[Array, " L"], tree):
@@ -62,6 +64,8 @@ def needed(mask: Bool[Array, " L"], tree):
     zero cotangents. At another chart's states these may meet infinite derivatives, and zero times
     infinity is NaN: it must not reach states or parameters.
     """
+    if on_host(mask):
+        return tree
     some = mask.any()
 
     def cut(x):

@@ -4,9 +4,9 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, namespace, on_host
 from .._core.lanes.lane_jvp import lane_jvp
 from .._core.lanes.per_lane import shared
 from .._core.lanes.vmap_as_lanes import vmap_to_lanes
@@ -79,7 +79,10 @@ def _begin(s: Structure, lanes, u, target, settings, setout, result, options) ->
     if not isinstance(setout, Stride):
         setout = stride(setout)
     if result is None:
-        result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
+        xp = namespace(lanes.t)
+        result = xp.full(lanes.t.shape, Result.OK, xp.int32)
+    if on_host(lanes.t):
+        return search(s, lanes, u, target, setout, result, settings, options)
     return _move(s.source, lanes, u, target, constant(setout), result, settings, options)
 
 

@@ -4,12 +4,13 @@ import functools as ft
 from typing import Annotated
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
+from .._core.executor import Array, namespace
 from .._core.precision import at_precision, real
 from .._core.text import fields
 from ..errors import DefinitionError
@@ -77,37 +78,46 @@ class Settings(eqx.Module):
         max_steps: StepCount = 256,
         scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
     ):
-        self.rtol, self.atol = real(rtol), real(atol)
+        self.rtol, self.atol = _kept(rtol), _kept(atol)
         self.max_steps = max_steps
-        self.scale = None if scale is None else real(scale)
+        self.scale = None if scale is None else _kept(scale)
 
-    def size(self, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
-        """Sizes of states of chart a against which errors are judged: those of `q`, and where `q`
-        is small, those that the states usually have, which must be known."""
-        if self.scale is None:
-            raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
-        own = ft.reduce(jnp.maximum, map(jnp.abs, q))
-        usual = self.scale[a, : len(own)].reshape(len(own), -1)
-        return own + self.atol / self.rtol * usual
 
-    def tolerance(
-        self,
-        a: int,
-        q: Float[Array, "n L"],
-        tau: Float[Array, " #L"],
-        step: Step,
-        rounding: Float[Array, "n L"],
-    ) -> Float[Array, "n L"]:
-        """The error that a step over tau from states `q` of chart a may have.
+def _kept(x: Array) -> Array:
+    """The host's arrays as they are, for what else there is JAX's."""
+    return x if isinstance(x, np.ndarray) and x.dtype == np.float64 else real(x)
 
-        Where the usual sizes are not known, a state is taken to be as large as it is at the ends
-        of the step, or as it would become at the rates there if that is more. Rounding errors are
-        allowed: its own, and the `rounding` errors of its rate.
-        """
-        if self.scale is not None:
-            return self.rtol * self.size(a, q, step.q)
-        own = jnp.maximum(jnp.abs(q), jnp.abs(step.q))
-        change = jnp.abs(tau) * jnp.maximum(jnp.abs(step.f0), jnp.abs(step.f1))
-        rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * jnp.abs(tau) * rounding
-        tolerance = self.rtol * own + self.atol * jnp.maximum(own, change) + rounding
-        return jnp.maximum(tolerance, jnp.finfo(own.dtype).tiny)  # where all is at rest at zero
+
+def size(settings: Settings, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
+    """Sizes of states of chart a against which errors are judged: those of `q`, and where `q` is
+    small, those that the states usually have, which must be known."""
+    if settings.scale is None:
+        raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
+    xp = namespace(q[0])
+    own = ft.reduce(xp.maximum, map(xp.abs, q))
+    usual = settings.scale[a, : len(own)].reshape(len(own), -1)
+    return own + settings.atol / settings.rtol * usual
+
+
+def tolerance(
+    settings: Settings,
+    a: int,
+    q: Float[Array, "n L"],
+    tau: Float[Array, " #L"],
+    step: Step,
+    rounding: Float[Array, "n L"],
+) -> Float[Array, "n L"]:
+    """The error that a step over tau from states `q` of chart a may have.
+
+    Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
+    step, or as it would become at the rates there if that is more. Rounding errors are allowed: its
+    own, and the `rounding` errors of its rate.
+    """
+    if settings.scale is not None:
+        return settings.rtol * size(settings, a, q, step.q)
+    xp = namespace(q)
+    own = xp.maximum(xp.abs(q), xp.abs(step.q))
+    change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
+    rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * xp.abs(tau) * rounding
+    found = settings.rtol * own + settings.atol * xp.maximum(own, change) + rounding
+    return xp.maximum(found, xp.finfo(own.dtype).tiny)  # where all is at rest at zero

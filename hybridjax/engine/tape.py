@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from .._core.executor import Array, namespace, put
 from .lanes import Lanes
 
 
@@ -32,17 +32,17 @@ class Tape(NamedTuple):
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
     """A tape on which nothing is written yet."""
-    d, L = lanes.q.shape
+    xp, (d, L) = namespace(lanes.q), lanes.q.shape
     return Tape(
-        jnp.zeros((rows, L)),
-        jnp.full((rows, L), IDLE, jnp.int32),
-        jnp.zeros((rows, L)),
-        jnp.zeros((rows, d, L)),
-        jnp.zeros((rows, d, L)),
-        jnp.zeros((rows, L), jnp.int32),
+        xp.zeros((rows, L)),
+        xp.full((rows, L), IDLE, xp.int32),
+        xp.zeros((rows, L)),
+        xp.zeros((rows, d, L)),
+        xp.zeros((rows, d, L)),
+        xp.zeros((rows, L), xp.int32),
     )
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
     """The tape with its row i filled in. (Outside of any branch, where it is done in place.)"""
-    return Tape(*(x.at[i].set(y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))
+    return Tape(*(put(x, i, y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))

@@ -3,16 +3,15 @@
 import abc
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from .._core.executor import Array, Definition, namespace, stop_gradient
 from .._core.lanes.per_lane import PerLane
 from .._core.results import Result
 from ..systems.structure import Structure
 
 
-class AbstractLevels(eqx.Module):
+class AbstractLevels(Definition):
     """Level functions of state-based sections, by section index."""
 
     @abc.abstractmethod
@@ -57,13 +56,13 @@ def toward(
 ) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""
-    L = time.shape[0]
-    later = jnp.nextafter(jax.lax.stop_gradient(time), jnp.inf)
+    xp, L = namespace(time), time.shape[0]
+    later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
         time,
-        jnp.full(L, index, jnp.int32),
-        jnp.full(L, event, jnp.int32),
-        jnp.where(jnp.isfinite(time), later, limit),
+        xp.full(L, index, xp.int32),
+        xp.full(L, event, xp.int32),
+        xp.where(xp.isfinite(time), later, limit),
         None,
         None,
         Result.SECTION_MISSED,

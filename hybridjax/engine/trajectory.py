@@ -13,7 +13,8 @@ from jaxtyping import Float, Int
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first
+from .._core.executor import namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -155,14 +156,14 @@ def simulate(
             f"shape ({s.dims[a]},); it has {start.state.shape}."
         )
     settings = Settings() if settings is None else settings
-    u = jnp.asarray(_constant_input(s, input), float)[:, None]
+    u = _constant_input(s, input)[:, None]
     if callable(input):
         system = Driven(system, input)
 
-    end = start.time + duration
-    span = jnp.asarray(duration, float)
-    lanes, h = _start(system, start.time[None], a, start.state, u, span, settings)
-    rows = [(lanes.t, lanes.q, lanes.q, lanes.chart, jnp.full(1, -1))]
+    span = np.array([duration], float)
+    end = np.asarray(start.time) + span
+    lanes, h = _start(system, np.array([start.time]), a, start.state, u, span, settings)
+    rows = [(lanes.t, lanes.q, lanes.q, lanes.chart, np.full(1, -1))]
     steps = 0
     while True:
         moved, tape = _piece(system, lanes, u, end, settings, h)
@@ -217,18 +218,18 @@ def _constant_input(s: Structure, input) -> np.ndarray:
     return np.broadcast_to(value, (s.nu,))
 
 
-@quick_jit
+@host_first
 def _start(system, t, a, state, u, span, settings):
-    s = Structure(system)
-    q = jnp.zeros((s.d, 1)).at[: state.shape[0], 0].set(state)
-    lanes = start_lanes(s, t, jnp.full(1, a, jnp.int32), q)
-    return lanes, initial_step(s, lanes, u, span[None], settings)
+    s, xp = Structure(system), namespace(t)
+    q = put(xp.zeros((s.d, 1)), (slice(len(state)), 0), state)
+    lanes = start_lanes(s, t, xp.full(1, a, xp.int32), q)
+    return lanes, initial_step(s, lanes, u, span, settings)
 
 
-@quick_jit
+@host_first
 def _piece(system, lanes, u, end, settings, h):
     settings = dataclasses.replace(settings, max_steps=_ROWS)
-    return record(Structure(system), lanes, u, until(end[None]), settings, h)
+    return record(Structure(system), lanes, u, until(end), settings, h)
 
 
 def _slopes(system, t, chart, q, u) -> np.ndarray:
@@ -240,10 +241,10 @@ def _slopes(system, t, chart, q, u) -> np.ndarray:
     return np.asarray(_fields(system, t, chart, q, u))[:, :n]
 
 
-@quick_jit
+@host_first
 def _fields(system, t, chart, q, u):
     s = Structure(system)
-    return slopes(s, t, chart, q, jnp.broadcast_to(u, (s.nu, t.shape[0])))
+    return slopes(s, t, chart, q, namespace(u).broadcast_to(u, (s.nu, t.shape[0])))
 
 
 def _evaluate(system, names, t, chart, q):

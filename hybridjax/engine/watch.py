@@ -6,12 +6,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
+from .._core.executor import Array, namespace, on_host, put
 from .._core.lanes.per_lane import shared
 from ..systems.structure import Structure
+from . import kernels
 from .lanes import for_each_chart, only
-from .solver.step import LaneField, short_step
+from .solver.step import LaneField, Step, rk_step, short_step
 from .target import Target
 
 
@@ -26,6 +29,8 @@ class Watch(NamedTuple):
 
 def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
     """Field of chart a over lanes."""
+    if on_host(u):
+        return lambda t, q: kernels.field(s, a, t, q, u)[:, 0]
     field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u), name=("field", a))
     return lambda t, q: field(t, q, u)
 
@@ -64,12 +69,27 @@ class ChartFlow(NamedTuple):
         level = levels is not None and shared(levels).present(self.s, self.a)
         return self.s.guards(self.a) + [len(self.s.transitions)] * level
 
+    def step(
+        self,
+        t: Float[Array, " #L"],
+        q: Float[Array, "n L"],
+        h: Float[Array, " #L"],
+        unroll: bool = False,
+    ) -> Step:
+        """A step from (t, q) over h (see `rk_step`)."""
+        if on_host(q):
+            return kernels.step(self.s, self.a, t, q, self.u, h)
+        return rk_step(self.field, t, q, h, unroll)
+
     def watch(
         self, t: Float[Array, " #L"], q: Float[Array, "n L"], f: Float[Array, "n L"]
     ) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, guards = self.a, self.s.guards(self.a)
-        level = len(self.rows) > len(guards)
+        a, guards, levels = self.a, self.s.guards(self.a), self.target.levels
+        if on_host(q):
+            rows = kernels.watched(self.s, a, levels, t, q, self.u, self.target.index)
+            return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
+        level = levels is not None and shared(levels).present(self.s, a)
 
         def one(s, levels, t, q, u, i, f):
             def all_of_them(t, q):
@@ -78,7 +98,7 @@ class ChartFlow(NamedTuple):
 
             return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
 
-        many = self.s.by_lane(one, self.target.levels, name=("watch", a))
+        many = self.s.by_lane(one, levels, name=("watch", a))
         return Watch(*many(t, q, self.u, self.target.index, f))
 
     def settle(
@@ -101,7 +121,7 @@ class ChartFlow(NamedTuple):
         def newton(t, q, f):
             value, rate = self.watch(t, q, f)
             value, rate = pick(value, rows, which), pick(rate, rows, which)
-            return -value / jnp.where(rate == 0, 1.0, rate)
+            return -value / namespace(rate).where(rate == 0, 1.0, rate)
 
         first = newton(t, q, f) if first is None else first
         q, error = short_step(field, t, q, f, first)
@@ -115,7 +135,9 @@ def chart_flow(
 ) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
     index = only(here, target.index)
-    return ChartFlow(s, a, only(here, u), dataclasses.replace(target, index=index))
+    if index is not target.index:
+        target = dataclasses.replace(target, index=index)
+    return ChartFlow(s, a, only(here, u), target)
 
 
 def slopes(
@@ -123,16 +145,17 @@ def slopes(
     t: Float[Array, " L"],
     chart: Int[Array, " L"],
     q: Float[Array, "d L"],
-    u: Float[Array, "nu L"],
+    u: Float[Array, "nu #L"],
 ) -> Float[Array, "d L"]:
     """The field at every lane."""
 
     def work(a, here, out):
         n = s.dims[a]
         f = chart_field(s, a, only(here, u))(only(here, t), only(here, q[:n]))
-        return out.at[:n].set(jnp.where(here, f, out[:n]))
+        return put(out, slice(n), xp.where(here, f, out[:n]))
 
-    return for_each_chart(s, chart, jnp.ones(t.shape, bool), work, jnp.zeros_like(q))
+    xp = namespace(q)
+    return for_each_chart(s, chart, xp.ones(t.shape, bool), work, xp.zeros_like(q))
 
 
 def watch(
@@ -153,27 +176,27 @@ def watch(
         point = only(here, t), only(here, q[: s.dims[a]])
         return write(out, flow.rows, here, flow.watch(*point, flow.field(*point)))
 
-    return for_each_chart(s, chart, mask, work, nothing(s, t.shape[0]))
+    return for_each_chart(s, chart, mask, work, nothing(s, t))
 
 
-def nothing(s: Structure, L: int) -> Watch:
-    """A `Watch` whose rows mean nothing."""
-    shape = (len(s.transitions) + 1, L)
-    return Watch(jnp.ones(shape), jnp.zeros(shape))
+def nothing(s: Structure, t: Float[Array, " L"]) -> Watch:
+    """A `Watch` of lanes at times t whose rows mean nothing."""
+    xp, shape = namespace(t), (len(s.transitions) + 1, len(t))
+    return Watch(xp.ones(shape), xp.zeros(shape))
 
 
 def take(seen: Watch, rows: list[int]) -> Watch:
     """Some rows of a `Watch`."""
-    return Watch(*(jnp.stack([x[row] for row in rows]) for x in seen))
+    return Watch(*(namespace(x).stack([x[row] for row in rows]) for x in seen))
 
 
 def write(out: Watch, rows: list[int], here: Bool[Array, " L"], new: Watch) -> Watch:
     """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
-    place = {row: k for k, row in enumerate(rows)}
+    xp, place = namespace(here), {row: k for k, row in enumerate(rows)}
     return Watch(
         *(
-            jnp.stack(
-                [jnp.where(here, y[place[r]], x[r]) if r in place else x[r] for r in range(len(x))]
+            xp.stack(
+                [xp.where(here, y[place[r]], x[r]) if r in place else x[r] for r in range(len(x))]
             )
             for x, y in zip(out, new, strict=True)
         )
@@ -185,7 +208,8 @@ def pick(x: Float[Array, "R L"], rows: Sequence[int], which: Int[Array, " L"]):
 
     (A chain of selections: unlike a sum or a gather, XLA computes it together with its users.)
     """
-    out = jnp.zeros_like(x[0])
+    xp = namespace(x)
+    out = xp.zeros_like(x[0])
     for k, row in enumerate(rows):
-        out = jnp.where(which == row, x[k], out)
+        out = xp.where(which == row, x[k], out)
     return out

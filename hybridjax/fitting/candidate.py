@@ -30,7 +30,7 @@ def candidate_cycle(
         system=system,
         period=period,
         anchor=map.departure(q),
-        legs=dataclasses.replace(guess.legs, q=jnp.full_like(guess.legs.q, jnp.nan)),
+        legs=guess.legs._replace(q=jnp.full_like(guess.legs.q, jnp.nan)),
         factors=jnp.full_like(guess.factors, jnp.nan),
         residual=turn.distance,
         iterations=steps,

@@ -12,6 +12,7 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, NonNegative, PeriodCount, Vector
+from .._core.executor import from_host
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.text import listed
@@ -358,7 +359,7 @@ def _dimensions(dims, n_sections, d):
         dims = np.asarray(dims)
         if np.any((dims < 1) | (dims > d)):
             raise DefinitionError(f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}.")
-    return jnp.asarray(dims)
+    return from_host(dims)
 
 
 def _check_padding(ldtp):

@@ -4,12 +4,20 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
+
+from .._core.executor import Array, on_host
+
+
+def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
+    """The product `A[N-1] ... A[0]`."""
+    if on_host(A):
+        return functools.reduce(lambda product, factor: factor @ product, A)
+    return _monodromy(A)
 
 
 @jax.jit
-def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
-    """The product `A[N-1] ... A[0]`."""
+def _monodromy(A):
     identity = jnp.eye(A.shape[-1], dtype=A.dtype)
     return jax.lax.scan(lambda product, factor: (factor @ product, None), identity, A)[0]
 

@@ -3,22 +3,24 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first
+from .._core.executor import Array, namespace, on_host, to_host
 from .._core.lanes.per_lane import by_lane
 from .._core.progress import working
 from .._core.results import Result
 from .._core.tracing import is_traced
+from ..engine import kernels
 from ..engine.jacobian import tape_jacobian
 from ..engine.lanes import for_each_chart, only
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output, OutputNames
-from ..systems.structure import Structure
+from ..systems.structure import Outputs, Structure
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 
@@ -62,7 +64,7 @@ def linearize(
     return LDTP(
         A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
         inputs=names, outputs=z.names,
-        coordinates=None if traced else placed.coordinates(),
+        coordinates=None if traced else to_host(placed).coordinates(),
     )  # fmt: skip
 
 
@@ -85,7 +87,7 @@ def _inputs(
     return tuple(known[k] for k in columns), columns
 
 
-@quick_jit
+@host_first
 def _section_jacobians(
     placed: PlacedSections,
 ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
@@ -93,18 +95,19 @@ def _section_jacobians(
     n = 1 + placed.lanes.q.shape[0]
     following, _, target = placed.onwards()
     jacobian, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
-    jacobian = jnp.where((placed.result == Result.OK)[:, None, None], jacobian, jnp.nan)
+    xp = namespace(jacobian)
+    jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
     embed, select = placed.frames()
     after = select[following]
     return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
 
-@quick_jit
+@host_first
 def _output_jacobians(
     placed: PlacedSections, outputs: tuple[str | Output, ...]
 ) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
     """C and D, padded."""
-    s, lanes = placed.structure(), placed.lanes
+    s, lanes, xp = placed.structure(), placed.lanes, namespace(placed.lanes.t)
     z = s.resolve_outputs(outputs)
     n, ny = 1 + s.d, len(outputs)
 
@@ -112,18 +115,25 @@ def _output_jacobians(
         if not z.defined(a):
             return out
         d = s.dims[a]
+        J = _jacobians(s, a, z, only(here, lanes.t), only(here, lanes.q[:d]))
+        blank = xp.zeros((ny, s.d - d, placed.n_sections))
+        J = xp.concatenate([J[:, : 1 + d], blank, J[:, 1 + d :]], axis=1)
+        return xp.where(here, J, out)
 
-        def jacobian(t, q):
-            J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
-            t, q, u = J(t, q, jnp.zeros(s.nu))
-            return jnp.concatenate([t[:, None], q, jnp.zeros((ny, s.d - d)), u], axis=1)
-
-        J = by_lane(jacobian)(only(here, lanes.t), only(here, lanes.q[:d]))
-        return jnp.where(here, J, out)
-
-    everywhere = jnp.ones(placed.n_sections, bool)
-    J = for_each_chart(
-        s, lanes.chart, everywhere, work, jnp.zeros((ny, n + s.nu, placed.n_sections))
-    )
-    J = jnp.moveaxis(J, -1, 0)
+    everywhere = xp.ones(placed.n_sections, bool)
+    nothing = xp.zeros((ny, n + s.nu, placed.n_sections))
+    J = xp.moveaxis(for_each_chart(s, lanes.chart, everywhere, work, nothing), -1, 0)
     return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]
+
+
+def _jacobians(s: Structure, a: int, z: Outputs, t, q) -> Float[Array, "ny m N"]:
+    """Derivatives of outputs in chart a by (t, q, u), at u = 0."""
+    if on_host(t):
+        return kernels.outputs(s, a, tuple(z.items), t, q, np.zeros((s.nu, 1)))[:, 1:]
+
+    def jacobian(t, q):
+        J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
+        t, q, u = J(t, q, jnp.zeros(s.nu))
+        return jnp.concatenate([t[:, None], q, u], axis=1)
+
+    return by_lane(jacobian)(t, q)

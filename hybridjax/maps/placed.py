@@ -1,13 +1,13 @@
 """A section family that was placed on a limit cycle."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation.compile import quick_jit
+from .._core.executor import Array, namespace
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -97,11 +97,11 @@ class PlacedSections(eqx.Module):
     def time_is_state(self) -> Bool[Array, " N"]:
         """Whether the time of crossing is a coordinate: on state-based sections of a clocked
         system."""
-        return jnp.isinf(self.bound.time) & self.cycle.clocked
+        return namespace(self.bound.time).isinf(self.bound.time) & self.cycle.clocked
 
     def frames(self) -> tuple[Float[Array, "N n c"], Float[Array, "N c n"]]:
         """Matrices from the coordinates on each section to deviations of (t, q), and back."""
-        return jax.vmap(_frames)(self.normal, self.drop, self.dims, self.time_is_state)
+        return _frames(self.normal, self.drop, self.dims, self.time_is_state)
 
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
@@ -122,13 +122,13 @@ class PlacedSections(eqx.Module):
 
         Lanes that do not arrive give up in the end.
         """
-        arrival = self.lanes.t[i] + turns * self.cycle.period
+        xp, arrival = namespace(t), self.lanes.t[i] + turns * self.cycle.period
         time = self.bound.time[i] + turns * self.cycle.period
         return Target(
-            jnp.broadcast_to(time, t.shape),
+            xp.broadcast_to(time, t.shape),
             i,
             self.bound.event[i],
-            jnp.maximum(arrival, t) + _GRACE * self.cycle.period,
+            xp.maximum(arrival, t) + _GRACE * self.cycle.period,
             None,
             self.bound.levels,
             Result.SECTION_MISSED,
@@ -136,8 +136,9 @@ class PlacedSections(eqx.Module):
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
         """For each section, the one that follows, how many turns later, and the way to it."""
-        following = (jnp.arange(self.n_sections) + 1) % self.n_sections
-        turns = (following == 0).astype(jnp.int32)
+        xp = namespace(self.lanes.t)
+        following = (xp.arange(self.n_sections) + 1) % self.n_sections
+        turns = (following == 0).astype(np.int32)
         return following, turns, self.target(following, self.lanes.t, turns)
 
 
@@ -153,22 +154,25 @@ def _observe(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> Float
 
 
 def _frames(
-    normal: Float[Array, " n"], drop, dim, with_time
-) -> tuple[Float[Array, "n c"], Float[Array, "c n"]]:
+    normal: Float[Array, "N n"],
+    drop: Int[Array, " N"],
+    dims: Int[Array, " N"],
+    with_time: Bool[Array, " N"],
+) -> tuple[Float[Array, "N n c"], Float[Array, "N c n"]]:
     """From section coordinates to (t, q), and back.
 
     Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous systems,
     and skipping `drop`. A move in coordinate j takes the dropped entry along the section:
     -normal_k / normal_drop.
     """
-    n = normal.shape[0]
-    k = jnp.arange(n)
-    kept = (k != drop) & ((k > 0) | with_time)
-    kept_first = jnp.argsort(~kept, stable=True)
+    xp, n = namespace(normal), normal.shape[1]
+    k, drop, drops = np.arange(n), drop[:, None], drop[:, None] >= 0
+    kept = (k != drop) & ((k > 0) | with_time[:, None])
+    kept_first = xp.argsort(~kept, axis=1, stable=True)
     # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-    valid = jnp.arange(n) < dim
-    select = jnp.where(valid[:, None], jnp.eye(n)[kept_first], 0.0)
-    slope = -normal / jnp.where(drop >= 0, normal[drop], 1.0)
-    along = jnp.where((k == drop)[:, None], slope[None, :], 0.0)
-    embed = (jnp.eye(n) + jnp.where(drop >= 0, along, 0.0)) @ select.T
+    valid = k < dims[:, None]
+    select = xp.where(valid[:, :, None], xp.eye(n)[kept_first], 0.0)
+    slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
+    along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
+    embed = (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2)
     return embed, select

@@ -1,16 +1,15 @@
 """Whether sections that were placed on a limit cycle are sound: each met once, across it, and in
 order."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import at_ease
+from .._core.executor import to_host
 from .._core.results import Result
+from ..engine import kernels
 from ..engine.hermite import interpolate
 from ..engine.tape import IDLE
-from ..engine.target import Target
-from ..engine.watch import slopes, watch
+from ..engine.watch import slopes
 from ..errors import ComputationError
 from ..sections.crossing import Crossing
 from .placed import PlacedSections
@@ -20,9 +19,6 @@ from .placed import PlacedSections
 # Further crossings of a section are looked for in this many parts of every step that the flow took.
 # Doubled: two crossings half as far apart are still told apart, at twice the cost.
 _PARTS_OF_A_STEP = 16
-# The number of steps is rounded up to a multiple of this. Doubled: other cycles are compiled anew
-# half as often, and short ones are searched for longer.
-_STEPS_AT_ONCE = 256
 # A section is tangent to the cycle if its level changes there at less than this fraction of its
 # fastest rate on the cycle. Doubled: sections crossed at twice the angle are refused.
 _LEAST_STEEPNESS = 1e-4
@@ -104,17 +100,46 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     steepness = np.ones(placed.n_sections)
     if placed.bound.levels is None:
         return counts, steepness
-    more, fastest, rate = jax.device_get(_levels_along(placed, *_steps(placed)))
+    with at_ease():
+        more, fastest, rate = _levels_along(to_host(placed))
     state_based = np.isinf(np.asarray(placed.bound.time)) & (event < 0)
     counts = np.where(state_based, 1 + more, counts)
     np.divide(np.abs(rate), fastest, out=steepness, where=state_based)
     return counts, steepness
 
 
+def _levels_along(placed: PlacedSections):
+    """How often the cycle's steps cross each section (N,) but for where it lies, the fastest rate
+    of its level (N,), and the rate there (N,)."""
+    s, N, levels = placed.structure(), placed.n_sections, placed.bound.levels
+    t, chart, q, h, after, section = _steps(placed)
+    still = np.zeros((s.nu, 1))
+    f0, f1 = slopes(s, t, chart, q.T, still), slopes(s, t + h, chart, after.T, still)
+    x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
+    q = interpolate(x, h, q.T[:, None], after.T[:, None], f0[:, None], f1[:, None])
+    t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)
+    value, rate = np.ones((N, len(t))), np.zeros((N, len(t)))
+    for a in np.unique(chart):
+        if levels.present(s, int(a)):
+            here = np.flatnonzero(chart == a)
+            seen = kernels.levels(s, int(a), levels, N, t[here], q[: s.dims[a], here])
+            value[:, here], rate[:, here] = seen[:, 0], seen[:, 1]
+    level = value.reshape(N, len(x), -1)
+    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (h > 0)
+    # Around the section itself, rounding decides the signs.
+    own = np.arange(N)[:, None] == section
+    falls[:, 0] &= ~own
+    falls[:, -1] &= ~np.roll(own, -1, axis=1)
+    lanes = placed.lanes
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
+    there = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
+    return np.sum(falls, axis=(1, 2)), np.max(np.abs(rate), axis=1), there
+
+
 def _steps(placed: PlacedSections):
-    """The steps of one period, some of them of length zero: time, chart and state at their starts,
-    length, state at their ends, and the section they start from or -1."""
-    tape, lanes = jax.device_get((placed.tape, placed.lanes))
+    """The steps of one period: time, chart and state at their starts, length, state at their ends,
+    and the section they start from or -1."""
+    tape, lanes = placed.tape, placed.lanes
     section, row = np.nonzero(tape.code.T != IDLE)
     first = np.append(True, np.diff(section) > 0)
 
@@ -126,42 +151,4 @@ def _steps(placed: PlacedSections):
     t = start(lanes.t, end)
     chart = start(lanes.chart, tape.chart[row, section])
     q = start(lanes.q.T, tape.after[row, :, section])
-    parts = t, chart, q, end - t, tape.before[row, :, section], np.where(first, section, -1)
-    idle = np.zeros(-len(section) % _STEPS_AT_ONCE, int)
-    t, chart, q, h, after, section = (np.concatenate([x, x[idle]]) for x in parts)
-    h[len(row) :] = 0
-    return t, chart, q, h, after, section
-
-
-@quick_jit
-def _levels_along(placed: PlacedSections, t, chart, q, h, after, section):
-    """How often the cycle's steps cross each section (N,) but for where it lies, the fastest rate
-    of its level (N,), and the rate there (N,)."""
-    s, N = placed.structure(), placed.n_sections
-    points = len(t) * (_PARTS_OF_A_STEP + 1)
-    still = jnp.zeros((s.nu, len(t)))
-    f0, f1 = slopes(s, t, chart, q.T, still), slopes(s, t + h, chart, after.T, still)
-    x = jnp.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
-    q = interpolate(x, h, q.T[:, None], after.T[:, None], f0[:, None], f1[:, None])
-    t, chart, q = (t + h * x).ravel(), jnp.tile(chart, _PARTS_OF_A_STEP + 1), q.reshape(s.d, points)
-    far, u, everywhere = (
-        jnp.full(points, jnp.inf),
-        jnp.zeros((s.nu, points)),
-        jnp.ones(points, bool),
-    )
-
-    def one(i):
-        index, never = jnp.full(points, i), jnp.full(points, -1)
-        target = Target(far, index, never, far, None, placed.bound.levels, Result.OK)
-        seen = watch(s, t, chart, q, u, target, everywhere)
-        level = seen.value[-1].reshape(_PARTS_OF_A_STEP + 1, -1)
-        falls = (level[:-1] > 0) & (level[1:] <= 0) & (h > 0)
-        # Around the section itself, rounding decides the signs.
-        falls = falls.at[0].set(falls[0] & (section != i))
-        falls = falls.at[-1].set(falls[-1] & (jnp.roll(section, -1) != i))
-        return jnp.sum(falls), jnp.max(jnp.abs(seen.rate[-1]))
-
-    more, fastest = jax.lax.map(one, jnp.arange(N))
-    lanes = placed.lanes
-    f = slopes(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)))
-    return more, fastest, placed.normal[:, 0] + jnp.sum(placed.normal[:, 1:] * f.T, axis=1)
+    return t, chart, q, end - t, tape.before[row, :, section], np.where(first, section, -1)

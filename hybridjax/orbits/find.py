@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.compilation.compile import quick_jit
-from .._core.precision import require_x64
+from .._core.compilation.compile import host_first
+from .._core.executor import namespace
+from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
@@ -26,7 +27,7 @@ from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .cycle import LimitCycle
 from .guess import begin, check_clock, check_section, guessed_lane
-from .newton import Solution, solve
+from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
 
@@ -40,8 +41,6 @@ _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
-# Steps of Levenberg and Marquardt before a cycle is given up.
-_DAMPED_STEPS = 64
 # The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
 # monodromy up to this part of it. Doubled, half as much loss is noticed.
 _CONSERVED = 1e-6
@@ -137,7 +136,7 @@ def find_limit_cycle(
         multiplicity = 1 if multiplicity is None else multiplicity
         lane, period = guessed_lane(system, guess), system.period()
         near = sizes_near(
-            system, int(lane.chart[0]), lane.t[0], lane.q[:, 0],
+            system, int(np.asarray(lane.chart)[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
@@ -149,7 +148,7 @@ def find_limit_cycle(
     conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
     map = dataclasses.replace(map, conserved=conserved)
     if traced:
-        return _cycle(map, solve(map, False, True), guess.event_sequence)
+        return _cycle(map, solve(map, True), guess.event_sequence)
     _check_values(system, map.anchor, conserved)
     map, solution = _in_own_sizes(map, _solve(map), given)
     codes = np.ravel(solution.turn.codes)
@@ -185,7 +184,7 @@ def _solve(map: ReturnMap) -> Solution:
     if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
         # Newton may have stepped out of the domain of the return map: smaller steps.
         say("steps of Levenberg and Marquardt")
-        second = solve(map, True, False, _DAMPED_STEPS)
+        second = solve_damped(map)
         solution = second if int(second.result) == Result.OK else solution
     return solution
 
@@ -204,7 +203,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     )
     if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
         size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
-        distance = jnp.asarray(np.max(np.abs(solution.turn.residual) / size))
+        distance = real(np.max(np.abs(solution.turn.residual) / size))
         return own, solution._replace(turn=solution.turn._replace(distance=distance))
     say("Newton's method, in the sizes of the cycle")
     again = solve(own)
@@ -278,7 +277,7 @@ def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
 def _check_clock(cycle: LimitCycle) -> None:
     """Raise where the cycle of a clocked system is not what it seems to be."""
     s, system = Structure(cycle.system), cycle.system
-    a, t = int(cycle.anchor.chart[0]), float(cycle.anchor.t[0])
+    a, t = int(cycle.anchor.chart[0]), float(np.asarray(cycle.anchor.t)[0])
     f, later, guards, rates = jax.device_get(_at_anchor(cycle))
     f, later = f[: s.dims[a]], later[: s.dims[a]]
     slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)
@@ -296,13 +295,13 @@ def _check_clock(cycle: LimitCycle) -> None:
         )
 
 
-@quick_jit
+@host_first
 def _at_anchor(cycle: LimitCycle):
     """The field at the anchor (d,) and one period later, the guards there (G,) and their rates."""
-    s, anchor = Structure(cycle.system), cycle.anchor
-    u, later = jnp.zeros((s.nu, 1)), anchor.t + cycle.period
+    s, anchor, xp = Structure(cycle.system), cycle.anchor, namespace(cycle.period)
+    u, later = xp.zeros((s.nu, 1)), anchor.t + cycle.period
     f = [slopes(s, t, anchor.chart, anchor.q, u)[:, 0] for t in (anchor.t, later)]
-    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), jnp.ones(1, bool))
+    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
     return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
 
 

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first
+from .._core.executor import from_host, namespace
+from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
 from ..engine.events import start_lanes
@@ -74,18 +76,18 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
         )
     q = np.zeros((s.d, 1))
     q[: s.dims[a], 0] = guess.state
-    return start_lanes(s, guess.time[None], jnp.asarray([a], jnp.int32), jnp.asarray(q))
+    return from_host(start_lanes(s, np.array([guess.time]), np.array([a], np.int32), q))
 
 
 def check_clock(system: HybridSystem) -> None:
     """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
     s = Structure(system)
-    period = system.period()
+    period = None if system.period() is None else float(system.period())
     if period is not None and not (np.isfinite(period) and period > 0):
         raise DefinitionError(f"the clock's period must be positive; it is {period}.")
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
-            ratio = np.inf if period is None else float(period / transition.guard.period)
+            ratio = np.inf if period is None else period / float(transition.guard.period)
             if not abs(ratio - round(min(ratio, 1e9))) < _WHOLE:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
@@ -125,13 +127,15 @@ def begin(
     if settle:
         say("settling")
         wait = float(settle) if period is None else np.ceil(settle / period) * float(period)
-        moved = _go(system, lanes, None, toward(lanes.t + wait, -1, lanes.t + wait), settings)
+        end = np.asarray(lanes.t) + wait
+        moved = _go(system, lanes, None, toward(end, -1, end), settings)
         _require(moved, "settling", s)
         lanes = moved.lanes
         if period is not None:
-            lanes = eqx.tree_at(lambda x: x.t, lanes, lanes.t - wait)
+            back = real(np.asarray(lanes.t) - wait)
+            lanes = eqx.tree_at(lambda x: x.t, lanes, back)
     if period is not None:
-        return Beginning(lanes, None, multiplicity * jnp.asarray(period, float))
+        return Beginning(lanes, None, real(multiplicity * float(period)))
     a = int(lanes.chart[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
     f, level, rate = jax.device_get(_at_start(system, lanes, section))
@@ -145,13 +149,13 @@ def begin(
     by_default = section is None
     if section is None:
         sizes = np.asarray(settings.scale)[a, : s.dims[a]]
-        plane = _Plane(jnp.asarray(q), jnp.asarray(f / sizes**2 / np.linalg.norm(f / sizes)))
+        plane = _Plane(real(q), real(f / sizes**2 / np.linalg.norm(f / sizes)))
         section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
     event = s.transition_index(section.name) if isinstance(section, AtEvent) else -1
 
     def next_meeting(lanes, doing):
         say(doing)
-        target = toward(jnp.full(1, jnp.inf), event, lanes.t + max_period)
+        target = toward(np.full(1, np.inf), event, np.asarray(lanes.t) + max_period)
         moved = _go(system, lanes, section, target, settings)
         where = "through the guess, across the flow" if by_default else str(section)
         _require(moved, f"{doing} ({where})", s, _other_section(s) if by_default else "")
@@ -162,16 +166,18 @@ def begin(
     back = lanes
     for _ in range(multiplicity):
         back = next_meeting(back, "looking for the return to the section")
-    return Beginning(lanes, section, back.t[0] - lanes.t[0])
+    duration = np.asarray(back.t)[0] - np.asarray(lanes.t)[0]
+    return Beginning(lanes, section, real(duration))
 
 
-@quick_jit
+@host_first
 def _at_start(system, lanes, section):
     """The field (d,), and the value and rate of the section's level, if it has one."""
-    s, u = Structure(system), jnp.zeros((len(system.inputs), 1))
+    s, xp = Structure(system), namespace(lanes.t)
+    u = xp.zeros((s.nu, 1))
     f = slopes(s, lanes.t, lanes.chart, lanes.q, u)[:, 0]
     target = _to_section(section, until(lanes.t))
-    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, jnp.ones(1, bool))
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, xp.ones(1, bool))
     return f, seen.value[-1, 0], seen.rate[-1, 0]
 
 
@@ -193,12 +199,13 @@ def _require(moved, doing: str, s: Structure, advice: str = "") -> None:
         )
 
 
-@quick_jit
+@host_first
 def _go(system, lanes, section, target, settings):
     """One lane to a time, or to one section, however many steps it takes."""
     s = Structure(system)
     settings = dataclasses.replace(settings, max_steps=1_000_000)
-    return move(s, lanes, jnp.zeros((s.nu, 1)), _to_section(section, target), settings)
+    u = namespace(lanes.t).zeros((s.nu, 1))
+    return move(s, lanes, u, _to_section(section, target), settings)
 
 
 def _to_section(section, target: Target) -> Target:

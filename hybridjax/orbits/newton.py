@@ -10,9 +10,10 @@ import jax
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first, quick_jit
+from .._core.executor import Array, on_host
 from ..engine.lanes import Lanes
 from .return_map import SINGULAR, ReturnMap, Turn
 
@@ -22,6 +23,8 @@ from .return_map import SINGULAR, ReturnMap, Turn
 _ATOL, _RTOL = 1e-12, 1e-11
 # Newton steps before a cycle is given up. Doubled, hopeless ones take twice as long.
 MAX_STEPS = 32
+# Steps of Levenberg and Marquardt before it is given up.
+_DAMPED_STEPS = 64
 # Along a direction in which J - I is singular, neither Newton nor a derivative moves.
 _SOLVER = lx.SVD(rcond=SINGULAR)
 
@@ -38,18 +41,23 @@ class Solution(NamedTuple):
     """`Result` code: whether this is a cycle."""
 
 
-@quick_jit
-def solve(
-    map: ReturnMap, damped: bool = False, once_more: bool = False, max_steps: int = MAX_STEPS
-) -> Solution:
+@host_first
+def solve(map: ReturnMap, once_more: bool = False) -> Solution:
     """Newton's method from the anchor's state.
 
-    **Arguments:** `damped` takes the smaller steps of Levenberg and Marquardt; `once_more` goes
-    round once more on the cycle found, so that what is seen has the derivatives of the cycle.
+    **Arguments:** `once_more` goes round once more on the cycle found, so that what is seen has the
+    derivatives of the cycle.
     """
-    q, turn, steps = root(map, damped, max_steps)
+    q, turn, steps = root(map, False, MAX_STEPS)
     if once_more:
         turn = map.turn_with_jacobian(q)
+    return Solution(map.departure(q), turn, steps, map.judge(q, turn))
+
+
+@quick_jit
+def solve_damped(map: ReturnMap) -> Solution:
+    """As `solve`, by the smaller steps of Levenberg and Marquardt."""
+    q, turn, steps = root(map, True, _DAMPED_STEPS)
     return Solution(map.departure(q), turn, steps, map.judge(q, turn))
 
 
@@ -72,7 +80,6 @@ def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float
     return np.max(np.abs(step) / (_ATOL + _RTOL * np.abs(q)), axis=1)
 
 
-@eqx.filter_custom_jvp
 def root(
     map: ReturnMap, damped: bool, max_steps: int
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
@@ -80,6 +87,24 @@ def root(
 
     Differentiable once and twice; only the state has derivatives.
     """
+    return _root_on_host(map, max_steps) if on_host(map.expected) else _root(map, damped, max_steps)
+
+
+def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Newton's method as that of optimistix."""
+    sizes, x, steps = map.sizes, map.anchor.q[:, 0] / map.sizes, 0
+    while True:
+        turn = map.turn_with_jacobian(x * sizes)
+        residual = turn.residual / sizes
+        (step,) = newton_steps((turn.jacobian * sizes / sizes[:, None])[None], residual[None])
+        x, steps = x + step, steps + 1
+        done = excess(x[None], step[None])[0] < 1 and np.max(np.abs(residual)) < _ATOL
+        if done or steps == max_steps or not np.isfinite(x).all():
+            return x * sizes, turn, np.asarray(steps)
+
+
+@eqx.filter_custom_jvp
+def _root(map, damped, max_steps):
     if damped:
         solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
     else:
@@ -91,7 +116,7 @@ def root(
     return solution.value * map.sizes, solution.aux, solution.stats["num_steps"]
 
 
-@root.def_jvp
+@_root.def_jvp
 def _root_jvp(primals, tangents):
     """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
     where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""

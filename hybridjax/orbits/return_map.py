@@ -13,11 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
+from .._core.executor import Array, namespace, on_host, scan, singular_values, stop_gradient
 from .._core.memo import remembered
 from .._core.results import Result
+from ..engine import kernels
 from ..engine.events import arm, start_lanes
 from ..engine.jacobian import flow_jacobian
 from ..engine.lanes import Lanes
@@ -132,7 +134,8 @@ class ReturnMap(eqx.Module):
     def valid(self) -> Bool[Array, " d"]:
         """Which entries of the padded state the anchor's chart has."""
         s = self.structure
-        return jnp.arange(s.d) < jnp.array(s.dims)[self.anchor.chart[0]]
+        chart = self.anchor.chart[0]
+        return np.arange(s.d) < namespace(chart).asarray(s.dims)[chart]
 
     def at_phase_of(self, system: HybridSystem) -> "ReturnMap":
         """That of another system; a clocked one begins at the same phase of its own clock."""
@@ -146,20 +149,20 @@ class ReturnMap(eqx.Module):
     def departure(self, q: Float[Array, " d"]) -> Lanes:
         """The lane at the beginning of a turn: an event that was just there is not due again."""
         s, anchor = self.structure, self.anchor
-        lanes = start_lanes(s, anchor.t, anchor.chart, q[:, None])
-        u, everywhere = jnp.zeros((s.nu, 1)), jnp.ones(1, bool)
+        lanes, xp = start_lanes(s, anchor.t, anchor.chart, q[:, None]), namespace(q)
+        u, everywhere = xp.zeros((s.nu, 1)), xp.ones(1, bool)
         seen = watch(s, lanes.t, lanes.chart, lanes.q, u, until(lanes.t), everywhere)
         lanes = arm(s, lanes, seen, self.expected[None])
         if isinstance(self.base, AtEvent):
-            own = jnp.arange(len(s.transitions))[:, None] == s.transition_index(self.base.name)
-            lanes = eqx.tree_at(lambda x: x.armed, lanes, lanes.armed & ~own)
+            own = np.arange(len(s.transitions))[:, None] == s.transition_index(self.base.name)
+            lanes = lanes._replace(armed=lanes.armed & ~own)
         return lanes
 
     def turn(self, q: Float[Array, " d"]) -> Return:
         """One turn from a state on the section."""
 
         def flow(lanes, target, h, result):
-            u = jnp.zeros((self.structure.nu, 1))
+            u = namespace(q).zeros((self.structure.nu, 1))
             moved = move(
                 self.structure, lanes, u, target, self.settings, h, result, new_input=False
             )
@@ -180,7 +183,7 @@ class ReturnMap(eqx.Module):
         `direction`: in the parameters, a system whose numbers are the direction (the phase of the
         clock at the anchor stays what it is).
         """
-        s, n = self.structure, q.shape[0]
+        s, n, xp = self.structure, q.shape[0], namespace(q)
         growth = self._growth_of_times(direction)
 
         def flow(lanes, target, h, result):
@@ -206,10 +209,10 @@ class ReturnMap(eqx.Module):
             return moved, (lanes, factor, tape.code)
 
         there, (legs, factors, codes) = self._round(q, flow)
-        legs = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), legs)
+        legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
         codes, product = codes[..., 0], monodromy(factors)
         off, by_state = self.held(q)
-        jacobian = jnp.where(self.valid[:, None], product[:n, :n], 0.0) - jnp.eye(n) - by_state
+        jacobian = xp.where(self.valid[:, None], product[:n, :n], 0.0) - np.eye(n) - by_state
         by_parameter = None
         if direction is not None:
             hold = lambda step: self._with(_moved(self.system, direction, step)).held(q)[0]  # noqa: E731
@@ -217,30 +220,30 @@ class ReturnMap(eqx.Module):
         factors = factors[:, :n, :n]
         if self.base is not None:
             factors = self._across(legs, factors)
-        defect = jnp.abs(there.residual) + jnp.abs(off)
+        defect = xp.abs(there.residual) + xp.abs(off)
         return Turn(
             there.residual, jacobian, by_parameter, legs, factors, codes, there.period,
-            jnp.max(defect / self.sizes), there.result, self._meetings(legs, codes),
+            xp.max(defect / self.sizes), there.result, self._meetings(legs, codes),
         )  # fmt: skip
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """Whether a state lies on a cycle, and what is wrong if it does not: a `Result` code."""
-        sizes, valid = self.sizes, self.valid
-        defect = monodromy(turn.factors) - jnp.diag(valid * 1.0) - self.held(q)[1]
-        singular = jnp.linalg.svd(defect * sizes / sizes[:, None], compute_uv=False)
-        smallest = jnp.min(jnp.where(jnp.arange(len(q)) < valid.sum(), singular, jnp.inf))
-        code = jnp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
-        found = jnp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = jnp.where(turn.closed, found, code)
+        sizes, valid, xp = self.sizes, self.valid, namespace(q)
+        defect = monodromy(turn.factors) - xp.diag(valid * 1.0) - self.held(q)[1]
+        singular = singular_values(defect * sizes / sizes[:, None])
+        smallest = xp.min(xp.where(np.arange(len(q)) < valid.sum(), singular, np.inf))
+        code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
+        found = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
+        code = xp.where(turn.closed, found, code)
         if self.base is not None:
             same = turn.legs.chart == self.anchor.chart
-            apart = jnp.max(jnp.abs(turn.legs.q - q[:, None]) / sizes[:, None], axis=0)
-            farthest = jnp.max(jnp.where(same, apart, jnp.inf))
-            still = farthest <= _REST * jnp.maximum(self.settings.atol, turn.distance)
+            apart = xp.max(xp.abs(turn.legs.q - q[:, None]) / sizes[:, None], axis=0)
+            farthest = xp.max(xp.where(same, apart, np.inf))
+            still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
             extra = turn.meetings > self.multiplicity
-            code = jnp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
-            code = jnp.where(turn.closed & still, Result.EQUILIBRIUM, code)
-        return code.astype(jnp.int32)
+            code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
+            code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
+        return code.astype(np.int32)
 
     def held(self, q: Float[Array, " d"]) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
         """The step of the state that takes conserved quantities away from their values, as far as
@@ -249,30 +252,39 @@ class ReturnMap(eqx.Module):
         Along P(q) - q nothing that is conserved changes, so that P(q) - q and this step can add up
         to zero only where both are zero; and J - I is regular once the derivative is taken from it.
         """
-        s = self.structure
+        s, xp, sizes = self.structure, namespace(q), self.sizes
         if not self.conserved:
-            return jnp.zeros_like(q), jnp.zeros((s.d, s.d))
-        outputs = s.resolve_outputs(tuple(self.conserved))
-        t, u, sizes = self.anchor.t[0], jnp.zeros(s.nu), self.sizes
+            return xp.zeros_like(q), xp.zeros((s.d, s.d))
+        excess, gradient = self._excess(q)
+        steep = xp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
+        steep = xp.where(steep > 0, steep, 1.0)
+        back = sizes[:, None] * xp.linalg.pinv(gradient * sizes / steep) / steep.T
+        back = stop_gradient(back)
+        return back @ excess, back @ gradient
+
+    def _excess(self, q: Float[Array, " d"]) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
+        """Conserved quantities less their values, and the derivative."""
+        s, names, t = self.structure, tuple(self.conserved), self.anchor.t[0]
+        values = namespace(q).stack(list(self.conserved.values()))
+        if on_host(q):
+            a = int(self.anchor.chart[0])
+            n = s.dims[a]
+            point = t[None], q[:n, None], np.zeros((s.nu, 1))
+            found = kernels.outputs(s, a, names, *point)[..., 0]
+            gradient = np.zeros((len(names), s.d))
+            gradient[:, :n] = found[:, 2 : 2 + n]
+            return found[:, 0] - values, gradient
+        outputs, u = s.resolve_outputs(names), jnp.zeros(s.nu)
         branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
-
-        def excess(q):
-            values = jnp.stack(list(self.conserved.values()))
-            return jax.lax.switch(self.anchor.chart[0], branches, q) - values
-
-        gradient = jax.jacfwd(excess)(q)
-        steep = jnp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
-        steep = jnp.where(steep > 0, steep, 1.0)
-        back = sizes[:, None] * jnp.linalg.pinv(gradient * sizes / steep) / steep.T
-        back = jax.lax.stop_gradient(back)
-        return back @ excess(q), back @ gradient
+        excess = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q) - values  # noqa: E731
+        return excess(q), jax.jacfwd(excess)(q)
 
     def _with(self, system: HybridSystem) -> "ReturnMap":
         return dataclasses.replace(self, system=system)
 
     def _round(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
         """One turn, piece by piece, each done by `flow`, and what `flow` returned besides."""
-        targets = self._leg_targets()
+        targets, xp = self._leg_targets(), namespace(q)
         each, common = eqx.partition(targets, _per_lane(targets))
 
         def leg(carry, target):
@@ -282,42 +294,43 @@ class ReturnMap(eqx.Module):
             return (moved.lanes, moved.h, moved.result), extra
 
         first_step = (0.5 * self.expected / LEGS)[None]
-        begin = (self.departure(q), first_step, jnp.zeros(1, jnp.int32))
-        (end, _, result), extra = jax.lax.scan(leg, begin, each)
+        begin = (self.departure(q), first_step, xp.zeros(1, xp.int32))
+        (end, _, result), extra = scan(leg, begin, each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
-        residual = jnp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
-        residual = jnp.where(same, residual, jnp.nan)
+        residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
+        residual = xp.where(same, residual, np.nan)
         return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
 
     def _leg_targets(self) -> Target:
         """Targets of the pieces of one turn: K - 1 times, then the section it began on."""
-        t0, expected, k = self.anchor.t[0], self.expected, jnp.arange(1, LEGS + 1)
+        xp, t0, expected = namespace(self.anchor.t), self.anchor.t[0], self.expected
+        k = xp.arange(1, LEGS + 1)
         if self.base is None:
             return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
-        time = jnp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), jnp.inf)
+        time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
         target = toward(time, -1, t0 + 3 * expected)
         last = k == LEGS
         if isinstance(self.base, AtEvent):
             event = self.structure.transition_index(self.base.name)
-            event = jnp.where(last, event, -1).astype(jnp.int32)
+            event = xp.where(last, event, -1).astype(np.int32)
             return dataclasses.replace(target, event=event)
-        index = jnp.where(last, 0, -1).astype(jnp.int32)
+        index = xp.where(last, 0, -1).astype(np.int32)
         return dataclasses.replace(target, index=index, levels=ListLevels((self.base,)))
 
     def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
-        s = self.structure
+        s, xp = self.structure, namespace(codes)
         if self.base is None:
-            return jnp.asarray(self.multiplicity, jnp.int32)
+            return xp.asarray(self.multiplicity, dtype=np.int32)
         if isinstance(self.base, AtEvent):
             own = codes == s.transition_index(self.base.name)
-            return jnp.sum(own, dtype=jnp.int32)
+            return xp.sum(own, dtype=np.int32)
         K = legs.t.shape[0]
         target = dataclasses.replace(until(legs.t), levels=ListLevels((self.base,)))
-        u, everywhere = jnp.zeros((s.nu, K)), jnp.ones(K, bool)
+        u, everywhere = xp.zeros((s.nu, K)), xp.ones(K, bool)
         level = watch(s, legs.t, legs.chart, legs.q, u, target, everywhere).value[-1]
         falls = (level[1:-1] > 0) & (level[2:] <= 0) & (legs.events[1:-1] == legs.events[2:])
-        return 1 + jnp.sum(falls, dtype=jnp.int32)
+        return 1 + xp.sum(falls, dtype=np.int32)
 
     def _across(self, legs: Lanes, factors: Float[Array, "K d d"]) -> Float[Array, "K d d"]:
         """The factors on the states modulo the direction of the flow.
@@ -325,19 +338,18 @@ class ReturnMap(eqx.Module):
         Along the flow of an autonomous system nothing contracts. Taken out of every factor, that
         direction cannot drown a strong contraction across it.
         """
-        s = self.structure
-        sizes = self.sizes_in(legs.chart)
-        f = slopes(s, legs.t, legs.chart, legs.q, jnp.zeros((s.nu, legs.t.shape[0]))).T / sizes
-        f = f / jnp.linalg.norm(f, axis=1, keepdims=True)
-        project = jnp.eye(s.d) - f[:, :, None] * f[:, None, :]
+        s, xp, sizes = self.structure, namespace(factors), self.sizes_in(legs.chart)
+        f = slopes(s, legs.t, legs.chart, legs.q, xp.zeros((s.nu, legs.t.shape[0]))).T / sizes
+        f = f / xp.linalg.norm(f, axis=1, keepdims=True)
+        project = np.eye(s.d) - f[:, :, None] * f[:, None, :]
         project = project * sizes[:, :, None] / sizes[:, None, :]
-        return jnp.roll(project, -1, axis=0) @ factors @ project
+        return xp.roll(project, -1, axis=0) @ factors @ project
 
     def _growth_of_times(self, direction: HybridSystem | None) -> Float[Array, ""]:
         """How fast all times of a turn grow, relatively, along a direction in the parameters:
         with the period of the clock, if there is one."""
         if direction is None or self.base is not None:
-            return jnp.zeros(())
+            return np.zeros(())
         period = lambda step: jnp.asarray(  # noqa: E731
             _moved(self.system, direction, step).period(), float
         )

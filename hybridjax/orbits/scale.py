@@ -10,14 +10,13 @@ zero, the size is so large that they are tolerated.
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .._core.compilation.compile import quick_jit
-from ..engine.watch import slopes
+from .._core.precision import real
+from ..engine import kernels
 from ..errors import DefinitionError
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -42,8 +41,6 @@ _TIME_ROUNDING = 2.0
 # Phases of the clock at which rounding errors of the field are seen at a guess: an odd number, lest
 # they be those of a symmetry. Doubled, a state that rounding moves is found more surely.
 _PHASES = 7
-# Points at which fields are seen in one call, so that one program serves guesses and cycles.
-_POINTS = 16
 
 
 class GuessSizes(NamedTuple):
@@ -58,8 +55,8 @@ class GuessSizes(NamedTuple):
 def sizes_near(
     system: HybridSystem,
     chart: int,
-    t: Float[Array, ""],
-    q: Float[Array, " d"],
+    t: float,
+    q: Float[np.ndarray, " d"],
     period: float | None,
 ) -> GuessSizes:
     """Sizes of all states, from the field at a guess and at the states that resets make of it.
@@ -67,13 +64,13 @@ def sizes_near(
     **Arguments:** `chart`, index of the guess's chart; `q`, padded; `period` of the clock.
     """
     s = Structure(system)
-    points = np.asarray(_reached(system, chart, t, q))
+    points = _reached(s, chart, t, q)
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
     reached = np.roll(reached, -int(np.argmax(reached == chart)))  # the guess's chart first
     phases = np.zeros(1) if period is None else period * np.arange(_PHASES) / _PHASES
     R, n = len(reached), len(phases)
     times, states = np.repeat(float(t) + phases, R), np.tile(points[reached].T, n)
-    seen = _look(system, np.tile(reached, n), times, states)
+    seen = _look(s, np.tile(reached, n), times, states)
     near = _Seen(*(x[..., :R] for x in seen))
     time = _time_scale(near)
     turn = _MODES * time
@@ -92,9 +89,10 @@ def sizes_on(
     period: float,
 ) -> Sizes:
     """Sizes of all states, from points of a cycle."""
-    seen = _look(system, np.asarray(chart), np.asarray(t), np.asarray(q))
+    s = Structure(system)
+    seen = _look(s, np.asarray(chart), np.asarray(t), np.asarray(q))
     size = np.maximum(np.abs(seen.q), _floor(seen, period))
-    return _by_name(Structure(system), np.asarray(chart), size)
+    return _by_name(s, np.asarray(chart), size)
 
 
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
@@ -121,7 +119,7 @@ def scale_of(
     for a, chart in enumerate(s.charts):
         scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
     if otherwise is None:
-        return jnp.asarray(np.where(np.isnan(scale), 1.0, scale))
+        return real(np.where(np.isnan(scale), 1.0, scale))
     return jnp.where(np.isnan(scale), otherwise, scale)
 
 
@@ -145,58 +143,49 @@ class _Seen(NamedTuple):
     """By how much rounding errors change the field, seen at states and times that all but agree."""
 
 
-def _look(system, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
-    K = len(chart)
-    fill = np.arange(-(-K // _POINTS) * _POINTS) % K
-    field = jax.device_get(_field(system, chart[fill].astype(np.int32), t[fill], q[:, fill]))
-    return _Seen(q, *(x[..., :K] for x in field))
+def _look(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Seen:
+    seen = _Seen(q, *np.zeros((2, *q.shape)), np.zeros((s.d, *q.shape)), np.zeros(q.shape))
+    for a in np.unique(chart):
+        n, here = s.dims[a], np.flatnonzero(chart == a)
+        own = _field(s, int(a), t[here], q[:n, here])
+        for whole, part in zip(seen[1:], own, strict=True):
+            whole[(*map(slice, part.shape[:-1]), here)] = part
+    return seen
 
 
-@quick_jit
-def _field(system, chart, t, q):
-    s = Structure(system)
-    K, n, eps = len(chart), len(_SHIFTS), np.finfo(float).eps
-    S = 1 + 2 * n
-
-    def at(t, q):
-        n = len(t) // K
-        return slopes(s, t, jnp.repeat(chart, n), q, jnp.zeros((s.nu, K * n)))
-
+def _field(s: Structure, a: int, t, q):
+    """What `_Seen` says of the field at points of chart a."""
+    n, eps = len(q), np.finfo(float).eps
     # First none, then states (not all by the same part, since a common factor may cancel), then t.
-    shifts = np.zeros((s.d, S))
-    shifts[:, 1 : n + 1] = [np.roll(_SHIFTS, k) for k in range(s.d)]
+    shifts = np.zeros((n, 1 + 2 * len(_SHIFTS)))
+    shifts[:, 1 : len(_SHIFTS) + 1] = [np.roll(_SHIFTS, k) for k in range(n)]
     moved = q[..., None] * (1 + eps * shifts[:, None])
-    later = t[:, None] * (1 + eps * np.concatenate([np.zeros(n + 1), _SHIFTS]))
-    fields = at(later.ravel(), moved.reshape(s.d, K * S)).reshape(s.d, K, S)
-    f, still, forwards = fields[..., 0], jnp.zeros((s.d, K)), jnp.ones((1, K))
-    times = jnp.concatenate([still, forwards])  # along each state, then along the flow
-    states = jnp.concatenate([jnp.eye(s.d)[:, :, None] * forwards, f[None]])
-    push = lambda dt, dq: jax.jvp(at, (t, q), (dt, dq))[1]  # noqa: E731
-    along = jax.vmap(push, out_axes=1)(times, states)
-    derivative, change = along[:, :-1], along[:, -1]
-    by_time = (change - jnp.einsum("ijk,jk->ik", derivative, f))[..., None]
-    smooth = jnp.einsum("ijk,jks->iks", derivative, moved - q[..., None])
+    later = t[:, None] * (1 + eps * np.append(np.zeros(len(_SHIFTS) + 1), _SHIFTS))
+    u = np.zeros((s.nu, 1))
+    seen = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u).reshape(n, -1, *later.shape)
+    fields, by_time, derivative = seen[:, 0], seen[:, 1, :, :1], seen[:, 2 : 2 + n, :, 0]
+    f = fields[..., 0]
+    change = by_time[..., 0] + np.einsum("ijk,jk->ik", derivative, f)
+    smooth = np.einsum("ijk,jks->iks", derivative, moved - q[..., None])
     smooth = smooth + by_time * (later - t[:, None])
-    off = jnp.abs(fields - f[..., None] - smooth)
-    of_time = _TIME_ROUNDING * eps * jnp.abs(by_time * t[:, None])
-    off = jnp.concatenate([off[..., : n + 1], off[..., n + 1 :] - of_time], axis=-1)
-    rounding = jnp.max(off, axis=-1)  # not negative: without a shift there is none
+    off = np.abs(fields - f[..., None] - smooth)
+    off[..., len(_SHIFTS) + 1 :] -= _TIME_ROUNDING * eps * np.abs(by_time * t[:, None])
+    rounding = np.max(off, axis=-1)  # not negative: without a shift there is none
     return f, change, derivative, rounding
 
 
-@quick_jit
-def _reached(system, chart: int, t, q) -> Float[Array, "A d"]:
+def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
     """A state in every chart, by resets from the guess's; NaN in charts that none leads to."""
-    s = Structure(system)
-    states = {chart: q[: s.dims[chart]]}
+    points = np.full((len(s.charts), s.d), np.nan)
+    points[chart], known = q, {chart}
     for _ in s.charts:
         for g, transition in enumerate(s.transitions):
             a, b = s.chart_index(transition.source), s.chart_index(transition.target)
-            if a in states and b not in states:
-                states[b] = s.reset(g, t, states[a], jnp.zeros(s.nu))
-    blank = jnp.full(s.d, jnp.nan)
-    pad = lambda a: jnp.zeros(s.d).at[: s.dims[a]].set(states[a])  # noqa: E731
-    return jnp.stack([pad(a) if a in states else blank for a in range(len(s.charts))])
+            if a in known and b not in known:
+                before = points[a, : s.dims[a], None]
+                after = kernels.reset(s, g, np.array([t]), before, np.zeros((s.nu, 1)))[:, 0, 0]
+                points[b], known = np.pad(after, (0, s.d - len(after))), known | {b}
+    return points
 
 
 def _time_scale(near: _Seen) -> float:

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Scalar, SectionCount
+from .._core.executor import Array, Definition
 from .._core.precision import real
 
 # Subclasses of `AbstractSections` meet these two, which other layers define.
@@ -54,7 +55,7 @@ class BoundSections(eqx.Module):
         return cls(never, jnp.full(n_sections, -1, jnp.int32), levels)
 
 
-class AbstractSections(eqx.Module):
+class AbstractSections(Definition):
     """A family of N Poincaré sections, in the order in which a limit cycle meets them.
 
     A family is a definition: it holds functions and numbers, and belongs to no cycle.

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Scalar, SignalNames
+from .._core.executor import Definition
 from .._core.precision import real
 from .._core.text import fields
 from ..systems.output import Output
@@ -19,7 +20,7 @@ Direction = Literal["falling", "rising"]
 
 
 @checked
-class Crossing(eqx.Module):
+class Crossing(Definition):
     """A section: the level set `function = value`, crossed in a stated direction.
 
     In a recording (`hj.recordings.estimate_phase`) it is the beginning of each cycle.

@@ -7,11 +7,12 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
+from .._core.executor import Definition
 from .._core.text import fields
 
 
 @checked
-class Output(eqx.Module):
+class Output(Definition):
     """A named scalar output z = h(t, q, u).
 
     **Fields:**

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from .._core.compilation.kernel import kernel
 from .._core.lanes.per_lane import PerLane, by_lane, shared
 from .._core.signal import Signal, signals, unit_of
 from .._core.tracing import is_traced
@@ -48,6 +49,11 @@ class Structure:
         self.d = max(self.dims)
         self.inputs: tuple[Signal, ...] = signals(system.inputs, system.input_units)
         self.nu = len(self.inputs)
+        self.nu = len(system.inputs)
+        out = [[g for g, tr in enumerate(self.transitions) if tr.source == n] for n in self.names]
+        by_clock = [isinstance(tr.guard, Scheduled) for tr in self.transitions]
+        self._guards = [[g for g in own if not by_clock[g]] for own in out]
+        self._schedules = [[g for g in own if by_clock[g]] for own in out]
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
@@ -69,6 +75,18 @@ class Structure:
         return by_lane(
             lambda system, *rest: function(Structure(system), *rest), self.source, *trees
         )
+
+    def kernel(
+        self, function: Callable, *static: Hashable, trees: tuple = (), lanes: int = 1
+    ) -> Callable:
+        """`function(*static, system, *trees, *arguments)` for arrays of the host, compiled (see
+        `_core/compilation/kernel.py`)."""
+        name = function, static
+        known = self._made.get(name)
+        if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
+            known = kernel(function, static, (self.source, *trees), lanes), trees
+            self._made[name] = known
+        return known[0]
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:
@@ -95,14 +113,11 @@ class Structure:
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a."""
-        return [g for g, tr in self._out(a) if not isinstance(tr.guard, Scheduled)]
+        return self._guards[a]
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
-        return [g for g, tr in self._out(a) if isinstance(tr.guard, Scheduled)]
-
-    def _out(self, a: int):
-        return [(g, tr) for g, tr in enumerate(self.transitions) if tr.source == self.names[a]]
+        return self._schedules[a]
 
     def guard(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
@@ -225,7 +240,6 @@ def check_system(system: HybridSystem) -> None:
         raise DefinitionError(f"{type(system).__name__} has no charts.")
     _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
     s = Structure(system)
-    t, u = jnp.zeros(()), jnp.zeros(s.nu)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         for unknown in set(chart.inputs or ()) - set(system.inputs):
             raise DefinitionError(
@@ -234,8 +248,7 @@ def check_system(system: HybridSystem) -> None:
             )
         if len(set(chart.states)) < len(chart.states):
             raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
-        _check_units(f"chart '{name}'", "states", chart.states, chart.units)
-        shape = _shape(f"field of chart '{name}'", lambda q, a=a: s.field(a, t, q, u), s.dims[a])
+        shape = _shape(f"field of chart '{name}'", lambda t, q, u, a=a: s.field(a, t, q, u), s, a)
         if shape != (s.dims[a],):
             raise DefinitionError(
                 f"the field of chart '{name}' returns shape {shape}, but the chart has the "
@@ -256,10 +269,10 @@ def check_system(system: HybridSystem) -> None:
         a, b = s.chart_index(tr.source), s.chart_index(tr.target)
         label = f"transition '{tr.name}' ({tr.source} -> {tr.target})"
         if not isinstance(tr.guard, Scheduled):
-            shape = _shape(f"guard of {label}", lambda q, g=g: s.guard(g, t, q, u), s.dims[a])
+            shape = _shape(f"guard of {label}", lambda t, q, u, g=g: s.guard(g, t, q, u), s, a)
             if shape != ():
                 raise DefinitionError(f"the guard of {label} returns shape {shape}, not a number.")
-        shape = _shape(f"reset of {label}", lambda q, g=g: s.reset(g, t, q, u), s.dims[a])
+        shape = _shape(f"reset of {label}", lambda t, q, u, g=g: s.reset(g, t, q, u), s, a)
         if shape != (s.dims[b],):
             raise DefinitionError(
                 f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
@@ -267,9 +280,12 @@ def check_system(system: HybridSystem) -> None:
             )
 
 
-def _shape(what: str, function: Callable, n: int) -> tuple[int, ...]:
+def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:
+    shapes = (), (s.dims[a],), (s.nu,)
     try:
-        return jax.eval_shape(function, jax.ShapeDtypeStruct((n,), jnp.result_type(float))).shape
+        return jax.eval_shape(
+            function, *(jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes)
+        ).shape
     except DefinitionError:
         raise
     except Exception as error:

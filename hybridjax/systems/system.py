@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.kinds import Scalar, Vector
+from .._core.executor import Definition
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart
@@ -63,7 +64,7 @@ class Guess(eqx.Module):
         return fields(self)
 
 
-class HybridSystem(eqx.Module):
+class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
     ```python

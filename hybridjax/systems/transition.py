@@ -4,10 +4,11 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PositiveScalar, Scalar
+from .._core.executor import Array, namespace
 from .._core.precision import real
 from .._core.text import fields
 
@@ -27,6 +28,11 @@ class Scheduled(eqx.Module):
 
     def __repr__(self):
         return fields(self)
+
+    def numbers(self, t: Array) -> tuple[Array, Array]:
+        """`offset` and `period`, as arrays of the kind of t."""
+        xp = namespace(t)
+        return xp.asarray(self.offset), xp.asarray(self.period)
 
 
 def _identity(t, q, u):

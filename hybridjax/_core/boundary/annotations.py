@@ -83,6 +83,14 @@ def kind_of(hint: Any) -> Kind | None:
 
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
+    arrays = [kind for kind in kinds if isinstance(kind, Reals)]
+    if (
+        len(arrays) > 1 and arrays[0].form is not None
+    ):  # of NumPy or of JAX: they stay what they are
+        arrays[0].form = None
+        kinds = [kind for kind in kinds if kind not in arrays[1:]]
+    if len(kinds) == 1:
+        return kinds[0]
     if None in kinds:
         return None
     return Either(*sorted(kinds, key=lambda kind: isinstance(kind, Nothing)))

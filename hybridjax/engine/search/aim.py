@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..._core.executor import Array, namespace, put
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ...systems.transition import Scheduled
@@ -46,36 +46,37 @@ class Way(NamedTuple):
 def take_aim(s: Structure, state: State, task: Task) -> tuple[Aim, Way]:
     """Where each lane goes next; nowhere, if it is not active."""
     lanes, approach, target = state.lanes, state.approach, task.target
+    xp = namespace(lanes.t)
     # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    known, schedule = target.time, jnp.full_like(lanes.chart, -1)
+    known, schedule = target.time, xp.full_like(lanes.chart, -1)
     if _has_schedules(s):
         scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
-        known = jnp.minimum(target.time, scheduled)
-        schedule = jnp.where(scheduled <= target.time, which, -1)
-    rest = jnp.maximum(known - lanes.t, 0.0)
-    steps = jnp.where(jnp.isfinite(rest), rest / state.h, 2.0)
-    pieces = jnp.ceil(steps - at_precision(*_WHOLE_STEPS))
+        known = xp.minimum(target.time, scheduled)
+        schedule = xp.where(scheduled <= target.time, which, -1)
+    rest = xp.maximum(known - lanes.t, 0.0)
+    steps = xp.where(xp.isfinite(rest), rest / state.h, 2.0)
+    pieces = xp.ceil(steps - at_precision(*_WHOLE_STEPS))
     last = (pieces <= 1) & ~approach.on
-    step = jnp.where(jnp.isfinite(rest), rest / jnp.maximum(pieces, 1.0), state.h)
-    which = jnp.where(approach.on, approach.which, -1)
+    step = xp.where(xp.isfinite(rest), rest / xp.maximum(pieces, 1.0), state.h)
+    which = xp.where(approach.on, approach.which, -1)
     # A zero that Newton's guess places within the first step is aimed at, where the way is known.
     value, rate = state.seen
     lead = task.stride.lead
-    guess = value / jnp.where(rate < 0, -rate, jnp.inf)
-    guess = guess.at[-1].multiply(jnp.where(state.i == 0, lead, 1.0))
+    guess = value / xp.where(rate < 0, -rate, xp.inf)
+    guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))
     level = np.arange(len(value))[:, None] == len(s.transitions)
     new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
-    within = guess <= jnp.where(level, 1.0, _AIM_WITHIN) * step
+    within = guess <= xp.where(level, 1.0, _AIM_WITHIN) * step
     sure = state.ready & (guess > 0) & within & (level | new)
-    guess = jnp.where(sure & ~approach.on & (lead > 0), guess, jnp.inf)
-    nearest = jnp.min(guess, axis=0)
-    homing = jnp.isfinite(nearest)
-    step = jnp.where(homing, nearest, step)
-    which = jnp.where(homing, jnp.argmin(guess, axis=0).astype(jnp.int32), which)
+    guess = xp.where(sure & ~approach.on & (lead > 0), guess, xp.inf)
+    nearest = xp.min(guess, axis=0)
+    homing = xp.isfinite(nearest)
+    step = xp.where(homing, nearest, step)
+    which = xp.where(homing, xp.argmin(guess, axis=0).astype(xp.int32), which)
     last = last & ~homing & state.active
-    step = jnp.where(state.active, jnp.where(approach.on, approach.tau, step), 0.0)
-    reach = jnp.where(approach.on, approach.reach, step)
-    return Aim(which, step, reach), Way(known, jnp.where(last, schedule, -1), last)
+    step = xp.where(state.active, xp.where(approach.on, approach.tau, step), 0.0)
+    reach = xp.where(approach.on, approach.reach, step)
+    return Aim(which, step, reach), Way(known, xp.where(last, schedule, -1), last)
 
 
 def _has_schedules(s: Structure) -> bool:

@@ -2,17 +2,17 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..._core.executor import Array, cond, namespace, put
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..events import width
 from ..hermite import NEAR, control_points, root_near_end
 from ..lanes import for_each_chart, only
-from ..solver.step import Step, rk_step, rounding_error
+from ..settings import size, tolerance
+from ..solver.step import Step, rounding_error
 from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 from .aim import Aim
 from .state import State, Task
@@ -92,89 +92,90 @@ def attempt(
     derivative: where the state rests, it has none of its own.
     """
     lanes, ready, L = state.lanes, state.ready, state.lanes.t.shape[0]
-    zero, no, yes = jnp.zeros(L), jnp.zeros(L, bool), jnp.ones(L, bool)
-    empty = Attempt(lanes.q, nothing(s, L), zero, zero, no, no, no, yes)
+    xp = namespace(lanes.t)
+    zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
+    empty = Attempt(lanes.q, nothing(s, lanes.t), zero, zero, no, no, no, yes)
 
     def work(a, here, out):
         n = s.dims[a]
         flow = chart_flow(s, a, here, task.u, task.target)
         t, q = only(here, lanes.t), only(here, lanes.q[:n])
-        tau = jnp.where(here, aim.step, 0.0)
+        tau = xp.where(here, aim.step, 0.0)
         if in_step:
-            t, tau = t[:1], aim.step[jnp.argmax(here)][None]
+            t, tau = t[:1], aim.step[xp.argmax(here)][None]
         # (A branch of its own, lest XLA masks the states again in every stage.)
         some = here.any()
-        step = jax.lax.cond(
+        step = cond(
             some,
-            lambda: rk_step(flow.field, t, q, tau, unroll),
+            lambda: flow.step(t, q, tau, unroll),
             lambda: Step(q, q, q, q),
         )
-        rounding = jnp.zeros_like(q)
+        rounding = xp.zeros_like(q)
         if task.settings.scale is None:
-            rounding = jax.lax.cond(
+            rounding = cond(
                 some,
                 lambda: rounding_error(flow.field, t + tau, step.q, step.f1),
-                lambda: jnp.zeros_like(q),
+                lambda: xp.zeros_like(q),
             )
-        tolerance = task.settings.tolerance(a, q, tau, step, rounding)
-        error = jnp.max(jnp.abs(step.error) / tolerance, axis=0, initial=0.0)
+        allowed = tolerance(task.settings, a, q, tau, step, rounding)
+        error = xp.max(xp.abs(step.error) / allowed, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * task.settings.size(a, q, step.q)
+            aside = _ASIDE * size(task.settings, a, q, step.q)
             direction = np.cos(1.0 + np.arange(n))[:, None]
-            near = jax.lax.cond(
+            near = cond(
                 some & tangents,
-                lambda: rk_step(flow.field, t, q + aside * direction, tau, unroll).error,
+                lambda: flow.step(t, q + aside * direction, tau, unroll).error,
                 lambda: step.error,
             )
-            change = jnp.abs(near - step.error) / (task.settings.rtol * aside)
-            change = jnp.max(change, axis=0, initial=0.0)
-            error = jnp.maximum(error, jnp.where(jnp.isfinite(change), change, 0.0))
-        finite = jnp.isfinite(step.q).all(axis=0) & ~jnp.isnan(error)
-        error = jnp.where(finite, error, jnp.inf)
+            change = xp.abs(near - step.error) / (task.settings.rtol * aside)
+            change = xp.max(change, axis=0, initial=0.0)
+            error = xp.maximum(error, xp.where(xp.isfinite(change), change, 0.0))
+        finite = xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error)
+        error = xp.where(finite, error, xp.inf)
         rows = flow.rows
         if not rows:
-            end = jnp.where(here, step.q, out.q[:n])
-            return out._replace(q=out.q.at[:n].set(end), error=jnp.where(here, error, out.error))
+            end = xp.where(here, step.q, out.q[:n])
+            return out._replace(q=put(out.q, slice(n), end), error=xp.where(here, error, out.error))
 
-        before, which = take(state.seen, rows), jnp.where(here, aim.which, -1)
+        before, which = take(state.seen, rows), xp.where(here, aim.which, -1)
         home, moved = _Home(step.q, step.f1, zero, no, zero), tau
         if not in_step:
-            home = jax.lax.cond(
+            home = cond(
                 (which >= 0).any(),
-                lambda: _go_home(flow, before, which, step, tolerance, t, tau, aim.reach, task),
+                lambda: _go_home(flow, before, which, step, allowed, t, tau, aim.reach, task),
                 lambda: home,
             )
-            moved = tau + jnp.where(home.lands, home.past, 0.0)
-        after = jax.lax.cond(some, lambda: flow.watch(t + moved, home.q, home.f), lambda: before)
+            moved = tau + xp.where(home.lands, home.past, 0.0)
+        after = cond(some, lambda: flow.watch(t + moved, home.q, home.f), lambda: before)
         ends = before.value, after.value, moved * before.rate, moved * after.rate
 
         middle = 0.5 * (q + home.q) + 0.125 * moved * (step.f0 - home.f)
         true = flow.watch(t + 0.5 * moved, middle, home.f).value
         cubic = 0.5 * (ends[0] + ends[1]) + 0.125 * (ends[2] - ends[3])
-        size = jnp.abs(ends[0]) + jnp.abs(ends[1]) + jnp.abs(true)
-        fastest = jnp.maximum(jnp.abs(before.rate), jnp.abs(after.rate))
-        bent = jnp.abs(true - cubic) > _BEND * size + width(t, task.span, fastest)
+        around = xp.abs(ends[0]) + xp.abs(ends[1]) + xp.abs(true)
+        fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
+        bent = xp.abs(true - cubic) > _BEND * around + width(t, task.span, fastest)
         bent = bent.any(axis=0)
 
         points = control_points(*ends)
-        low = jnp.minimum(jnp.minimum(points[0], points[1]), jnp.minimum(points[2], points[3]))
-        high = jnp.maximum(jnp.maximum(points[0], points[1]), jnp.maximum(points[2], points[3]))
-        scale = jnp.maximum(jnp.abs(ends[0]), jnp.abs(ends[1]))
+        low = xp.minimum(xp.minimum(points[0], points[1]), xp.minimum(points[2], points[3]))
+        high = xp.maximum(xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3]))
+        scale = xp.maximum(xp.abs(ends[0]), xp.abs(ends[1]))
         own = (np.array(rows)[:, None] == which) & home.lands
-        armed = jnp.stack([ready[row] for row in rows])
-        far = jnp.where(armed, low > NEAR * scale, high <= 0)
-        fastest = jnp.maximum(jnp.abs(ends[2]), jnp.abs(ends[0]))
+        armed = xp.stack([ready[row] for row in rows])
+        far = xp.where(armed, low > NEAR * scale, high <= 0)
+        fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
         # (By rounding, the zero may lie a little before the start.)
-        slow = (own & (jnp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
+        slow = (own & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
         return Attempt(
-            out.q.at[:n].set(jnp.where(here, home.q, out.q[:n])),
+            put(out.q, slice(n), xp.where(here, home.q, out.q[:n])),
             write(out.seen, rows, here, after),
-            jnp.where(here, error + home.rough, out.error),
-            jnp.where(here, home.past, out.past),
-            jnp.where(here, home.lands, out.lands),
-            jnp.where(here, slow, out.slow),
-            jnp.where(here, bent, out.bent),
-            jnp.where(here, (far | own).all(axis=0) & ~bent & ~slow, out.calm),
+            xp.where(here, error + home.rough, out.error),
+            xp.where(here, home.past, out.past),
+            xp.where(here, home.lands, out.lands),
+            xp.where(here, slow, out.slow),
+            xp.where(here, bent, out.bent),
+            xp.where(here, (far | own).all(axis=0) & ~bent & ~slow, out.calm),
         )
 
     return for_each_chart(s, lanes.chart, state.active, work, empty)
@@ -185,30 +186,30 @@ def _go_home(
     before: Watch,
     which: Int[Array, " L"],
     step: Step,
-    tolerance: Float[Array, "n #L"],
+    allowed: Float[Array, "n #L"],
     t: Float[Array, " L"],
     tau: Float[Array, " L"],
     reach: Float[Array, " L"],
     task: Task,
 ) -> _Home:
     """From the end of a step of length tau onto the zero of `which`, on either side of it."""
-    after = flow.watch(t + tau, step.q, step.f1)
+    xp, after = namespace(tau), flow.watch(t + tau, step.q, step.f1)
     v0, r0, v1, r1 = (pick(x, flow.rows, which) for x in (*before, *after))
     by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
-    by_newton = -v1 / jnp.where(r1 == 0, 1.0, r1)
-    first = jnp.where(tau > _SHORT_STEP * reach, by_cubic, by_newton)
-    near = (which >= 0) & (jnp.abs(first) <= reach)
-    first = jnp.where(near, first, 0.0)
+    by_newton = -v1 / xp.where(r1 == 0, 1.0, r1)
+    first = xp.where(tau > _SHORT_STEP * reach, by_cubic, by_newton)
+    near = (which >= 0) & (xp.abs(first) <= reach)
+    first = xp.where(near, first, 0.0)
     end = flow.settle(t + tau, step.q, step.f1, which, first)
-    share = jnp.abs(first) / jnp.where(reach > 0, reach, 1.0)
-    rough = jnp.max(end.error / tolerance * jnp.where(share > 0, share, 0.0) ** 2, axis=0)
+    share = xp.abs(first) / xp.where(reach > 0, reach, 1.0)
+    rough = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
     rounding = at_precision(*_LAST_CORRECTION_OF_SPAN) * task.span
-    fine = jnp.abs(end.last) <= _LAST_CORRECTION * jnp.abs(tau + end.past) + rounding
-    lands = near & fine & (share <= _LANDING_REACH) & (jnp.abs(rough) <= 1.0)
+    fine = xp.abs(end.last) <= _LAST_CORRECTION * xp.abs(tau + end.past) + rounding
+    lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(rough) <= 1.0)
     return _Home(
-        jnp.where(lands, end.q, step.q),
-        jnp.where(lands, end.f, step.f1),
-        jnp.where(near, end.past, by_newton),
+        xp.where(lands, end.q, step.q),
+        xp.where(lands, end.f, step.f1),
+        xp.where(near, end.past, by_newton),
         lands,
-        jnp.where(lands, jnp.abs(rough), 0.0),
+        xp.where(lands, xp.abs(rough), 0.0),
     )

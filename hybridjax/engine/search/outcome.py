@@ -4,12 +4,10 @@ As long as no watched function comes near to a zero in any lane, little has to b
 otherwise `eventfully` finds out what happened.
 """
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..._core.executor import Array, cond, namespace, put
 from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
@@ -47,15 +45,17 @@ def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[
     """Nothing happened to any lane, except perhaps that it arrived. Also returns the row for the
     tape."""
     lanes, active, slack = state.lanes, state.active, task.stride.slack
+    xp = namespace(lanes.t)
     level, on_time = active & new.lands, way.last
-    moved = aim.step + jnp.where(level, new.past, 0.0)
-    t = jnp.where(way.last, way.known, lanes.t + moved)
+    moved = aim.step + xp.where(level, new.past, 0.0)
+    t = xp.where(way.last, way.known, lanes.t + moved)
     arrived = level | on_time
-    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, lanes.pace.at[0].add(moved))
-    h = jnp.where(active, _next_step(state.h, aim.step, new.error / slack), state.h)
+    pace = put(lanes.pace, 0, lanes.pace[0] + moved)
+    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
+    h = xp.where(active, _next_step(state.h, aim.step, new.error / slack), state.h)
     late = active & ~arrived & (t >= task.target.limit)
-    code = jnp.where(on_time, ARRIVE_TIME, jnp.where(level, ARRIVE_LEVEL, MOVE))
-    code = jnp.where(active, code, IDLE).astype(jnp.int32)
+    code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
+    code = xp.where(active, code, IDLE).astype(xp.int32)
     row = Tape(moved, code, t, new.q, new.q, lanes.chart)
     end = State(
         lanes,
@@ -63,7 +63,7 @@ def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[
         state.aimed,
         state.approach,
         h,
-        state.error + jnp.where(active, new.error, 0.0),
+        state.error + xp.where(active, new.error, 0.0),
         update_result(state.result, late, task.target.missed),
         state.arrived | arrived,
         state.i + 1,
@@ -77,7 +77,7 @@ def eventfully(
     """Find out what happened to each lane, and let it happen. Also returns the row for the tape."""
     lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
     active, target, slack = state.active, task.target, task.stride.slack
-    G = len(s.transitions)
+    xp, G = namespace(lanes.t), len(s.transitions)
     near = new.error <= slack
 
     # 1. Which approaches succeed.
@@ -85,11 +85,11 @@ def eventfully(
     beyond = _BEYOND_STEP * approach.reach + at_precision(*_BEYOND_STEP_OF_SPAN) * task.span
     inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
     falling = _of(end.rate, aim.which) < 0
-    lands = active & new.lands & falling & jnp.where(approach.on, inside, near)
+    lands = active & new.lands & falling & xp.where(approach.on, inside, near)
     closer = active & approach.on & ~lands & (approach.tries < _LANDING_TRIES)
     lost = active & approach.on & ~lands & ~closer
-    moved = aim.step + jnp.where(new.lands, new.past, 0.0)
-    t = jnp.where(way.last, way.known, jnp.where(active, lanes.t + moved, lanes.t))
+    moved = aim.step + xp.where(new.lands, new.past, 0.0)
+    t = xp.where(way.last, way.known, xp.where(active, lanes.t + moved, lanes.t))
 
     # 2. What was crossed on the way.
     ready = state.ready
@@ -97,12 +97,12 @@ def eventfully(
     crossing = _crossing(fresh | lands, seen, end, moved, ready)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(G + 1)[:, None] == aim.which)
-    old = lands & (jnp.abs(end.value) <= zero)
-    s_first = jnp.where(chosen | old, jnp.inf, crossing.position)
-    which = jnp.argmin(s_first, axis=0).astype(jnp.int32)
-    first = jnp.min(s_first, axis=0)
+    old = lands & (xp.abs(end.value) <= zero)
+    s_first = xp.where(chosen | old, xp.inf, crossing.position)
+    which = xp.argmin(s_first, axis=0).astype(xp.int32)
+    first = xp.min(s_first, axis=0)
     bent = fresh & new.bent
-    crosses = ((fresh | lands) & jnp.isfinite(first)) & ~bent
+    crosses = ((fresh | lands) & xp.isfinite(first)) & ~bent
     refine = bent | ((fresh | lands) & ~crosses & (crossing.near & ~chosen).any(axis=0))
     touch = fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0)
     lands = lands & ~crosses & ~refine
@@ -112,24 +112,24 @@ def eventfully(
 
     # 3. What happens there.
     clear = end.value > zero
-    ready = jnp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
+    ready = xp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
     guard = lands & (aim.which < G)
     fires = guard & enabled(s, t, new.q, task.u, aim.which)
     by_clock = plain & (way.schedule >= 0)
-    fired = jnp.where(fires, aim.which, jnp.where(by_clock, way.schedule, -1))
+    fired = xp.where(fires, aim.which, xp.where(by_clock, way.schedule, -1))
     level = lands & (aim.which == G)
     on_time = plain & way.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    speed = jnp.abs(_of(end.rate, aim.which))
+    speed = xp.abs(_of(end.rate, aim.which))
     slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
-    pace, zeno = keep_pace(lanes.pace, jnp.where(accept, moved, 0.0), fired >= 0, slow)
+    pace, zeno = keep_pace(lanes.pace, xp.where(accept, moved, 0.0), fired >= 0, slow)
     expected = _expected(target.event_sequence, lanes.events, fired)
-    falls = (jnp.abs(end.value) <= zero) & (end.rate < 0)
+    falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
     after = Lanes(
-        jnp.where(accept, t, lanes.t),
+        xp.where(accept, t, lanes.t),
         lanes.chart,
-        jnp.where(accept, new.q, lanes.q),
+        xp.where(accept, new.q, lanes.q),
         ready[:-1],
         lanes.events + (fired >= 0),
         pace,
@@ -138,20 +138,20 @@ def eventfully(
     after, seen, aimed = _reset(s, after, seen, ready[-1], fired, together, task)
 
     # 4. The next step, and reasons to stop.
-    fastest = jnp.maximum(jnp.abs(_of(state.seen.rate, which)), jnp.abs(_of(end.rate, which)))
+    fastest = xp.maximum(xp.abs(_of(state.seen.rate, which)), xp.abs(_of(end.rate, which)))
     approach = Approach(
         crosses | closer,
-        jnp.where(crosses, which, approach.which),
-        jnp.where(crosses, first * moved, jnp.clip(tau, 0.0, approach.reach)),
-        jnp.where(crosses, moved, approach.reach),
-        jnp.where(crosses, fastest, approach.rate),
-        jnp.where(crosses, 0, approach.tries + 1),
+        xp.where(crosses, which, approach.which),
+        xp.where(crosses, first * moved, xp.clip(tau, 0.0, approach.reach)),
+        xp.where(crosses, moved, approach.reach),
+        xp.where(crosses, fastest, approach.rate),
+        xp.where(crosses, 0, approach.tries + 1),
     )
     adapted = _next_step(state.h, aim.step, new.error / slack)
     too_long = active & ~state.approach.on & ~near
-    h = jnp.where(plain | too_long, adapted, state.h)
-    h = jnp.where(fired >= 0, jnp.maximum(h, task.stride.h), h)
-    h = jnp.where(refine, 0.5 * aim.step, jnp.where(lost, 0.5 * aim.reach, h))
+    h = xp.where(plain | too_long, adapted, state.h)
+    h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
+    h = xp.where(refine, 0.5 * aim.step, xp.where(lost, 0.5 * aim.reach, h))
     stuck = (too_long | refine | lost) & (h < at_precision(*_SHORTEST_STEP) * task.span)
     graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
     result = update_result(state.result, graze, Result.GRAZING)
@@ -160,11 +160,11 @@ def eventfully(
     result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)
     result = update_result(result, active & ~arrived & (after.t >= target.limit), target.missed)
 
-    code = jnp.where(accept, MOVE, IDLE)
-    code = jnp.where(on_time, ARRIVE_TIME, code)
-    code = jnp.where(level, ARRIVE_LEVEL, jnp.where(fired >= 0, fired, code))
-    row = Tape(moved, code.astype(jnp.int32), t, new.q, after.q, after.chart)
-    error = state.error + jnp.where(accept, new.error, 0.0)
+    code = xp.where(accept, MOVE, IDLE)
+    code = xp.where(on_time, ARRIVE_TIME, code)
+    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code))
+    row = Tape(moved, code.astype(xp.int32), t, new.q, after.q, after.chart)
+    error = state.error + xp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
     return State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
 
@@ -178,14 +178,16 @@ def _crossing(
 ) -> CubicCrossing:
     """What was crossed on the way. (In a branch, so that it is not computed anew by every user.)"""
 
+    xp = namespace(ready)
+
     def look():
         return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
 
     def nothing():
-        no = jnp.zeros_like(ready)
-        return CubicCrossing(jnp.full_like(end.value, jnp.inf), no, no)
+        no = xp.zeros_like(ready)
+        return CubicCrossing(xp.full_like(end.value, xp.inf), no, no)
 
-    return jax.lax.cond(some.any(), look, nothing)
+    return cond(some.any(), look, nothing)
 
 
 def _next_step(
@@ -195,9 +197,10 @@ def _next_step(
 
     The estimate is of order 7; three square roots are cheaper than that power, and nearly it.
     """
-    factor = jnp.clip(_CAUTION / jnp.sqrt(jnp.sqrt(jnp.sqrt(error))), _SHRINK, _GROW)
-    factor = jnp.where(jnp.isfinite(error), factor, _SHRINK_BLINDLY)
-    return jnp.where((step < h) & (error <= 1), jnp.maximum(h, step * factor), step * factor)
+    xp = namespace(error)
+    factor = xp.clip(_CAUTION / xp.sqrt(xp.sqrt(xp.sqrt(error))), _SHRINK, _GROW)
+    factor = xp.where(xp.isfinite(error), factor, _SHRINK_BLINDLY)
+    return xp.where((step < h) & (error <= 1), xp.maximum(h, step * factor), step * factor)
 
 
 def _reset(
@@ -210,26 +213,27 @@ def _reset(
     task: Task,
 ) -> tuple[Lanes, Watch, Bool[Array, " L"]]:
     """The lanes after their events, what they see there, and whether they aim at their target."""
-    fires = fired >= 0
+    xp, fires = namespace(fired), fired >= 0
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
-        new = eqx.tree_at(lambda x: (x.q, x.chart), lanes, (q, chart))
+        new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
-        residue = jnp.abs(_of(seen.value, fired))
+        residue = xp.abs(_of(seen.value, fired))
         new = rearm(s, new, after, fired, together, task.span, task.u, residue)
-        return new, _merge(fires, after, seen), jnp.where(fires, aims(after, task.span), aimed)
+        return new, _merge(fires, after, seen), xp.where(fires, aims(after, task.span), aimed)
 
-    return jax.lax.cond(fires.any(), work, lambda: (lanes, seen, aimed))
+    return cond(fires.any(), work, lambda: (lanes, seen, aimed))
 
 
 def aims(seen: Watch, span: Float[Array, " L"]) -> Bool[Array, " L"]:
     """Whether the target's level is clearly positive, so that its next fall counts."""
-    return seen.value[-1] > at_precision(*_LEVEL_CLEAR) * span * jnp.abs(seen.rate[-1])
+    return seen.value[-1] > at_precision(*_LEVEL_CLEAR) * span * abs(seen.rate[-1])
 
 
 def _merge(mask: Bool[Array, " L"], new: Watch, old: Watch) -> Watch:
-    return Watch(jnp.where(mask, new.value, old.value), jnp.where(mask, new.rate, old.rate))
+    xp = namespace(mask)
+    return Watch(xp.where(mask, new.value, old.value), xp.where(mask, new.rate, old.rate))
 
 
 def _of(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
@@ -241,8 +245,9 @@ def _expected(
     sequence: tuple[int, ...] | None, events: Int[Array, " L"], fired: Int[Array, " L"]
 ) -> Bool[Array, " L"]:
     """Whether the next event of each lane is the one that the limit cycle has."""
+    xp = namespace(fired)
     if sequence is None:
-        return jnp.ones(fired.shape, bool)
+        return xp.ones(fired.shape, bool)
     if not sequence:
-        return jnp.zeros(fired.shape, bool)
-    return jnp.array(sequence)[events % len(sequence)] == fired
+        return xp.zeros(fired.shape, bool)
+    return xp.array(sequence)[events % len(sequence)] == fired

@@ -9,10 +9,9 @@ meets its outcome.
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..._core.executor import Array, cond, namespace, while_loop
 from ..._core.lanes.per_lane import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
@@ -81,25 +80,25 @@ def search(
 
     Lanes whose `result` is not OK at the start stay where they are.
     """
-    L = lanes.t.shape[0]
-    finite = jnp.isfinite(lanes.t) & jnp.isfinite(lanes.q).all(axis=0) & jnp.isfinite(u).all(axis=0)
+    xp, L = namespace(lanes.t), lanes.t.shape[0]
+    finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0) & xp.isfinite(u).all(axis=0)
     result = update_result(result, ~finite, Result.BAD_INPUT)
     task = Task(u, target, target.limit - lanes.t, stride, settings)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
-    none, zero = jnp.zeros(L, jnp.int32), jnp.zeros(L)
+    none, zero = xp.zeros(L, xp.int32), xp.zeros(L)
     begin = State(
         arm(s, lanes, seen, task.span) if options.new_input else lanes,
         seen,
         aims(seen, task.span),
-        Approach(jnp.zeros(L, bool), none, zero, zero, zero, none),
+        Approach(xp.zeros(L, bool), none, zero, zero, zero, none),
         stride.h,
-        jnp.zeros(L),
+        xp.zeros(L),
         result,
-        jnp.zeros(L, bool),
-        jnp.zeros((), jnp.int32),
+        xp.zeros(L, bool),
+        xp.zeros((), xp.int32),
     )
     blank = blank_tape(settings.max_steps, lanes) if options.tape else None
-    no_events = blank_log(options.event_log, L) if options.event_log else None
+    no_events = blank_log(options.event_log, lanes) if options.event_log else None
 
     def attempted(state, unroll=False, in_step=False):
         """Aims, ways, and an attempt in all active lanes, and which of them it leaves calm."""
@@ -118,7 +117,7 @@ def search(
     def body(carry):
         state, tape, log = carry
         i, (calm, aim, way, new) = state.i, attempted(state)
-        state, row = jax.lax.cond(
+        state, row = cond(
             (calm | ~state.active).all(),
             lambda: calmly(state, aim, way, new, task),
             lambda: eventfully(s, state, aim, way, new, task),
@@ -128,7 +127,7 @@ def search(
         return state, tape, log
 
     def all_the_way():
-        end, tape, log = jax.lax.while_loop(going, body, (begin, blank, no_events))
+        end, tape, log = while_loop(going, body, (begin, blank, no_events))
         result = update_result(end.result, end.active, Result.STEP_LIMIT)
         return Recorded(Moved(end.lanes, end.h, end.error, result, log), tape)
 
@@ -147,9 +146,9 @@ def search(
         tape = None if blank is None else write_row(blank, begin.i, row)
         return Recorded(Moved(end.lanes, end.h, end.error, end.result, no_events), tape)
 
-    return jax.lax.cond((home | ~begin.active).all(), in_one_step, all_the_way)
+    return cond((home | ~begin.active).all(), in_one_step, all_the_way)
 
 
 def _alike(x: Float[Array, " L"], mask: Bool[Array, " L"]) -> Bool[Array, " L"]:
     """Which lanes have the same number as the first lane of `mask`."""
-    return x == x[jnp.argmax(mask)]
+    return x == x[namespace(x).argmax(mask)]

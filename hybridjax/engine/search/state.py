@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from ..._core.executor import Array, namespace
 from ..._core.results import Result
 from ..lanes import Lanes
 from ..settings import Settings
@@ -66,4 +66,4 @@ class State(NamedTuple):
     @property
     def ready(self) -> Bool[Array, "W L"]:
         """Watched functions whose next falling zero counts."""
-        return jnp.concatenate([self.lanes.armed, self.aimed[None]])
+        return namespace(self.aimed).concatenate([self.lanes.armed, self.aimed[None]])

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from ..._core.executor import Array, namespace
 from ...systems.structure import Structure
 from ..lanes import Lanes, for_each_chart, only
-from ..settings import Settings
+from ..settings import Settings, size
 from ..watch import chart_field
 
 
@@ -35,7 +35,8 @@ class Stride(NamedTuple):
 
 def stride(h: Float[Array, " L"]) -> Stride:
     """Set out with steps h, and no further knowledge."""
-    return Stride(h, jnp.zeros_like(h), jnp.ones_like(h))
+    xp = namespace(h)
+    return Stride(h, xp.zeros_like(h), xp.ones_like(h))
 
 
 def initial_step(
@@ -51,13 +52,14 @@ def initial_step(
         q = only(here, lanes.q[: s.dims[a]])
         f = chart_field(s, a, only(here, u))(only(here, lanes.t), q)
         known = settings.scale is not None
-        rates = jnp.abs(f) / (settings.size(a, q) if known else jnp.abs(q))
-        rate = jnp.max(jnp.where(jnp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
-        time = jnp.where(rate > 0, 1 / rate, jnp.inf)
+        rates = xp.abs(f) / (size(settings, a, q) if known else xp.abs(q))
+        rate = xp.max(xp.where(xp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
+        time = xp.where(rate > 0, 1 / rate, xp.inf)
         part = _FIRST_STEP * (settings.rtol / _FIRST_RTOL) ** (1 / 7)
-        first = jnp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
-        first = first if known else jnp.maximum(first, _SHORTEST * span)
-        return jnp.where(here, first, out)
+        first = xp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
+        first = first if known else xp.maximum(first, _SHORTEST * span)
+        return xp.where(here, first, out)
 
-    everywhere = jnp.ones(lanes.t.shape[0], bool)
+    xp = namespace(lanes.t)
+    everywhere = xp.ones(lanes.t.shape[0], bool)
     return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)

@@ -10,12 +10,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from ..._core.executor import Array, for_each_row, namespace
 from .tableau import VERNER76
 
 
-LaneField = Callable[[jax.Array, jax.Array], jax.Array]
+LaneField = Callable[[Array, Array], Array]
 
 # From this number of lanes on, stages are always written out. Twice as many: batches of 128 to 255
 # lanes compile in half the time, and run up to twice as long.
@@ -97,13 +98,14 @@ def rounding_error(
     which is f at (t, q); zero where it is not finite."""
     # Not all states by the same part, since a common factor may cancel.
     shifts = np.stack([np.roll(_SHIFTS, k) for k in range(len(q) + 1)], axis=1)
-    shifts = jnp.asarray(shifts * jnp.finfo(q.dtype).eps, q.dtype)
+    xp = namespace(q)
+    shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
 
     def change(shift):
-        return jnp.abs(field(t * (1 + shift[0]), q * (1 + shift[1:, None])) - f)
+        return xp.abs(field(t * (1 + shift[0]), q * (1 + shift[1:, None])) - f)
 
-    changes = jax.vmap(change)(shifts)
-    return jnp.max(jnp.where(jnp.isfinite(changes), changes, 0.0), axis=0)
+    changes = for_each_row(change, shifts)
+    return xp.max(xp.where(xp.isfinite(changes), changes, 0.0), axis=0)
 
 
 def short_step(

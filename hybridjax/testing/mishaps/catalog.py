@@ -144,8 +144,8 @@ def mishandle(
     - `input`, two or more `outputs`: names of signals. `event`: of one that comes once in each
       cycle. `seed`: of what happens at random.
 
-    **Raises:** `DefinitionError` for an unknown mishap or signal, and where the result is no recording: a
-    clock that runs backwards.
+    **Raises:** `DefinitionError` for an unknown mishap or signal, and where the result is no
+    recording: a clock that runs backwards.
     """
     known = MISHAPS | EVENT_MISHAPS
     if mishap not in known:

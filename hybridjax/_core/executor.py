@@ -1,0 +1,142 @@
+"""One source, two executors: programs of XLA, and the host.
+
+Code that decides (step sizes, events, Newton's method) is written once, on arrays. Given JAX's, it
+is traced and compiled, which pays for many lanes and below `jit`, `vmap` and `grad`. Given NumPy's,
+it runs at once, and only what users wrote is compiled, in small programs (`compilation/kernel.py`):
+for a few lanes that is the quicker way to a first answer. Nothing switches between the two but the
+arrays themselves: functions come from their `namespace`, and those below do for both what differs.
+"""
+
+import contextlib
+import contextvars
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+if TYPE_CHECKING:
+    Array = jax.Array  # what users get
+else:
+    Array = jax.Array | np.ndarray | np.generic
+    """An array of either executor."""
+
+
+class Definition(eqx.Module):
+    """What users write: functions, and numbers that they compute with. Its arrays are always JAX's,
+    whoever runs the code around it."""
+
+
+class OutOfTimeError(Exception):
+    """The host has looped for longer than it may."""
+
+
+_deadline = contextvars.ContextVar("deadline", default=float("inf"))
+
+
+@contextlib.contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """A context in which loops of the host end after so many seconds of this thread.
+
+    **Raises:** `OutOfTimeError`, where they do.
+    """
+    before = _deadline.set(time.thread_time() + seconds)
+    try:
+        yield
+    finally:
+        _deadline.reset(before)
+
+
+def on_host(x: Any) -> bool:
+    """Whether x is an array of the host."""
+    return isinstance(x, np.ndarray | np.generic)
+
+
+def namespace(x: Array) -> Any:
+    """`numpy` for the host's arrays, `jax.numpy` for JAX's."""
+    return x.__array_namespace__()
+
+
+def to_host(tree: Any) -> Any:
+    """`tree` with its arrays on the host, but for those of a `Definition`."""
+    return jax.tree_util.tree_map(
+        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree, is_leaf=_is_definition
+    )
+
+
+def from_host(tree: Any) -> Any:
+    """`tree` with its arrays as JAX's."""
+    return jax.tree_util.tree_map(lambda x: jax.device_put(x) if on_host(x) else x, tree)
+
+
+def cond(some: Array, yes: Callable, no: Callable, *operands: Any) -> Any:
+    """`jax.lax.cond`."""
+    if on_host(some):
+        return yes(*operands) if some else no(*operands)
+    return jax.lax.cond(some, yes, no, *operands)
+
+
+def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
+    """`jax.lax.while_loop`."""
+    if not on_host(jax.tree_util.tree_leaves(carry)[0]):
+        return jax.lax.while_loop(going, body, carry)
+    deadline = _deadline.get()
+    while going(carry):
+        if time.thread_time() > deadline:
+            raise OutOfTimeError
+        carry = body(carry)
+    return carry
+
+
+def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
+    """`jax.lax.scan`."""
+    first = jax.tree_util.tree_leaves(xs)[0]
+    if not on_host(first):
+        return jax.lax.scan(body, carry, xs)
+    rows = []
+    for k in range(len(first)):
+        carry, row = body(carry, jax.tree_util.tree_map(lambda x, k=k: x[k], xs))
+        rows.append(row)
+    return carry, jax.tree_util.tree_map(lambda *x: np.stack(x), *rows)
+
+
+def for_each_row(function: Callable, rows: Array) -> Array:
+    """`jax.vmap` of a function of one row."""
+    return np.stack([function(x) for x in rows]) if on_host(rows) else jax.vmap(function)(rows)
+
+
+def put(x: Array, index: Any, value: Any) -> Array:
+    """x with other values at an index: `x.at[index].set(value)`."""
+    if not on_host(x):
+        return x.at[index].set(value)
+    x = x.copy()
+    x[index] = value
+    return x
+
+
+def lane(x: Array, i: Array) -> Array:
+    """Lane i of x, as the only one."""
+    if on_host(x):
+        return x[..., i : i + 1]
+    return jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
+
+
+def singular_values(x: Array) -> Array:
+    """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
+    if not on_host(x):
+        return jnp.linalg.svd(x, compute_uv=False)
+    finite = np.isfinite(x).all()
+    return np.linalg.svd(x, compute_uv=False) if finite else np.full(min(x.shape), np.nan)
+
+
+def stop_gradient(x: Array) -> Array:
+    """`jax.lax.stop_gradient`."""
+    return x if on_host(x) else jax.lax.stop_gradient(x)
+
+
+def _is_definition(x: Any) -> bool:
+    return isinstance(x, Definition)

@@ -1,0 +1,165 @@
+"""Jacobians of recorded flow on the host: those of the moves on the tape, multiplied.
+
+The same derivatives as those of `replay`: of the Runge-Kutta step, of the crossing at its end (the
+saltation formula), and of the reset. Every move is linearized where the search left it, so that all
+moves in a chart are done in one pass.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..systems.structure import Structure
+from . import kernels
+from .lanes import Lanes
+from .solver.tableau import VERNER76
+from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
+from .target import Target
+from .watch import ChartFlow
+
+
+class _Moves(NamedTuple):
+    """Moves of any lanes, on the last axis: where they start, how far they go, how they end."""
+
+    t: Float[np.ndarray, " M"]
+    chart: Int[np.ndarray, " M"]
+    q: Float[np.ndarray, "d M"]
+    h: Float[np.ndarray, " M"]
+    code: Int[np.ndarray, " M"]
+    lane: Int[np.ndarray, " M"]
+    turn: Int[np.ndarray, " M"]
+    """How many moves of the same lane come before."""
+
+
+class _Linear(NamedTuple):
+    """(t, q) after some moves, and its derivatives by (t, q, u) before them: moves come first."""
+
+    end: Float[np.ndarray, "M n"]
+    by: Float[np.ndarray, "M n m"]
+
+
+def chain(
+    s: Structure, lanes: Lanes, target: Target, tape: Tape, of_states: bool
+) -> tuple[Float[np.ndarray, "L n m"], Float[np.ndarray, "n L"]]:
+    """Derivatives of (t, q) at the end of a record by (t, q, u) at its start, at u = 0, or by q
+    only; and (t, q) at the end."""
+    n, L = 1 + s.d, len(lanes.t)
+    moves = _moves(lanes, tape)
+    found = _Linear(np.zeros((len(moves.t), n)), np.zeros((len(moves.t), n, n + s.nu)))
+    for a in np.unique(moves.chart):
+        here = np.flatnonzero(moves.chart == a)
+        own = _linear(s, int(a), _Moves(*(x[..., here] for x in moves)), target)
+        found.end[here], found.by[here] = own
+    columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
+    end = np.concatenate([lanes.t[None], lanes.q]).T
+    for turn in range(1 + max(moves.turn, default=-1)):
+        now = moves.turn == turn
+        lane, by = moves.lane[now], found.by[now]
+        columns[lane] = by[:, :, :n] @ columns[lane]
+        columns[lane, :, n:] += by[:, :, n:]
+        end[lane] = found.end[now]
+    return columns[:, :, 1:n] if of_states else columns, end.T
+
+
+def _moves(lanes: Lanes, tape: Tape) -> _Moves:
+    """The moves of a tape, lane by lane."""
+    lane, row = np.nonzero(tape.code.T != IDLE)
+    first = np.diff(lane, prepend=-1) > 0
+    last = np.roll(row, 1)  # the move before, but for the first of a lane
+    begins = np.flatnonzero(first)
+    turn = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
+    return _Moves(
+        np.where(first, lanes.t[lane], tape.t[last, lane]),
+        np.where(first, lanes.chart[lane], tape.chart[last, lane]),
+        np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
+        tape.h[row, lane], tape.code[row, lane], lane, turn,
+    )  # fmt: skip
+
+
+def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
+    """Moves that start in chart a."""
+    n, M, code = s.dims[a], len(moves.t), moves.code
+    u = np.zeros((s.nu, M))
+    by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
+    index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
+    goal = target.time[moves.lane]
+    h = np.where(on_time, goal - moves.t, moves.h)
+    q, dq, f = _step(s, a, moves.t, moves.q[:n], u, h)
+    t = np.where(on_time, goal, moves.t + h)
+    # By (t, q, u), with the length of the step as the last; that to a known time shrinks with t.
+    dt = np.zeros((M, 1, dq.shape[2]))
+    dt[:, 0, [0, -1]] = 1.0
+    shrinks = (by_clock | on_time)[:, None]
+    dq[:, :, 0] -= shrinks * dq[:, :, -1]
+    dt[:, :, 0] -= shrinks
+    dq, dt = dq[:, :, :-1], dt[:, :, :-1]
+
+    which = np.where(code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code))
+    lands = np.flatnonzero(which >= 0)
+    if len(lands):
+        point = t[lands], q[:, lands], f[:, lands]
+        flow = ChartFlow(s, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
+        settled = flow.settle(*point, which[lands])
+        t[lands] += settled.past
+        q[:, lands] = settled.q
+        f = kernels.field(s, a, t[lands], q[:, lands], u[:, lands])[:, 0].T[:, :, None]
+        rows = kernels.watched(
+            s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
+        )
+        row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
+        by_t, by_q, by_u = _split(rows[row, :, np.arange(len(lands))][:, None], n)
+        change = by_t @ dt[lands] + by_q @ dq[lands]
+        change[:, :, 1 + n :] += by_u
+        delay = -change / (by_t + by_q @ f)
+        dt[lands] += delay
+        dq[lands] += f @ delay
+
+    end, by = np.zeros((M, 1 + s.d)), np.zeros((M, 1 + s.d, 1 + s.d + s.nu))
+    columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
+    for g in {-1, *code[code >= 0]}:
+        now = np.flatnonzero(np.maximum(code, -1) == g)
+        new, dnew = q[:, now], dq[now]
+        if g >= 0:
+            by_reset = kernels.reset(s, int(g), t[now], new, u[:, now])
+            new = by_reset[:, 0]
+            by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
+            dnew = by_t @ dt[now] + by_q @ dnew
+            dnew[:, :, 1 + n :] += by_u
+        m = len(new)
+        end[now, 1 : 1 + m] = new.T
+        by[np.ix_(now, np.arange(1, 1 + m), columns)] = dnew
+    end[:, 0] = t
+    by[:, :1, columns] = dt
+    return _Linear(end, by)
+
+
+def _step(s: Structure, a: int, t, q, u, h):
+    """States (n, M) at the end of Runge-Kutta steps, their derivatives (M, n, m) by (t, q, u, h) at
+    the start, and the field (n, M) at the end."""
+    n, M = q.shape
+    m = 2 + n + s.nu
+    stages = len(VERNER76.b_sol) + 1
+    K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
+    straight = np.zeros((M, n, m))
+    straight[:, :, 1 : 1 + n] = np.eye(n)
+    rows = [np.zeros(0), *VERNER76.a_lower, VERNER76.b_sol]
+    for i, (row, c) in enumerate(zip(rows, [0.0, *VERNER76.c, 1.0], strict=True)):
+        slope = (row @ K.reshape(stages, -1)[:i]).reshape(n, M)
+        dslope = (row @ dK.reshape(stages, -1)[:i]).reshape(M, n, m)
+        state, dstate = q + h * slope, straight + h[:, None, None] * dslope
+        dstate[:, :, -1] += slope.T
+        expanded = kernels.field(s, a, t + c * h, state, u)
+        by_t, by_q, by_u = _split(np.moveaxis(expanded, -1, 0), n)
+        dK[i] = by_q @ dstate
+        dK[i, :, :, 0] += by_t[:, :, 0]
+        dK[i, :, :, 1 + n : -1] += by_u
+        dK[i, :, :, -1] += c * by_t[:, :, 0]
+        K[i] = expanded[:, 0]
+    return state, dstate, K[-1]
+
+
+def _split(expanded, n: int):
+    """Derivatives by t, q and u (see `kernels`), moves first."""
+    return expanded[:, :, 1:2], expanded[:, :, 2 : 2 + n], expanded[:, :, 2 + n :]

@@ -1,0 +1,193 @@
+"""One source, two executors: the host and XLA agree, and the host compiles users' functions."""
+
+import jax
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core.compilation import compile
+from hybridjax._core.compilation.compile import quick_jit
+from hybridjax._core.executor import from_host, on_host, to_host
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import record
+from hybridjax.engine.settings import Settings
+from hybridjax.engine.tape import IDLE
+from hybridjax.engine.target import until
+from hybridjax.systems.structure import Structure
+
+from ..conftest import KINEMATIC, OUTPUTS, no_compilation, unchecked_host
+from ..fuzz.drawing import STRUCTURES, draw
+from ..fuzz.structures import Random
+from ..toys import Field
+
+
+# Systems of which both executors are compiled in every run of the tests; the rest is slow.
+FEW = ("BuckConverter", "PaddleJuggler", "VerticalHopper")
+FEW_STRUCTURES = sorted(STRUCTURES)[:2]
+
+
+def slow_but(names, few):
+    return [n if n in few else pytest.param(n, marks=pytest.mark.slow) for n in sorted(names)]
+
+
+def flow(system, t, chart, q, u, end, settings):
+    """A recorded flow of one lane (of either executor's arrays)."""
+    return record(
+        Structure(system), start_lanes(Structure(system), t, chart, q), u, until(end), settings
+    )
+
+
+compiled_flow = quick_jit(flow)
+
+
+def agree(system, chart, state, u, begin, duration):
+    """Both executors decide the same, and their tapes are the same to rounding."""
+    s = Structure(system)
+    q = np.zeros((s.d, 1))
+    q[: len(state), 0] = state
+    start = np.array([begin], float), np.array([chart], np.int32), q
+    settings = Settings(1e-9, 1e-9, max_steps=400)
+    arguments = (*start, np.reshape(u, (s.nu, 1)), start[0] + duration, settings)
+    with unchecked_host():
+        host = flow(system, *to_host(arguments))
+    assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
+    xla = compiled_flow(system, *from_host(arguments))
+    np.testing.assert_array_equal(host.moved.result, xla.moved.result)
+    assert np.sum(host.tape.code != IDLE) > 2
+    for name in ("code", "chart"):
+        np.testing.assert_array_equal(getattr(host.tape, name), getattr(xla.tape, name))
+    # Steps amplify the rounding errors of their error estimates.
+    np.testing.assert_allclose(host.moved.lanes.t, xla.moved.lanes.t, rtol=1e-12)
+    size = 1 + np.abs(xla.moved.lanes.q)
+    np.testing.assert_allclose(host.moved.lanes.q / size, xla.moved.lanes.q / size, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
+def test_both_agree_on_the_gallery(name):
+    system = getattr(hj.models, name)()
+    guess = system.guess()
+    if guess is None:
+        pytest.skip("has no guess of its own")
+    period = system.period()
+    chart = Structure(system).chart_index(guess.chart)
+    duration = 2.0 if period is None else 1.5 * float(period)
+    u = np.zeros(len(system.inputs))
+    agree(system, chart, np.asarray(guess.state), u, float(guess.time), duration)
+
+
+@pytest.mark.parametrize("name", slow_but(STRUCTURES, FEW_STRUCTURES))
+def test_both_agree_on_random_systems(name):
+    plan = STRUCTURES[name][0]
+    for number in range(2):
+        sample = jax.tree_util.tree_map(np.asarray, draw(name, number))
+        start = sample.start
+        system = from_host(Random(plan, sample.charts, sample.arrows))
+        agree(system, 0, start.q, start.u, start.t, 2.0)
+
+
+@pytest.fixture(scope="module")
+def compiled(hopper_cycle):
+    """The hopper's cycle, and what is linearized along it, by compiled programs only."""
+    patience = compile._WORTH_COMPILING
+    compile._WORTH_COMPILING = -1.0
+    try:
+        cycle = hj.find_limit_cycle(hopper_cycle.system)
+        return cycle, hj.linearize(cycle, KINEMATIC, OUTPUTS)
+    finally:
+        compile._WORTH_COMPILING = patience
+
+
+def test_both_find_the_same_cycle(hopper_cycle, compiled):
+    cycle, _ = compiled
+    assert cycle.event_sequence == hopper_cycle.event_sequence
+    assert int(cycle.iterations) == int(hopper_cycle.iterations)
+    np.testing.assert_allclose(cycle.anchor.q, hopper_cycle.anchor.q, atol=1e-12)
+    after = np.roll(cycle.dims, -1)
+    for one, other, m, n in zip(
+        cycle.factors, hopper_cycle.factors, after, cycle.dims, strict=True
+    ):
+        np.testing.assert_allclose(one[:m, :n], other[:m, :n], atol=1e-11)
+    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
+
+
+def test_both_linearize_alike(kinematic_ldtp, compiled):
+    _, ldtp = compiled
+    for name in ("A", "B", "C", "D"):
+        np.testing.assert_allclose(
+            getattr(kinematic_ldtp, name), getattr(ldtp, name), atol=1e-10, err_msg=name
+        )
+
+
+class Decay(hj.HybridSystem):
+    """x' = -rate x + u, reset to 1 where x falls to `level`: its period is -log(level) / rate."""
+
+    rate: hj.Parameter = hj.parameter(1.0)
+    level: hj.Parameter = hj.parameter(0.5)
+
+    def charts(self):
+        return {"x": Field(("x",), lambda t, q, u: (-self.rate * q[0] + u[0],))}
+
+    def transitions(self):
+        guard = lambda t, q, u: q[0] - self.level  # noqa: E731
+        return (hj.Transition("kick", "x", "x", guard, reset=lambda t, q, u: (q[0] / q[0],)),)
+
+
+def first_kick(system):
+    found = hj.simulate(system, "x", [0.9], 1.5)
+    return found.events[0].time
+
+
+def test_another_value_compiles_nothing_and_is_another_answer():
+    np.testing.assert_allclose(first_kick(Decay()), np.log(0.9 / 0.5), rtol=1e-9)
+    with no_compilation():
+        other = first_kick(Decay(rate=2.0, level=0.6))
+    np.testing.assert_allclose(other, np.log(0.9 / 0.6) / 2, rtol=1e-9)
+
+
+def test_a_class_of_the_same_name_is_another_system():
+    def again(factor, direction):
+        class Decay(hj.HybridSystem):
+            def charts(self):
+                return {"x": Field(("x",), lambda t, q, u: (-factor * q[0],))}
+
+            def transitions(self):
+                sign = 1.0 if direction == "falling" else -1.0
+                guard = lambda t, q, u: sign * (q[0] - 0.5)  # noqa: E731
+                return (hj.Transition("kick", "x", "x", guard, direction, lambda t, q, u: (1.0,)),)
+
+        return Decay()
+
+    for factor, direction in ((1.0, "falling"), (3.0, "falling"), (3.0, "rising")):
+        time = first_kick(again(factor, direction))
+        np.testing.assert_allclose(time, np.log(0.9 / 0.5) / factor, rtol=1e-9)
+
+
+class Table(hj.HybridSystem):
+    """x' = -slope x, with a plain Python number as a field: part of the program."""
+
+    slope: float
+
+    def charts(self):
+        return {"x": Field(("x",), lambda t, q, u: (-self.slope * q[0],))}
+
+
+@pytest.mark.parametrize("slope", [1, 2.0, True])
+def test_plain_numbers_are_part_of_the_program(slope):
+    end = hj.simulate(Table(slope), "x", [1.0], 1.0).after[-1, 0]
+    np.testing.assert_allclose(end, np.exp(-float(slope)), rtol=1e-9)
+
+
+def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
+    quick = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
+    monkeypatch.setattr(compile, "_WORTH_COMPILING", -1.0)
+    compiled = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
+    assert [e.name for e in quick.events] == [e.name for e in compiled.events]
+    np.testing.assert_allclose(quick.t, compiled.t, rtol=1e-13)
+    np.testing.assert_allclose(quick.after, compiled.after, rtol=1e-13)
+
+
+def test_the_host_leaves_a_long_job_to_the_compiled_program(monkeypatch):
+    """While it is at work: one call that would take it longer than compiling does."""
+    monkeypatch.setattr(compile, "_WORTH_COMPILING", 0.1)
+    found = hj.simulate(Decay(level=0.8), "x", [0.9], 100.0)
+    assert len(found.events) == 1 + int((100 - np.log(0.9 / 0.8)) / np.log(1 / 0.8))
