@@ -83,7 +83,7 @@ class Settings(eqx.Module):
         self.scale = None if scale is None else _kept(scale)
 
 
-def _kept(x: Array) -> Array:
+def _kept(x: Array | float) -> Array:
     """The host's arrays as they are, for what else there is JAX's."""
     return x if isinstance(x, np.ndarray) and x.dtype == np.float64 else real(x)
 

@@ -202,6 +202,7 @@ class LDTP(eqx.Module):
         **Returns:** at `[n, r]` the response at section `n` to a unit input `r` sections earlier:
         `D[n]` for `r = 0`, then `C[n] A[n-1] ... A[n-r+1] B[n-r]`.
         """
+        require_x64(self)
         return time_response.impulse_response(self.A, self.B, self.C, self.D, n_lags)
 
     def htf(self, f: Frequencies, harmonics: Harmonics | None = None) -> HTF:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.boundary.checked import checked_methods
 from .._core.executor import Array, namespace, on_host, scan, singular_values, stop_gradient
 from .._core.memo import remembered
 from .._core.results import Result
@@ -92,7 +91,6 @@ class Turn(NamedTuple):
         return self.distance <= _CLOSED
 
 
-@checked_methods
 class ReturnMap(eqx.Module):
     """The return map P of a system, and which of its fixed points is meant.
 

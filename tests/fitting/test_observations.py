@@ -23,11 +23,11 @@ def records(**options):
     "make, message",
     [
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS), "16 sections, the family has 8"),
-        (lambda: hj.ObservedHTF(hj.HTF(F, H * np.nan, 0, 8), SECTIONS), "NaN"),
+        (lambda: hj.ObservedHTF(hj.HTF(F, H * np.nan, 0, 8), SECTIONS), "must be finite"),
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
         (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
-        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "`std` must be positive"),
+        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "`std` must be an array of positive"),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "each of 1 outputs"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "does not move"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),

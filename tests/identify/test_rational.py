@@ -1,6 +1,7 @@
 """The paper's parametric fit: its known bias, global optimum, bad input."""
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -103,4 +104,4 @@ def test_bad_values():
     with pytest.raises(hj.DefinitionError, match="zero at a frequency"):
         hj.fit_rational(hj.HTF(f, H, 0, 4), weighting="relative")
     with pytest.raises(hj.DefinitionError, match="H_0 of y holds NaN"):
-        hj.fit_rational(eqx.tree_at(lambda h: h.H, hj.HTF(f, H, 0, 4), np.nan * H))
+        hj.fit_rational(eqx.tree_at(lambda h: h.H, hj.HTF(f, H, 0, 4), jnp.asarray(np.nan * H)))

@@ -311,7 +311,7 @@ def test_bad_records(small):
         hj.fit_series(hj.Record(good.u * np.nan, good.y, n_sections=4), 2)
     with pytest.raises(hj.DefinitionError, match=r"not \(400, 1\) and \(399, 2\)"):
         hj.Record(good.u, good.y[1:], n_sections=4)
-    with pytest.raises(hj.DefinitionError, match="first_section from 0 to n_sections - 1"):
+    with pytest.raises(hj.DefinitionError, match="`first_section` must be one of the sections 0..3"):
         hj.Record(good.u, good.y, n_sections=4, first_section=4)
     with pytest.raises(hj.DefinitionError, match="y is infinite at sample 7"):
         y = good.y.copy()

@@ -42,7 +42,7 @@ class Whole(Kind):
 class Number(Kind):
     """A finite real number between bounds, as a Python `float`: numbers of Python and NumPy, arrays
     of one number without axes; no bools, strings and complex numbers. With `infinite`, infinity may
-    stand for no bound."""
+    stand for no bound; with `missing`, NaN for a value that is not known."""
 
     def __init__(
         self,
@@ -53,10 +53,11 @@ class Number(Kind):
         high: int | float = math.inf,
         below: int | float = math.inf,
         infinite: bool = False,
+        missing: bool = False,
     ):
         self.allowed = allowed
         self.above, self.low, self.high, self.below = above, low, high, below
-        self.infinite = infinite
+        self.infinite, self.missing = infinite, missing
 
     def take(self, value):
         number = value if type(value) is float else self._as_float(value)
@@ -66,7 +67,7 @@ class Number(Kind):
 
     def fits(self, number: float) -> bool:
         if not math.isfinite(number):
-            return self.infinite and number > 0
+            return (self.infinite and number > 0) or (self.missing and math.isnan(number))
         return self.low <= number <= self.high and self.above < number < self.below
 
     def _as_float(self, value: Any) -> float:

@@ -1,18 +1,22 @@
 """Phase in real time: from the past only."""
 
 import math
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Positive
+from ..._core.boundary.scalars import Number
 from ...errors import DefinitionError
 
 
 # Bandwidth of the loop in cycles per cycle. Doubled: changes of the rate are followed twice as
 # fast, with more of the noise.
 _LOOP_HARMONICS = 5
+
+Sample = Annotated[float, Number("a finite number or NaN", missing=True)]
 
 
 @checked
@@ -49,7 +53,7 @@ class PhaseTracker:
         self.phase: float | None = None
         self._loop = 0.0
 
-    def update(self, time: float, position: float, velocity: float) -> float | None:
+    def update(self, time: float, position: Sample, velocity: Sample) -> float | None:
         """The phase in cycles after one more sample, counted from the first one; NaN are skipped.
 
         **Returns:** None before the first good sample.
