@@ -248,6 +248,7 @@ def check_system(system: HybridSystem) -> None:
             )
         if len(set(chart.states)) < len(chart.states):
             raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
+        _check_units(f"chart '{name}'", "states", chart.states, chart.units)
         shape = _shape(f"field of chart '{name}'", lambda t, q, u, a=a: s.field(a, t, q, u), s, a)
         if shape != (s.dims[a],):
             raise DefinitionError(

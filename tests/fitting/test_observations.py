@@ -27,7 +27,10 @@ def records(**options):
         (lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS), "variance"),
         (lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)), "8 sections, the family 4"),
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
-        (lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0), "`std` must be an array of positive"),
+        (
+            lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0),
+            "`std` must be an array of positive",
+        ),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "each of 1 outputs"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "does not move"),
         (lambda: hj.ObservedCycle(SECTIONS), "`times`, or the `period`"),

@@ -32,6 +32,7 @@ from .values import (
     WHOLE,
     WORD,
     Other,
+    Right,
     array,
     instance,
     optional,
@@ -323,8 +324,9 @@ def recordings(t):
         "anchor": FINITE, "bandwidth": optional(POSITIVE),
     }  # fmt: skip
     update = hj.recordings.PhaseTracker(**tracker).update
+    sample = [Right(NAN), *(x for x in FINITE if x is not NAN)]
     yield "PhaseTracker.update", update, dict(time=0.0, position=1.0, velocity=0.0), {
-        "time": FINITE, "position": FINITE, "velocity": FINITE,
+        "time": FINITE, "position": sample, "velocity": sample,
     }  # fmt: skip
 
 

@@ -83,11 +83,12 @@ def systems(t):
         "k": ["10", 1j, NAN, INF, Other(), {}],
     }  # fmt: skip
     yield "enable_vector_math", hj.enable_vector_math, dict(enabled=True), {"enabled": FLAG}
+    yield "enable_progress", hj.enable_progress, dict(enabled=False), {"enabled": FLAG}
     yield "enable_compilation_cache", hj.enable_compilation_cache, dict(folder=None), {
         "folder": optional(PATH),
     }  # fmt: skip
     yield "Execution", hj.Execution, {}, {
-        "batch": optional(COUNT), "workers": optional(LIMITED), "precision": WORD, "progress": FLAG,
+        "batch": optional(COUNT), "workers": optional(LIMITED), "precision": WORD,
     }  # fmt: skip
     yield "Settings", hj.Settings, dict(rtol=1e-9, atol=1e-9), {
         "rtol": [*POSITIVE, Right(np.float32(1e-6)), Right(jnp.array(1e-6))], "atol": POSITIVE,

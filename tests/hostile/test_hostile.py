@@ -16,7 +16,8 @@ CALLED_BY_THE_ENGINE = {
     "AbstractLevels", "AbstractObservation", "AbstractSections", "AtEvent", "BoundSections",
     "BuckConverter", "Chart", "ClockPhase", "Crossing", "KinematicPhase", "Lanes", "ObservedSeries",
     "PaddleJuggler", "PlacedSections", "Plan", "ProcessNoise", "ReturnMap", "SLIPRunner",
-    "SectionList", "Settings", "Structure", "TwoLeggedBar", "VerticalHopper", "Winding",
+    "Scheduled", "SectionList", "Settings", "Structure", "TwoLeggedBar", "VerticalHopper",
+    "Winding",
 }  # fmt: skip
 SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
 

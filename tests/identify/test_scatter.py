@@ -161,7 +161,9 @@ def test_noise_by_its_ratio(model):
     for bad in (dict(), dict(std=1.0, snr=20), dict(std=-1.0), dict(std=np.nan)):
         with pytest.raises(hj.DefinitionError):
             hj.experiments.add_noise(data, **bad)
-    with pytest.raises(hj.DefinitionError, match="ProcessNoise: `std` must be a number that is not negative"):
+    with pytest.raises(
+        hj.DefinitionError, match="ProcessNoise: `std` must be a number that is not negative"
+    ):
         realized(model, 1, process_noise=-1.0)
 
 
