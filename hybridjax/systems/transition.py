@@ -1,16 +1,19 @@
 """Transitions between charts: guards, scheduled events and resets."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PositiveScalar, Scalar
+from .._core.boundary.kinds import Numbers
 from .._core.executor import Array, namespace
 from .._core.precision import real
 from .._core.text import fields
+from ..errors import DefinitionError
 
 
 Direction = Literal["falling", "rising"]
@@ -23,7 +26,17 @@ class Scheduled(eqx.Module):
     period: Float[Array, ""]
     offset: Float[Array, ""]
 
-    def __init__(self, period: PositiveScalar, offset: Scalar = 0.0):
+    def __init__(
+        self,
+        period: Annotated[Numbers, Reals("...", sign="positive")],
+        offset: Annotated[Numbers, Reals("...")] = 0.0,
+    ):
+        for name, given in (("period", period), ("offset", offset)):
+            # (Of JAX's arrays, several lanes may each have their own number.)
+            if isinstance(given, np.ndarray) and given.shape:
+                raise DefinitionError(
+                    f"Scheduled: `{name}` must be one number, not of shape {given.shape}."
+                )
         self.period, self.offset = real(period), real(offset)
 
     def __repr__(self):

@@ -92,6 +92,7 @@ class SeriesFit(MultiplierEstimate):
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
         by_b = (np.abs(spread) ** 2).sum(axis=(1, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
         variance = by_c + by_b * self.noise[:, None] ** 2
+        variance = np.where(np.isnan(variance), np.inf, variance)  # nothing is known
         return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
 
     def __repr__(self) -> str:
