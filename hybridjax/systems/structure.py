@@ -49,7 +49,6 @@ class Structure:
         self.d = max(self.dims)
         self.inputs: tuple[Signal, ...] = signals(system.inputs, system.input_units)
         self.nu = len(self.inputs)
-        self.nu = len(system.inputs)
         out = [[g for g, tr in enumerate(self.transitions) if tr.source == n] for n in self.names]
         by_clock = [isinstance(tr.guard, Scheduled) for tr in self.transitions]
         self._guards = [[g for g in own if not by_clock[g]] for own in out]

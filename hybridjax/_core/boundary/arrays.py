@@ -133,7 +133,8 @@ class Reals(Kind):
         if not bad.any():
             return
         if values.ndim == 0:
-            raise self.refused(values.item())
+            one = self.single if self.sign == "any" else f"a {self.sign} number"
+            raise Misfit(f"must be {one}, not {show(values.item())}", near=True)
         index = tuple(map(int, np.argwhere(bad)[0]))
         raise Misfit(
             f"must be {allowed}, but is {values[index]:.6g} at index "
