@@ -156,7 +156,7 @@ def apply_resets(
             q, chart = carry
             xp, point = namespace(q), [only(here, x) for x in (t, q[:n], u)]
             if on_host(q):
-                new = kernels.reset(s, g, *point)[:, 0]
+                new = kernels.reset(s, g, *point, here)[:, 0]
             else:
                 own = Structure(needed(here, s.source))
                 reset = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))
@@ -178,7 +178,7 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
             n = s.dims[s.chart_index(transition.source)]
             arguments = only(here, t), only(here, q[:n]), only(here, u)
             if on_host(t):
-                holds = kernels.enabled(s, g, *arguments)
+                holds = kernels.enabled(s, g, *arguments, here)
             else:
                 holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
             out = xp.where(here, holds, out)

@@ -1,7 +1,8 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
 All take and return NumPy's arrays. A column of values stands before those of derivatives, by the
-time, the n states and the inputs: (rows, 2 + n + nu, L).
+time, the n states and the inputs: (rows, 2 + n + nu, L). Where only `some` lanes are needed, the
+others are copies of one of these; none may stand for all.
 """
 
 import jax
@@ -27,9 +28,10 @@ def field(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "n c L"]:
     """The field of chart a, and its derivatives."""
-    return s.kernel(_field, a, lanes=_POINTS)(t, q, u)
+    return s.kernel(_field, a, lanes=_POINTS)(t, q, u, some=some)
 
 
 def step(
@@ -39,9 +41,10 @@ def step(
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
     h: Float[np.ndarray, " #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(*s.kernel(_step, a)(t, q, u, h))
+    return Step(*s.kernel(_step, a)(t, q, u, h, some=some))
 
 
 def watched(
@@ -52,9 +55,12 @@ def watched(
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
     index: Int[np.ndarray, " #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32))
+    return s.kernel(_watched, a, trees=(levels,))(
+        t, q, u, index.astype(np.int32), some=some
+    )
 
 
 def reset(
@@ -63,9 +69,10 @@ def reset(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "m c L"]:
     """The state after transition g, and its derivatives."""
-    return s.kernel(_reset, g)(t, q, u)
+    return s.kernel(_reset, g)(t, q, u, some=some)
 
 
 def enabled(
@@ -74,9 +81,10 @@ def enabled(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Bool[np.ndarray, " L"]:
     """Whether the predicate of transition g holds."""
-    return s.kernel(_enabled, g)(t, q, u)
+    return s.kernel(_enabled, g)(t, q, u, some=some)
 
 
 def outputs(
