@@ -178,7 +178,7 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
             n = s.dims[s.chart_index(transition.source)]
             arguments = only(here, t), only(here, q[:n]), only(here, u)
             if on_host(t):
-                holds = kernels.enabled(s, g, *arguments, here)
+                holds = kernels.enabled(s, g, *arguments)
             else:
                 holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
             out = xp.where(here, holds, out)

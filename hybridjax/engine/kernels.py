@@ -58,9 +58,7 @@ def watched(
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    return s.kernel(_watched, a, trees=(levels,))(
-        t, q, u, index.astype(np.int32), some=some
-    )
+    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32), some=some)
 
 
 def reset(
@@ -81,10 +79,9 @@ def enabled(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
-    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Bool[np.ndarray, " L"]:
     """Whether the predicate of transition g holds."""
-    return s.kernel(_enabled, g)(t, q, u, some=some)
+    return s.kernel(_enabled, g)(t, q, u)
 
 
 def outputs(
@@ -97,6 +94,17 @@ def outputs(
 ) -> Float[np.ndarray, "ny c L"]:
     """Outputs in chart a, and their derivatives."""
     return s.kernel(_outputs, a, trees=(items,), lanes=_POINTS)(t, q, u)
+
+
+def values(
+    s: Structure,
+    a: int,
+    items: tuple[str | Output, ...],
+    t: Float[np.ndarray, " L"],
+    q: Float[np.ndarray, "n L"],
+) -> Float[np.ndarray, "ny L"]:
+    """Outputs in chart a without input, without derivatives."""
+    return s.kernel(_values, a, trees=(items,), lanes=_MANY_POINTS)(t, q)
 
 
 def levels(
@@ -148,6 +156,11 @@ def _outputs(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q
         return _expand(lambda t, q, u: z(a, t, q, u), t, q, u)
 
     return Structure(system).by_lane(one, items)(t, q, u)
+
+
+def _values(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q):
+    one = lambda s, items, t, q: s.resolve_outputs(items)(a, t, q, jnp.zeros(s.nu))  # noqa: E731
+    return Structure(system).by_lane(one, items)(t, q)
 
 
 def _levels(a: int, n_sections: int, system: HybridSystem, levels: AbstractLevels, t, q):

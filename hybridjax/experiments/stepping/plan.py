@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from ..._core.boundary.scalars import Number
 from ..._core.compilation.compile import host_first
-from ..._core.executor import Array, namespace
+from ..._core.executor import Array, from_host, namespace, to_host
 from ..._core.memo import Memory
 from ..._core.results import Result
 from ...engine.move import move
@@ -98,12 +98,13 @@ def make_plan(
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
     """
     N = placed.n_sections
-    ways = jax.device_get(_try_ways(placed, settings, jnp.asarray(scale)))
+    placed = to_host(placed)
+    ways = to_host(_try_ways(placed, settings, scale))
     K = len(ways.estimate)
     exact = ways.ends[:, K]
     J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _DIFFERENCE, (2, 0, 1))
     J = J / scale[:, None, :]
-    J[~np.asarray(placed.time_is_state), :, 0] = 0.0
+    J[~placed.time_is_state, :, 0] = 0.0
     error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
@@ -128,7 +129,7 @@ def make_plan(
     slack = np.where(
         best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
     )
-    return Plan(*map(jnp.asarray, (ways.first[best, section], ways.lead, slack, weight)))
+    return from_host(Plan(ways.first[best, section], ways.lead, slack, weight))
 
 
 class _Ways(NamedTuple):
@@ -254,7 +255,7 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         cycle = placed.cycle
         settings = Settings(accuracy, accuracy, PATIENCE, cycle.settings.scale)
         time = np.full((placed.n_sections, 1), float(cycle.period))
-        sizes = np.asarray(cycle.return_map.sizes_in(placed.lanes.chart))
+        sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
