@@ -69,8 +69,9 @@ def to_host(tree: Any) -> Any:
 
 
 def from_host(tree: Any) -> Any:
-    """`tree` with its arrays as JAX's."""
-    return jax.tree_util.tree_map(lambda x: jax.device_put(x) if on_host(x) else x, tree)
+    """`tree` with copies of its arrays as JAX's. (`jnp.array` compiles a program for each shape,
+    and `jax.device_put` alone may share memory.)"""
+    return jax.tree_util.tree_map(lambda x: jax.device_put(np.array(x)) if on_host(x) else x, tree)
 
 
 def cond(some: Array, yes: Callable, no: Callable, *operands: Any) -> Any:

@@ -156,7 +156,7 @@ def apply_resets(
             q, chart = carry
             xp, point = namespace(q), [only(here, x) for x in (t, q[:n], u)]
             if on_host(q):
-                new = kernels.reset(s, g, *point)[:, 0]
+                new = kernels.reset(s, g, *point, here)[:, 0]
             else:
                 own = Structure(needed(here, s.source))
                 reset = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))

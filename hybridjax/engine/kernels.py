@@ -1,7 +1,8 @@
 """Users' functions for code that runs on the host, each with its first derivatives.
 
 All take and return NumPy's arrays. A column of values stands before those of derivatives, by the
-time, the n states and the inputs: (rows, 2 + n + nu, L).
+time, the n states and the inputs: (rows, 2 + n + nu, L). Where only `some` lanes are needed, the
+others are copies of one of these; none may stand for all.
 """
 
 import jax
@@ -27,9 +28,10 @@ def field(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "n c L"]:
     """The field of chart a, and its derivatives."""
-    return s.kernel(_field, a, lanes=_POINTS)(t, q, u)
+    return s.kernel(_field, a, lanes=_POINTS)(t, q, u, some=some)
 
 
 def step(
@@ -39,9 +41,10 @@ def step(
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
     h: Float[np.ndarray, " #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(*s.kernel(_step, a)(t, q, u, h))
+    return Step(*s.kernel(_step, a)(t, q, u, h, some=some))
 
 
 def watched(
@@ -52,9 +55,10 @@ def watched(
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
     index: Int[np.ndarray, " #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32))
+    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32), some=some)
 
 
 def reset(
@@ -63,9 +67,10 @@ def reset(
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
+    some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "m c L"]:
     """The state after transition g, and its derivatives."""
-    return s.kernel(_reset, g)(t, q, u)
+    return s.kernel(_reset, g)(t, q, u, some=some)
 
 
 def enabled(
@@ -89,6 +94,17 @@ def outputs(
 ) -> Float[np.ndarray, "ny c L"]:
     """Outputs in chart a, and their derivatives."""
     return s.kernel(_outputs, a, trees=(items,), lanes=_POINTS)(t, q, u)
+
+
+def values(
+    s: Structure,
+    a: int,
+    items: tuple[str | Output, ...],
+    t: Float[np.ndarray, " L"],
+    q: Float[np.ndarray, "n L"],
+) -> Float[np.ndarray, "ny L"]:
+    """Outputs in chart a without input, without derivatives."""
+    return s.kernel(_values, a, trees=(items,), lanes=_MANY_POINTS)(t, q)
 
 
 def levels(
@@ -140,6 +156,11 @@ def _outputs(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q
         return _expand(lambda t, q, u: z(a, t, q, u), t, q, u)
 
     return Structure(system).by_lane(one, items)(t, q, u)
+
+
+def _values(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q):
+    one = lambda s, items, t, q: s.resolve_outputs(items)(a, t, q, jnp.zeros(s.nu))  # noqa: E731
+    return Structure(system).by_lane(one, items)(t, q)
 
 
 def _levels(a: int, n_sections: int, system: HybridSystem, levels: AbstractLevels, t, q):

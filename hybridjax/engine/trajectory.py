@@ -21,6 +21,7 @@ from .._core.text import number
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure, check_system
 from ..systems.system import Driven, Guess, HybridSystem
+from . import kernels
 from .events import start_lanes
 from .hermite import interpolate
 from .move import record
@@ -174,7 +175,7 @@ def simulate(
             + (tape.chart[used, 0], tape.code[used, 0])
         )
         lanes, h, steps = moved.lanes, moved.h, steps + _ROWS
-        result = Result(int(moved.result[0]))
+        result = Result(int(np.asarray(moved.result)[0]))
         if result != Result.STEP_LIMIT or steps >= max_steps:
             break
     t, before, after, charts, event = (
@@ -251,11 +252,9 @@ def _evaluate(system, names, t, chart, q):
     """Outputs (p,) each at points of trajectories, NaN where not defined."""
     require_x64()
     s = Structure(system)
-    outputs = s.resolve_outputs(names)
+    items = tuple(s.resolve_outputs(names).items)
     values = np.full((len(names), t.shape[0]), np.nan)
-    for a in range(len(s.charts)):
+    for a in np.unique(chart):
         here = chart == a
-        if here.any():
-            z = jax.vmap(lambda t, q, a=a: outputs(a, t, q, jnp.zeros(s.nu)))
-            values[:, here] = z(t[here], q[here, : s.dims[a]]).T
+        values[:, here] = kernels.values(s, int(a), items, t[here], q[here, : s.dims[a]].T)
     return values

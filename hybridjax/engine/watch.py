@@ -27,10 +27,12 @@ class Watch(NamedTuple):
     rate: Float[Array, "W L"]
 
 
-def chart_field(s: Structure, a: int, u: Float[Array, "nu L"]) -> LaneField:
-    """Field of chart a over lanes."""
+def chart_field(
+    s: Structure, a: int, u: Float[Array, "nu L"], some: Bool[np.ndarray, " L"] | None = None
+) -> LaneField:
+    """Field of chart a over lanes; on the host only `some`, if not all are needed."""
     if on_host(u):
-        return lambda t, q: kernels.field(s, a, t, q, u)[:, 0]
+        return lambda t, q: kernels.field(s, a, t, q, u, some)[:, 0]
     field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u), name=("field", a))
     return lambda t, q: field(t, q, u)
 
@@ -57,10 +59,16 @@ class ChartFlow(NamedTuple):
     a: int
     u: Float[Array, "nu L"]
     target: Target
+    some: Bool[np.ndarray, " L"] | None = None
+    """On the host, the lanes that are needed; all, if that is not said."""
 
     @property
     def field(self) -> LaneField:
-        return chart_field(self.s, self.a, self.u)
+        return chart_field(self.s, self.a, self.u, self.some)
+
+    def only(self, some: Bool[Array, " L"]) -> "ChartFlow":
+        """Itself for fewer lanes."""
+        return self._replace(some=some) if on_host(some) and not some.all() else self
 
     @property
     def rows(self) -> list[int]:
@@ -78,7 +86,7 @@ class ChartFlow(NamedTuple):
     ) -> Step:
         """A step from (t, q) over h (see `rk_step`)."""
         if on_host(q):
-            return kernels.step(self.s, self.a, t, q, self.u, h)
+            return kernels.step(self.s, self.a, t, q, self.u, h, self.some)
         return rk_step(self.field, t, q, h, unroll)
 
     def watch(
@@ -87,7 +95,8 @@ class ChartFlow(NamedTuple):
         """The watched functions, in the order of `rows`; f is the field there."""
         a, guards, levels = self.a, self.s.guards(self.a), self.target.levels
         if on_host(q):
-            rows = kernels.watched(self.s, a, levels, t, q, self.u, self.target.index)
+            index = self.target.index
+            rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.some)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
         level = levels is not None and shared(levels).present(self.s, a)
 
@@ -137,7 +146,7 @@ def chart_flow(
     index = only(here, target.index)
     if index is not target.index:
         target = dataclasses.replace(target, index=index)
-    return ChartFlow(s, a, only(here, u), target)
+    return ChartFlow(s, a, only(here, u), target).only(here)
 
 
 def slopes(

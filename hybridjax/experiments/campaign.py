@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
+from .._core.executor import from_host
 from .._core.memo import Memory
 from .._core.progress import counted
 from .._core.results import Result
@@ -111,7 +112,7 @@ class Campaign:
         outputs, base = tuple(self.outputs.items), self._cycle_outputs()
 
         def arguments(some):
-            x, held = jnp.asarray(start[:, some]), jnp.asarray(u[some])
+            x, held = from_host((start[:, some], u[some]))
             return placed, stepping.plan, x, held, outputs, stepping.settings, capacity
 
         S, n, _ = u.shape
@@ -145,10 +146,10 @@ class Campaign:
         """The events of one period of the limit cycle, by the same steps as in experiments."""
         placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
         start = CycleStart(placed).states(np.zeros((1, 0, 0)), 0)
-        u = jnp.zeros((1, N, len(placed.cycle.system.inputs)))
+        u = np.zeros((1, N, len(placed.cycle.system.inputs)))
         capacity = max(len(placed.cycle.event_sequence), 1)
         log = _FLOW[True](
-            placed, stepping.plan, jnp.asarray(start), u, (), stepping.settings, capacity
+            placed, stepping.plan, *from_host((start, u)), (), stepping.settings, capacity
         ).log
         return log
 

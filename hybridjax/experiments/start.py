@@ -4,16 +4,16 @@ import dataclasses
 from collections.abc import Callable
 from typing import ClassVar
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .._core.compilation.compile import quick_jit
 from .._core.execution import Execution
+from .._core.executor import from_host, to_host
 from .._core.memo import Memory
 from .._core.progress import counted
 from ..errors import ComputationError
 from ..linear.ldtp import LDTP
+from ..linear.time_response import monodromy
 from ..maps.linearize import linearize
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
@@ -52,7 +52,7 @@ class PeriodicStart:
 
     def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
         """As of `CycleStart`."""
-        embed = np.asarray(_first_frame(self.placed)[0])[:, : self.model.A.shape[1]]
+        embed = to_host(self.placed).frames()[0][0, :, : self.model.A.shape[1]]
         x0 = self.model.periodic_states(self.window(u), self.periods)
         return _on_cycle(self.placed) + embed @ np.asarray(x0).T
 
@@ -84,7 +84,7 @@ class SteadyStart:
         prediction = self._prediction()
 
         def arguments(some):
-            start, u = jnp.asarray(predicted[:, some]), jnp.asarray(window[some])
+            start, u = from_host((predicted[:, some], window[some]))
             return placed, stepping.plan, start, u, stepping.settings, prediction
 
         parts = in_batches(self.program, arguments, len(u), self.execution)
@@ -102,14 +102,14 @@ class SteadyStart:
 
     def _prediction(self) -> Prediction:
         placed, model = self.predicted.placed, self.predicted.model
-        embed, back = (np.asarray(x) for x in _first_frame(placed))
-        phi = np.asarray(model.monodromy())
+        embed, back = (x[0] for x in to_host(placed).frames())
+        phi = monodromy(to_host(model.A))
         power, d = np.linalg.matrix_power(phi, self.predicted.periods), len(phi)
         gain = embed[:, :d] @ np.linalg.solve(np.eye(d) - power, power) @ back[:d]
         moves = np.ones((len(gain), 1))
-        moves[0] = np.asarray(placed.time_is_state)[0]
-        size = np.asarray(self.stepping.scales[0])[:, None]
-        return Prediction(*map(jnp.asarray, (gain, size, moves, self.stepping.accuracy)))
+        moves[0] = to_host(placed).time_is_state[0]
+        size = self.stepping.scales[0][:, None]
+        return from_host(Prediction(gain, size, moves, np.array(self.stepping.accuracy)))
 
 
 Start = CycleStart | PeriodicStart | SteadyStart
@@ -135,10 +135,3 @@ def _on_cycle(placed: PlacedSections) -> Float[np.ndarray, "m 1"]:
     """Time and state of the limit cycle on section 0."""
     lanes = placed.lanes
     return np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
-
-
-@quick_jit
-def _first_frame(placed: PlacedSections) -> tuple[Float[Array, "m c"], Float[Array, "c m"]]:
-    """From coordinates on section 0 to times and states, and back."""
-    embed, back = placed.frames()
-    return embed[0], back[0]

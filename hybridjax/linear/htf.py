@@ -12,6 +12,7 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Complexes, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
+from .._core.executor import from_host
 from .._core.precision import require_x64
 from .._core.text import listed
 from .._core.tracing import is_traced
@@ -87,7 +88,7 @@ class HTF(eqx.Module):
         variance_freedom: Annotated[Numbers, Reals("F", sign="positive")] | None = None,
     ):
         require_x64()
-        self.f, self.H = jnp.asarray(f), jnp.asarray(H, complex)
+        self.f, self.H = from_host((f, H.astype(complex)))
         self.harmonics = check_harmonics(harmonics, n_sections)
         shape = self.H.shape
         if shape[:2] != (len(self.harmonics), self.f.shape[0]):

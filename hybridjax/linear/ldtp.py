@@ -80,10 +80,10 @@ class LDTP(eqx.Module):
         coordinates: Sequence[Sequence[str]] | None = None,
     ):
         require_x64()
-        A, B, C = map(jnp.asarray, (A, B, C))
+        A, B, C = from_host((A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
-        D = jnp.zeros((n_sections, ny, nu)) if D is None else jnp.asarray(D)
+        D = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         expected = {
             "A": (A, (n_sections, d, d)),
             "B": (B, (n_sections, d, nu)),
@@ -292,7 +292,6 @@ class LDTP(eqx.Module):
 
     def _input(self, u):
         require_x64()
-        u = jnp.asarray(u)
         if u.shape[-1] != len(self.inputs):
             raise DefinitionError(
                 f"`u` has {u.shape[-1]} columns, but the inputs are ({', '.join(self.inputs)})."

@@ -4,9 +4,11 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, on_host
+from .._core.compilation.compile import host_first
+from .._core.executor import Array, namespace, on_host, scan
 
 
 def monodromy(A: Float[Array, "N d d"]) -> Float[Array, "d d"]:
@@ -70,7 +72,7 @@ def impulse_response(
     return jnp.concatenate([D[None], later]).swapaxes(0, 1)
 
 
-@jax.jit
+@host_first
 def periodic_states(
     A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "S P N nu"]
 ) -> Float[Array, "S d"]:
@@ -79,14 +81,14 @@ def periodic_states(
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.
     """
-    _, periods, n_sections, _ = u.shape
-    zero = jnp.zeros(A.shape[-1])
-    after_one = jax.vmap(lambda u: states(A, B, u, zero, jnp.arange(n_sections))[-1])
-    w = jax.vmap(after_one)(u)
-    z_N = jnp.exp(2j * jnp.pi * jnp.arange(periods) / periods)
-    resolvent = z_N[:, None, None] * jnp.eye(A.shape[-1]) - monodromy(A)
-    x = jnp.linalg.solve(resolvent, jnp.fft.fft(w, axis=1)[..., None])
-    return jnp.mean(x[..., 0], axis=1).real
+    xp, periods, identity = namespace(A), u.shape[1], np.eye(A.shape[-1])
+    # What enters at a section reaches the end of the period through the factors after it.
+    phi, after = scan(lambda P, factor: (P @ factor, P), xp.asarray(identity), A[::-1])
+    w = xp.einsum("nij,spnj->spi", after[::-1] @ B, u)
+    z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
+    resolvent = z_N[:, None, None] * identity - phi
+    x = xp.linalg.solve(resolvent, xp.fft.fft(w, axis=1)[..., None])
+    return xp.mean(x[..., 0], axis=1).real
 
 
 @jax.jit

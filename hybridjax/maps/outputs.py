@@ -1,8 +1,9 @@
 """Outputs of hybrid states."""
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from .._core.executor import Array, namespace, on_host
+from ..engine import kernels
 from ..engine.lanes import Lanes, for_each_chart, needed, only
 from ..systems.structure import Outputs, Structure
 
@@ -15,8 +16,12 @@ def observe(
 
     def work(a, here, out):
         point = needed(here, [only(here, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
-        values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
-        return jnp.where(here, values, out)
+        if on_host(here):
+            values = kernels.outputs(s, a, tuple(z.items), *point)[:, 0]
+        else:
+            values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
+        return xp.where(here, values, out)
 
-    nothing = jnp.full((len(z.names), L), jnp.nan)
-    return for_each_chart(s, lanes.chart, jnp.ones(L, bool), work, nothing)
+    xp = namespace(lanes.t)
+    nothing = xp.full((len(z.names), L), xp.nan)
+    return for_each_chart(s, lanes.chart, xp.ones(L, bool), work, nothing)

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
-from .._core.compilation.compile import quick_jit
-from .._core.executor import Array, namespace
+from .._core.compilation.compile import host_first
+from .._core.executor import Array, namespace, to_host
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -71,10 +71,11 @@ class PlacedSections(eqx.Module):
         head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
-        names, charts = self.structure().names, np.asarray(self.lanes.chart)
+        placed = to_host(self)
+        names, charts = self.structure().names, placed.lanes.chart
         inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
-        start = number(self.lanes.t[0], unit=self.cycle.system.time_unit)
-        low, high = np.min(self.dims), np.max(self.dims)
+        start = number(placed.lanes.t[0], unit=self.cycle.system.time_unit)
+        low, high = np.min(placed.dims), np.max(placed.dims)
         dimension = f"{low}" if low == high else f"{low} to {high}"
         return f"{head}: {', '.join(inside)}; dimension {dimension}; section 0 at t = {start})"
 
@@ -146,10 +147,10 @@ SectionsLike = FamilyLike | PlacedSections
 """A family, a single section, a list of sections, or a family that was placed on the cycle."""
 
 
-@quick_jit
+@host_first
 def _observe(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> Float[Array, "N ny"]:
     s = placed.structure()
-    u = jnp.zeros((s.nu, placed.n_sections))
+    u = namespace(placed.lanes.t).zeros((s.nu, placed.n_sections))
     return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
 
 

@@ -3,14 +3,14 @@
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.compile import host_first
+from .._core.executor import namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.tracing import is_traced
@@ -70,25 +70,22 @@ class SectionMap(eqx.Module):
         t: Scalar | None = None,
     ) -> Arrival:
         require_x64()
-        q = jnp.asarray(q, float)
-        if q.shape != self.fixed_point.shape:
+        if q.shape != self.dims[:1]:
             raise DefinitionError(
                 f"`q` must be a state on {self.placed.family.describe(self.i)}, where the map "
-                f"starts and states have the shape {self.fixed_point.shape}; got {q.shape}."
+                f"starts and states have the shape {self.dims[:1]}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)
-        u = jnp.asarray(0.0 if u is None else u, float)
+        u = np.zeros(nu) if u is None else u
         if u.shape not in ((), (nu,)):
             raise DefinitionError(f"`u` must be {nu} numbers, one for each input; got {u.shape}.")
-        u = jnp.broadcast_to(u, (nu,))
-        t = self.placed.lanes.t[self.i] if t is None else jnp.asarray(t, float)
-        arrival = _map(self.placed, self.i, self.j, q, u, t)
+        arrival = _map(self, q, u, t)
         if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
             raise ComputationError(
                 f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
                 f"{code.message}."
             )
-        return Arrival(arrival.t, arrival.q[: self.dims[1]], arrival.result)
+        return arrival
 
 
 @checked
@@ -109,21 +106,22 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
     return SectionMap(placed, i, j, dims)
 
 
-@quick_jit
-def _map(placed: PlacedSections, i: int, j: int, q, u, t) -> Arrival:
-    s = placed.structure()
-    pick = slice(i, i + 1)
-    lanes = placed.lanes
-    q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
+@host_first
+def _map(map: SectionMap, q, u, t) -> Arrival:
+    placed, i, j = map.placed, map.i, map.j
+    s, xp, lanes = placed.structure(), namespace(q), placed.lanes
+    pick, u = slice(i, i + 1), xp.broadcast_to(u, len(placed.cycle.system.inputs))
+    t = lanes.t[i] if t is None else t
+    q = put(xp.zeros((s.d, 1)), (slice(len(q)), 0), q)
     start = eqx.tree_at(
         lambda x: (x.t, x.q, x.chart, x.armed, x.events, x.pace),
         lanes,
         (t[None], q, lanes.chart[pick], lanes.armed[:, pick], lanes.events[pick],
          lanes.pace[:, pick]),
     )  # fmt: skip
-    target = placed.target(jnp.array([j]), t[None], jnp.array([1 if j <= i else 0]))
+    target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
     moved = move(s, start, u[:, None], target, placed.cycle.settings)
     end = moved.lanes
     result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
-    keep = jnp.where(result == Result.OK, 1.0, jnp.nan)  # a factor makes derivatives NaN, too
-    return Arrival((keep * end.t)[0], (keep * end.q)[:, 0], result[0])
+    keep = xp.where(result == Result.OK, 1.0, xp.nan)  # a factor makes derivatives NaN, too
+    return Arrival((keep * end.t)[0], (keep * end.q)[: map.dims[1], 0], result[0])

@@ -6,6 +6,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
+from .._core.executor import to_host
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of
@@ -99,7 +100,7 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "multipliers")
         dims, factors = self.dims, np.asarray(self.factors)
-        sizes = np.asarray(self.return_map.sizes_in(self.legs.chart))
+        sizes = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
         after = np.roll(np.arange(len(dims)), -1)  # the piece that follows
         factors = factors * sizes[:, None, :] / sizes[after, :, None]
         blocks = [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
@@ -120,30 +121,31 @@ class LimitCycle(eqx.Module):
     def state(self) -> dict[str, float]:
         """The state at `anchor`, by name."""
         _require_values(self, "state")
-        chart = Structure(self.system).charts[int(self.anchor.chart[0])]
-        return dict(zip(chart.states, self.anchor.q[:, 0].tolist(), strict=False))
+        anchor = to_host(self.anchor)
+        chart = Structure(self.system).charts[int(anchor.chart[0])]
+        return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot."""
         _require_values(self, "trajectory")
-        s = Structure(self.system)
-        a = int(self.anchor.chart[0])
+        s, anchor = Structure(self.system), to_host(self.anchor)
+        a = int(anchor.chart[0])
         return simulate(
             self.system,
             s.names[a],
-            self.anchor.q[: s.dims[a], 0],
+            anchor.q[: s.dims[a], 0],
             float(self.period) * periods,
-            time=float(self.anchor.t[0]),
+            time=float(anchor.t[0]),
             settings=self.settings,
         )
 
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
-        s, time = Structure(self.system), self.system.time_unit
+        s, time, anchor = Structure(self.system), self.system.time_unit, to_host(self.anchor)
         names = [tr.name for tr in s.transitions]
         events = ", ".join(names[g] for g in self.event_sequence) or "none"
-        units = map(unit_of, s.states(int(self.anchor.chart[0])))
+        units = map(unit_of, s.states(int(anchor.chart[0])))
         state = ", ".join(
             f"{name} = {number(x, 9, unit)}"
             for (name, x), unit in zip(self.state.items(), units, strict=True)
@@ -154,7 +156,7 @@ class LimitCycle(eqx.Module):
         return (
             f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
             f"  period       {number(self.period, 12, time)}\n"
-            f"  at t = {number(self.anchor.t[0], 6, time)}   {state}\n"
+            f"  at t = {number(anchor.t[0], 6, time)}   {state}\n"
             f"  events       {events}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"

@@ -4,18 +4,18 @@ import dataclasses
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation.compile import host_first
-from .._core.executor import namespace
+from .._core.executor import namespace, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
+from ..engine import kernels
 from ..engine.lanes import Lanes
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.target import until
@@ -145,7 +145,7 @@ def find_limit_cycle(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
         )
         map = ReturnMap(system, settings, anchor, base, expected, {}, multiplicity)
-    conserved = {k: jnp.asarray(v, float) for k, v in (conserved or {}).items()}
+    conserved = {k: real(v) for k, v in (conserved or {}).items()}
     map = dataclasses.replace(map, conserved=conserved)
     if traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
@@ -202,7 +202,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
         map, settings=_in_sizes(map.settings, s, sizes), anchor=solution.anchor, expected=expected
     )
     if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
-        size = np.asarray(own.settings.scale)[int(map.anchor.chart[0])]
+        size = np.asarray(own.settings.scale)[np.asarray(map.anchor.chart)[0]]
         distance = real(np.max(np.abs(solution.turn.residual) / size))
         return own, solution._replace(turn=solution.turn._replace(distance=distance))
     say("Newton's method, in the sizes of the cycle")
@@ -245,7 +245,7 @@ def _check_fits(
 
 def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, Array]) -> None:
     s = Structure(system)
-    s.resolve_outputs(tuple(conserved)).require(int(anchor.chart[0]))
+    s.resolve_outputs(tuple(conserved)).require(int(np.asarray(anchor.chart)[0]))
 
 
 def _check_conserved(cycle: LimitCycle) -> None:
@@ -261,23 +261,24 @@ def _check_conserved(cycle: LimitCycle) -> None:
 def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
     """Those outputs that are conserved near the cycle, with their values: their gradients are left
     eigenvectors of the monodromy."""
-    s = Structure(cycle.system)
-    a, t = int(cycle.anchor.chart[0]), cycle.anchor.t[0]
-    q, u = cycle.anchor.q[: s.dims[a], 0], jnp.zeros(s.nu)
-    returned = np.asarray(monodromy(cycle.factors))[: s.dims[a], : s.dims[a]]
-    sizes = np.asarray(cycle.return_map.sizes)[: s.dims[a]]
-    outputs = s.resolve_outputs(names)
-    gradients = np.asarray(jax.jacfwd(lambda q: outputs(a, t, q, u))(q))
+    cycle = to_host(cycle)
+    s, t = Structure(cycle.system), cycle.anchor.t
+    a = int(cycle.anchor.chart[0])
+    n = s.dims[a]
+    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.settings.scale[a, :n]
+    items = tuple(s.resolve_outputs(names).items)
+    seen = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
+    values, gradients = seen[:, 0], seen[:, 2 : 2 + n]
     changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
     kept = changes <= _CONSERVED * np.abs(gradients * sizes).max(axis=1)
-    values = np.asarray(outputs(a, t, q, u))
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
 def _check_clock(cycle: LimitCycle) -> None:
     """Raise where the cycle of a clocked system is not what it seems to be."""
     s, system = Structure(cycle.system), cycle.system
-    a, t = int(cycle.anchor.chart[0]), float(np.asarray(cycle.anchor.t)[0])
+    anchor = to_host(cycle.anchor)
+    a, t = int(anchor.chart[0]), float(anchor.t[0])
     f, later, guards, rates = jax.device_get(_at_anchor(cycle))
     f, later = f[: s.dims[a]], later[: s.dims[a]]
     slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)

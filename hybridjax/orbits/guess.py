@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.compilation.compile import host_first
-from .._core.executor import from_host, namespace
+from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
@@ -136,7 +136,7 @@ def begin(
             lanes = eqx.tree_at(lambda x: x.t, lanes, back)
     if period is not None:
         return Beginning(lanes, None, real(multiplicity * float(period)))
-    a = int(lanes.chart[0])
+    a = int(np.asarray(lanes.chart)[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
     f, level, rate = jax.device_get(_at_start(system, lanes, section))
     f = f[: s.dims[a]]
@@ -189,9 +189,9 @@ def _other_section(s: Structure) -> str:
 
 
 def _require(moved, doing: str, s: Structure, advice: str = "") -> None:
-    result = Result(int(moved.result[0]))
+    result = Result(int(np.asarray(moved.result)[0]))
     if result != Result.OK:
-        lanes = moved.lanes
+        lanes = to_host(moved.lanes)
         raise ComputationError(
             f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
             f"'{s.names[int(lanes.chart[0])]}': {result.message}. {advice}Check the guess and "

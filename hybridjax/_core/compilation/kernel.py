@@ -24,6 +24,7 @@ def kernel(function: Callable, static: tuple[Hashable, ...], trees: Any, lanes: 
 
     `function` belongs to a module, so that it is the same whenever it is asked for. Arguments and
     results have lanes on their last axis; an argument may have one lane where others have more.
+    Where only `some` lanes are needed (a mask), the others get the results of one of these.
 
     The program is for this number of `lanes`: more are done in several calls, fewer are filled up,
     so that it serves all. (XLA runs the smallest programs, of a thousand operations, in the thread
@@ -35,7 +36,10 @@ def kernel(function: Callable, static: tuple[Hashable, ...], trees: Any, lanes: 
     rest = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
     program = _program(function, static, structure, rest)
 
-    def call(*arguments):
+    def call(*arguments, some=None):
+        if some is not None:
+            found = call(*(x[..., some] if x.shape[-1] == len(some) else x for x in arguments))
+            return found[..., np.maximum(np.cumsum(some) - 1, 0)]
         L = max(x.shape[-1] for x in arguments)
         if L == lanes == 1:
             return np.asarray(program(arrays, *arguments))

@@ -142,7 +142,9 @@ def attempt(
         if not in_step:
             home = cond(
                 (which >= 0).any(),
-                lambda: _go_home(flow, before, which, step, allowed, t, tau, aim.reach, task),
+                lambda: _go_home(
+                    flow.only(which >= 0), before, which, step, allowed, t, tau, aim.reach, task
+                ),
                 lambda: home,
             )
             moved = tau + xp.where(home.lands, home.past, 0.0)

@@ -4,16 +4,18 @@ A plan serves prediction, step lengths and error estimates, not control flow: la
 way than the cycle are integrated just as well, only perhaps in more steps.
 """
 
+import dataclasses
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ..._core.boundary.scalars import Number
-from ..._core.compilation.compile import quick_jit
+from ..._core.compilation.compile import host_first
+from ..._core.executor import Array, from_host, namespace, to_host
 from ..._core.memo import Memory
 from ..._core.results import Result
 from ...engine.move import move
@@ -96,12 +98,13 @@ def make_plan(
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
     """
     N = placed.n_sections
-    ways = jax.device_get(_try_ways(placed, settings, jnp.asarray(scale)))
+    placed = to_host(placed)
+    ways = to_host(_try_ways(placed, settings, scale))
     K = len(ways.estimate)
     exact = ways.ends[:, K]
     J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _DIFFERENCE, (2, 0, 1))
     J = J / scale[:, None, :]
-    J[~np.asarray(placed.time_is_state), :, 0] = 0.0
+    J[~placed.time_is_state, :, 0] = 0.0
     error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
@@ -126,7 +129,7 @@ def make_plan(
     slack = np.where(
         best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
     )
-    return Plan(*map(jnp.asarray, (ways.first[best, section], ways.lead, slack, weight)))
+    return from_host(Plan(ways.first[best, section], ways.lead, slack, weight))
 
 
 class _Ways(NamedTuple):
@@ -143,41 +146,42 @@ class _Ways(NamedTuple):
     lead: Float[Array, " N"]
 
 
-@quick_jit
+@host_first
 def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N n"]) -> _Ways:
-    N, n = scale.shape
+    s, xp, (N, n) = placed.structure(), namespace(scale), scale.shape
     K = len(_EQUAL_STEPS) + len(_TOLERANCES)
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
-    by_level = jnp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
-    longest = placed.duration * jnp.where(by_level, _ROOM, 1 + 1e-9)
+    by_level = xp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
+    longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
-    # Blocks of N lanes: K candidates, the reference, and one for each coordinate of (t, q).
-    nudge = _DIFFERENCE * scale.T[None] * np.eye(n)[:, :, None]
-    nudge = jnp.concatenate([np.zeros((K + 1, n, N)), nudge])
+    # Ways, with a lane for every section: K candidates, the reference, and one for each coordinate
+    # of (t, q).
+    W = K + 1 + n
     divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), *[2] * (1 + n)])
     slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
-    by_estimate = np.isfinite(slack) & (np.arange(len(slack)) < K)
-    rtol = jnp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
-    s = placed.structure()
-    u = jnp.zeros((s.nu, N))
+    by_estimate = np.isfinite(slack) & (np.arange(W) < K)
+    rtol = xp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
+    nudge = np.concatenate([np.zeros((K + 1, n)), _DIFFERENCE * np.eye(n)])
+    nudge = (nudge.T[:, :, None] * scale.T[:, None]).reshape(n, -1)
 
-    def block(xs):
-        nudge, divide, slack, rtol = xs
-        moved_to = placed.lanes.t + nudge[0], placed.lanes.q + nudge[1:]
-        lanes = eqx.tree_at(lambda x: (x.t, x.q), placed.lanes, moved_to)
-        start = Stride(longest / divide, lead, jnp.full(N, slack))
-        atol = settings.atol * rtol / settings.rtol
-        tolerance = Settings(rtol, atol, patience, settings.scale)
-        moved = move(s, lanes, u, target, tolerance, start)
-        ends = jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
-        return jnp.where(moved.result == Result.OK, ends, jnp.nan), moved.error
-
-    ends, error = jax.lax.map(block, (nudge, jnp.asarray(divide), jnp.asarray(slack), rtol))
-    estimate = error[:K] * (rtol[:K, None] / settings.rtol)
+    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W), tree)  # noqa: E731
+    each = lambda x: xp.repeat(xp.asarray(x), N)  # noqa: E731
+    lanes = all_ways(placed.lanes)
+    lanes = lanes._replace(t=lanes.t + nudge[0], q=lanes.q + nudge[1:])
+    per_lane = ("time", "index", "event", "limit")
+    target = dataclasses.replace(target, **{x: all_ways(getattr(target, x)) for x in per_lane})
+    start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
+    accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
+    tolerance = Settings(1.0, 1.0, patience, settings.scale)
+    tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
+    moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start)
+    ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
+    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(n, W, N)
+    estimate = moved.error.reshape(W, N)[:K] * (rtol[:K, None] / settings.rtol)
     first = longest / divide[:K, None]
-    return _Ways(jnp.moveaxis(ends, 0, 1), estimate, first, jnp.asarray(slack[:K]), lead)
+    return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
 
 
 def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
@@ -190,12 +194,13 @@ def _lead(placed: PlacedSections, target):
     """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
     s, lanes = placed.structure(), placed.lanes
     N = placed.n_sections
-    everywhere = jnp.ones(N, bool)
-    seen = watch(s, lanes.t, lanes.chart, lanes.q, jnp.zeros((s.nu, N)), target, everywhere)
+    xp = namespace(lanes.t)
+    everywhere = xp.ones(N, bool)
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, everywhere)
     value, rate = seen.value[-1], seen.rate[-1]
     falls = (value > 0) & (rate < 0)
-    lead = placed.duration * jnp.where(falls, -rate / jnp.where(falls, value, 1.0), 0.0)
-    return jnp.where((lead > _LEAST_LEAD) & (lead < _LARGEST_LEAD), lead, 1.0)
+    lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    return xp.where((lead > _LEAST_LEAD) & (lead < _LARGEST_LEAD), lead, 1.0)
 
 
 def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
@@ -250,7 +255,7 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         cycle = placed.cycle
         settings = Settings(accuracy, accuracy, PATIENCE, cycle.settings.scale)
         time = np.full((placed.n_sections, 1), float(cycle.period))
-        sizes = np.asarray(cycle.return_map.sizes_in(placed.lanes.chart))
+        sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
         return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
 
