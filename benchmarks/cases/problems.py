@@ -5,6 +5,7 @@ import functools as ft
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +14,8 @@ from job import Job, make_job
 from peers.contest import Seconds, measure
 
 import hybridjax as hj
-from hybridjax.experiments.campaign import _FLOW, prepare
-from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.campaign import prepare
+from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.options import Options
 
 
@@ -91,12 +92,11 @@ class Problem:
 
 def responding(placed, plan, start, u, outputs, settings):
     """Outputs (S, n, 2) of experiments, to be differentiated."""
-    return flow_batch(placed, plan, start, u, outputs, settings).y
+    return flow_batch(course(placed, outputs), plan, start, u, settings).y
 
 
-def program(*arguments) -> jax.Array:
-    """`responding` as `run_experiments` has compiled it for many experiments."""
-    return _FLOW[False](*arguments, 0).y
+program = eqx.filter_jit(responding)
+"""As JAX compiles it, without the options of `run_experiments`."""
 
 
 def record(data: hj.ExperimentData) -> np.ndarray:

@@ -8,11 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.compilation.garbage_collector import uncollected
 from .._core.device import on_cpu
 from .._core.execution import Execution
 from .._core.precision import single, single_precision
-from .._core.threads import in_threads, meanwhile
+from .._core.threads import in_threads
 
 
 # Experiments of one compiled call: on CPU, where fewer share the cost of what is done once for all
@@ -61,41 +60,17 @@ def in_batches(
         some = slice(k, k + size)
         if k + size > S:  # the last batch is filled up with repetitions
             some = np.arange(k, k + size) % S
-        with _precision(execution) as convert:
+        with precision_of(execution) as convert:
             out = program(*convert(arguments(some)))
         return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], out)
 
-    if execution.workers > 1:  # two threads that need the same program would both compile it
-        with _precision(execution) as convert:
-            lower(program, convert(arguments(np.arange(size) % S))).compile()
     parts = in_threads(work, range(0, S, size), execution.workers)
     for k, part in zip(range(0, S, size), parts, strict=True):
         yield slice(k, min(k + size, S)), part
 
 
 @contextlib.contextmanager
-def compiling(
-    program: Callable[..., Any], arguments: tuple, execution: Execution
-) -> Iterator[None]:
-    """A context during which `program` is compiled in another thread.
-
-    `arguments` need the right shapes only. The program is traced in this thread: what two threads
-    trace at the same time differs from run to run, and is not found again in a cache on disk.
-    """
-    with _precision(execution) as convert:
-        lowered = lower(program, convert(arguments))
-    with meanwhile(lowered.compile):
-        yield
-
-
-def lower(program: Callable[..., Any], arguments: tuple) -> Any:
-    """`program` traced for these arguments; takes less than a millisecond where it has been."""
-    with uncollected:
-        return program.lower(*arguments)
-
-
-@contextlib.contextmanager
-def _precision(execution: Execution):
+def precision_of(execution: Execution):
     """A context of this precision, and what brings arguments to it."""
     if execution.precision == "double":
         yield lambda tree: tree

@@ -4,46 +4,43 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation.fingerprint import IndescribableError
+from .._core.compilation.stored import Stored
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import Memory
 from .._core.progress import counted
 from .._core.results import Result
-from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT, Settings
+from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
 from ..errors import ComputationError, DefinitionError
-from ..maps.place import PATIENCE, as_placed
+from ..maps.place import as_placed
 from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
 from ..systems.structure import Outputs
-from .batches import compiling, divide, in_batches
+from .batches import divide, in_batches, precision_of
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD
 from .events import EventTimes, in_order
-from .flow_batch import IntervalEvents, flow_batch
+from .flow_batch import Course, IntervalEvents, closed, course, flow_batch
 from .inputs import DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
 from .options import Options
 from .start import CycleStart, Start, SteadyStart, predict_start
 from .steady import settle_batch
-from .stepping.plan import Plan, Stepping, plan_flow
+from .stepping.plan import Stepping, plan_flow
 from .stepping.single_precision import plan_single
 
 
-# Up to so many samples in all, programs are compiled with little optimization, in half the time,
-# and run up to five times as long: at most 0.03 s longer here. Twice as many, twice that.
-_SMALL = 20_000
+# From so many samples in all, it pays to wait for a program that is compiled thoroughly: that takes
+# 10 s longer, and then 2 microseconds less for each of them. Twice as many: jobs of up to 20 s take
+# twice as long.
+_LARGE = 5_000_000
 _ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
-
-# Compiled with little optimization, and with all.
-_FLOW = {True: quick_jit(flow_batch), False: eqx.filter_jit(flow_batch)}
-_SETTLE = {True: quick_jit(settle_batch), False: eqx.filter_jit(settle_batch)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +49,8 @@ class Campaign:
 
     **Fields:**
 
-    - `placed`: the sections, on their limit cycle. `outputs`: what is recorded there.
+    - `placed`: the sections, on their limit cycle. `course`: what the program needs to know of
+        them. `outputs`: what is recorded there.
     - `inputs`: where inputs come from, and which part of the records is for estimation.
     - `start`: how experiments start. `process_noise`: what acts beside their inputs.
     - `stepping`: how lanes step from section to section. `program`: `flow_batch`, compiled.
@@ -61,6 +59,7 @@ class Campaign:
     """
 
     placed: PlacedSections
+    course: Course
     outputs: Outputs
     inputs: Inputs
     start: Start
@@ -108,12 +107,12 @@ class Campaign:
     def _respond(self, u, start, capacity: int):
         """Deviations of outputs from the cycle (S, n, ny), codes, samples of failures, errors, and
         the first `capacity` events between any two sections."""
-        placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
-        outputs, base = tuple(self.outputs.items), self._cycle_outputs()
+        stepping, N = self.stepping, self.placed.n_sections
+        base = self._cycle_outputs()
 
         def arguments(some):
             x, held = from_host((start[:, some], u[some]))
-            return placed, stepping.plan, x, held, outputs, stepping.settings, capacity
+            return self.course, stepping.plan, x, held, stepping.settings, capacity
 
         S, n, _ = u.shape
         y, others = np.empty((S, n // N, *base.shape)), []
@@ -148,10 +147,10 @@ class Campaign:
         start = CycleStart(placed).states(np.zeros((1, 0, 0)), 0)
         u = np.zeros((1, N, len(placed.cycle.system.inputs)))
         capacity = max(len(placed.cycle.event_sequence), 1)
-        log = _FLOW[True](
-            placed, stepping.plan, *from_host((start, u)), (), stepping.settings, capacity
+        own = dataclasses.replace(self.course, outputs=())
+        return Stored(flow_batch, large=False)(
+            own, stepping.plan, *from_host((start, u)), stepping.settings, capacity
         ).log
-        return log
 
     def _events(
         self, log: IntervalEvents | None, cycle_log: IntervalEvents | None
@@ -192,25 +191,19 @@ def prepare(
     together = len(inputs) if chunk is None else chunks(len(inputs), chunk)[0].stop
     execution = divide(together, execution)
     samples = inputs.cycles * N
-    small = len(inputs) * samples <= _SMALL
-    shape = execution.batch, samples, nu
-    kind = small, shape, z.names, execution.precision
-    # What has room for events is known after the plan only.
-    if not options.record_events and _kinds.is_new(placed, kind):
-        ahead = _compiling_ahead(_FLOW[small], placed, shape, z, execution)
-    else:
-        ahead = contextlib.nullcontext()
-    with ahead:
-        single = execution.precision == "single"
-        stepping = (plan_single if single else plan_flow)(placed, accuracy)
+    large = len(inputs) * samples > _LARGE
+    own = _course(placed, outputs, execution)
+    single = execution.precision == "single"
+    stepping = (plan_single if single else plan_flow)(placed, accuracy)
     if start == "cycle":
         begin = CycleStart(placed)
     else:
         begin = predict_start(placed, inputs.periods)
         if start == "steady":
-            begin = SteadyStart(begin, stepping, execution, _SETTLE[small])
+            aside = dataclasses.replace(own, outputs=())
+            begin = SteadyStart(begin, aside, stepping, execution, Stored(settle_batch, large))
     return Campaign(
-        placed, z, inputs, begin, options.process_noise, stepping, _FLOW[small],
+        placed, own, z, inputs, begin, options.process_noise, stepping, Stored(flow_batch, large),
         options.record_events, execution,
     )  # fmt: skip
 
@@ -238,19 +231,22 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
         )
 
 
-# The kinds of programs that were compiled for placed sections; others, with outputs of the same
-# names, are compiled when they are called.
-_kinds = Memory()
+_courses = Memory()
 
 
-def _compiling_ahead(
-    program, placed: PlacedSections, shape, z: Outputs, execution: Execution
-) -> contextlib.AbstractContextManager[None]:
-    """A context in which the values of the plan are found while `program`, which does not depend on
-    them, is compiled."""
-    N, m = placed.n_sections, 1 + placed.lanes.q.shape[0]
-    plan = Plan(*map(jnp.asarray, np.zeros((4, N))))
-    start, u = jnp.asarray(np.zeros((m, shape[0]))), jnp.asarray(np.zeros(shape))
-    s = placed.structure()
-    settings = Settings(1.0, 1.0, PATIENCE, np.ones((len(s.charts), s.d)))
-    return compiling(program, (placed, plan, start, u, tuple(z.items), settings, 0), execution)
+def _course(
+    placed: PlacedSections, outputs: Sequence[str | Output], execution: Execution
+) -> Course:
+    """The course in the precision that is asked for; closed, if that is possible; once for the
+    same sections and outputs."""
+    names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
+
+    def make():
+        with precision_of(execution) as convert:
+            items = placed.structure().resolve_outputs(outputs).items
+            own = convert(course(placed, items))
+            with contextlib.suppress(IndescribableError):
+                own = closed(own)
+            return own, outputs  # which keep their `id` as long as they live
+
+    return _courses.recall(placed, (names, execution.precision), make)[0]

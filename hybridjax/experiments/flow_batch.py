@@ -10,11 +10,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
+from ..engine.closed import close
+from ..engine.lanes import Lanes
 from ..engine.move import Moved, move
 from ..engine.settings import Settings
 from ..maps.outputs import observe
-from ..maps.placed import PlacedSections
+from ..maps.placed import PlacedSections, section_target
+from ..sections.abstract import BoundSections
 from ..systems.output import Output
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
 from .stepping.plan import Plan
 
 
@@ -52,12 +57,45 @@ class Response(NamedTuple):
     """Events, if they were asked for."""
 
 
+class Course(eqx.Module):
+    """What experiments need to know of sections on a limit cycle.
+
+    **Fields:** `outputs`, what is recorded there; the others are those of `PlacedSections` and
+    `LimitCycle`.
+    """
+
+    system: HybridSystem
+    outputs: tuple[str | Output, ...]
+    bound: BoundSections
+    lanes: Lanes
+    period: Float[Array, ""]
+    event_sequence: tuple[int, ...] = eqx.field(static=True)
+
+
+def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
+    """The course of experiments around a limit cycle."""
+    cycle = placed.cycle
+    return Course(
+        cycle.system, tuple(outputs), placed.bound, placed.lanes, cycle.period, cycle.event_sequence
+    )
+
+
+def closed(course: Course) -> Course:
+    """The course without users' functions, of which programs remain (see `engine/closed.py`).
+
+    **Raises:** `IndescribableError`.
+    """
+    system, levels = close(course.system, course.outputs, course.bound.levels)
+    names = tuple(x.name for x in system.outputs())
+    bound = dataclasses.replace(course.bound, levels=levels)
+    return dataclasses.replace(course, system=system, outputs=names, bound=bound)
+
+
 def flow_batch(
-    placed: PlacedSections,
+    course: Course,
     plan: Plan,
     start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
-    outputs: Sequence[str | Output],
     settings: Settings,
     event_log: int = 0,
 ) -> Response:
@@ -68,11 +106,11 @@ def flow_batch(
     sections are kept. Differentiable in both modes; reverse mode stores the states at the sections,
     and computes what lies between them again.
     """
-    s, cycle = placed.structure(), placed.cycle
-    z = s.resolve_outputs(outputs)
-    N, (S, n, _) = placed.n_sections, u.shape
-    one_turn = len(cycle.event_sequence)
-    first = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
+    s, period, sequence = Structure(course.system), course.period, course.event_sequence
+    z = s.resolve_outputs(course.outputs)
+    N, (S, n, _) = len(course.bound.time), u.shape
+    one_turn = len(sequence)
+    first = jax.tree_util.tree_map(lambda x: x[..., :1], course.lanes)
     lanes = jax.tree_util.tree_map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
@@ -83,19 +121,20 @@ def flow_batch(
         i, j = k % N, (k + 1) % N
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
-        target = placed.target(j[None], lanes.t, turns[None])
-        target = dataclasses.replace(target, event_sequence=cycle.event_sequence)
+        to = j[None], lanes.t, turns[None]
+        target = section_target(course.bound, course.lanes, period, *to)
+        target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result, glide=True, event_log=event_log)
         # An event may change places with a section, but none may be left out or come in addition.
-        due = placed.lanes.events[j] + turns * one_turn
+        due = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
         # Times and events are counted within one turn, so that every turn is computed alike.
         lanes = eqx.tree_at(
             lambda x: (x.t, x.events),
             moved.lanes,
-            (moved.lanes.t - turns * cycle.period, moved.lanes.events - turns * one_turn),
+            (moved.lanes.t - turns * period, moved.lanes.events - turns * one_turn),
         )
         ok = result == Result.OK
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)

@@ -19,7 +19,7 @@ from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
-from .flow_batch import Response, flow_batch
+from .flow_batch import Response, course, flow_batch
 from .stepping.plan import Accuracy, Stepping, plan_flow
 
 
@@ -77,7 +77,7 @@ class ResponseFunction(eqx.Module):
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
         return flow_batch(
-            placed, self.stepping.plan, start, u, self.outputs, self.stepping.settings
+            course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
         )
 
 

@@ -18,6 +18,7 @@ from ..maps.linearize import linearize
 from ..maps.placed import PlacedSections
 from ..systems.output import Output
 from .batches import in_batches
+from .flow_batch import Course
 from .options import StartName
 from .steady import Prediction
 from .stepping.plan import Stepping
@@ -65,11 +66,13 @@ class PeriodicStart:
 class SteadyStart:
     """Experiments start in the periodic response itself, found from the predicted one.
 
-    **Fields:** `program`, `settle_batch` compiled; `stepping` and `execution`, how it is run.
+    **Fields:** `course`; `program`, `settle_batch` compiled; `stepping` and `execution`, how it is
+    run.
     """
 
     name: ClassVar[StartName] = "steady"
     predicted: PeriodicStart
+    course: Course
     stepping: Stepping
     execution: Execution
     program: Callable
@@ -79,13 +82,13 @@ class SteadyStart:
 
         **Raises:** `ComputationError` if no periodic response is found near the predicted one.
         """
-        placed, stepping = self.predicted.placed, self.stepping
+        stepping = self.stepping
         predicted, window = self.predicted.states(u, first), self.predicted.window(u)
         prediction = self._prediction()
 
         def arguments(some):
             start, u = from_host((predicted[:, some], window[some]))
-            return placed, stepping.plan, start, u, stepping.settings, prediction
+            return self.course, stepping.plan, start, u, stepping.settings, prediction
 
         parts = in_batches(self.program, arguments, len(u), self.execution)
         batches = -(-len(u) // self.execution.batch) if self.execution.batch else None

@@ -14,9 +14,8 @@ from .._core.boundary.kinds import Numbers, Positive
 from .._core.precision import require_x64
 from ..engine.settings import STEADY_START, Settings
 from ..errors import DefinitionError
-from ..maps.placed import PlacedSections
 from ..systems.system import HybridSystem
-from .flow_batch import flow_batch
+from .flow_batch import Course, flow_batch
 from .response_function import ResponseFunction
 from .stepping.plan import Plan
 
@@ -86,7 +85,7 @@ class Prediction(NamedTuple):
 
 
 def settle_batch(
-    placed: PlacedSections,
+    course: Course,
     plan: Plan,
     start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
@@ -100,7 +99,7 @@ def settle_batch(
     """
 
     def step(x):
-        defect = (flow_batch(placed, plan, x, u, (), settings).end.T - x) * predicted.moves
+        defect = (flow_batch(course, plan, x, u, settings).end.T - x) * predicted.moves
         return defect + predicted.gain @ defect, None
 
     settled = settle(step, start, predicted.size, predicted.accuracy)

@@ -19,7 +19,7 @@ from .._core.text import fields, listed, value
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.flow_batch import flow_batch
+from ..experiments.flow_batch import course, flow_batch
 from ..experiments.response_function import response_function
 from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.error_weights import check_values, error_weights
@@ -210,7 +210,7 @@ class ObservedSeries(AbstractObservation):
         placed = place_sections(cycle, self.sections)
         start = jnp.tile(placed.section_zero[:, None], len(self.u))
         plan, settings = self.flow
-        y = flow_batch(placed, plan, start, self.u, self.outputs, settings).y
+        y = flow_batch(course(placed, self.outputs), plan, start, self.u, settings).y
         if not self.absolute:
             y = y - jnp.tile(placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1))
         return ((y - self.y) / self.scale).ravel()

@@ -123,17 +123,7 @@ class PlacedSections(eqx.Module):
 
         Lanes that do not arrive give up in the end.
         """
-        xp, arrival = namespace(t), self.lanes.t[i] + turns * self.cycle.period
-        time = self.bound.time[i] + turns * self.cycle.period
-        return Target(
-            xp.broadcast_to(time, t.shape),
-            i,
-            self.bound.event[i],
-            xp.maximum(arrival, t) + _GRACE * self.cycle.period,
-            None,
-            self.bound.levels,
-            Result.SECTION_MISSED,
-        )
+        return section_target(self.bound, self.lanes, self.cycle.period, i, t, turns)
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
         """For each section, the one that follows, how many turns later, and the way to it."""
@@ -141,6 +131,27 @@ class PlacedSections(eqx.Module):
         following = (xp.arange(self.n_sections) + 1) % self.n_sections
         turns = (following == 0).astype(np.int32)
         return following, turns, self.target(following, self.lanes.t, turns)
+
+
+def section_target(
+    bound: BoundSections,
+    lanes: Lanes,
+    period: Float[Array, ""],
+    i: Int[Array, " #L"],
+    t: Float[Array, " L"],
+    turns: Int[Array, " #L"],
+) -> Target:
+    """See `PlacedSections.target`."""
+    xp, arrival = namespace(t), lanes.t[i] + turns * period
+    return Target(
+        xp.broadcast_to(bound.time[i] + turns * period, t.shape),
+        i,
+        bound.event[i],
+        xp.maximum(arrival, t) + _GRACE * period,
+        None,
+        bound.levels,
+        Result.SECTION_MISSED,
+    )
 
 
 SectionsLike = FamilyLike | PlacedSections

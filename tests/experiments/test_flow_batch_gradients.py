@@ -10,7 +10,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.settings import Settings
-from hybridjax.experiments.flow_batch import flow_batch
+from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.stepping.plan import make_plan
 
 from ..conftest import APEX, OUTPUTS
@@ -41,7 +41,7 @@ def experiment(request, lossy_cycle):
         pick = lambda s: [getattr(s, name) for name in PARAMETERS]  # noqa: E731
         system = eqx.tree_at(pick, lossy_cycle.system, list(x))
         other = eqx.tree_at(lambda p: p.cycle.system, placed, system)
-        response = flow_batch(other, plan, start, u[None], OUTPUTS, SETTINGS)
+        response = flow_batch(course(other, OUTPUTS), plan, start, u[None], SETTINGS)
         return response.y[0], response.result[0]
 
     return run

@@ -8,6 +8,15 @@ import jax
 from ...errors import DefinitionError
 from ..boundary.checked import checked
 from ..boundary.kinds import Path
+from .loader_messages import silence_for_good
+
+
+_folder: pathlib.Path | None = None
+
+
+def folder() -> pathlib.Path | None:
+    """Where compiled programs are kept, if they are."""
+    return _folder
 
 
 @checked
@@ -32,6 +41,9 @@ def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
             f"cannot keep compiled programs in '{folder}' ({error.strerror}): set HYBRIDJAX_CACHE "
             "to another folder."
         ) from error
+    global _folder
+    _folder = folder
+    silence_for_good()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # The smallest programs too: those of users' functions come before everything else.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

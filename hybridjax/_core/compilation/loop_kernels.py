@@ -30,8 +30,7 @@ def enable_loop_kernels() -> None:
     do it.
     """
     before = os.environ.get("XLA_FLAGS")
-    if _FLAG not in (before or "").split():
-        os.environ["XLA_FLAGS"] = f"{before} {_FLAG}" if before else _FLAG
+    os.environ["XLA_FLAGS"] = with_loop_kernels(before)
     if jax.default_backend() == "cpu" and not _in_use():
         os.environ.pop("XLA_FLAGS")
         if before is not None:
@@ -40,6 +39,12 @@ def enable_loop_kernels() -> None:
             "XLA does not make single kernels of loops: it has read its options already (call "
             "`enable_loop_kernels()` before JAX computes anything), or it is of another version."
         )
+
+
+def with_loop_kernels(flags: str | None) -> str:
+    """`XLA_FLAGS` with the option."""
+    words = (flags or "").split()
+    return " ".join(words if _FLAG in words else [*words, _FLAG])
 
 
 def _in_use() -> bool:

@@ -1,0 +1,204 @@
+"""Large programs, which are compiled twice: quickly for a first answer, and thoroughly for more.
+
+A program is known by a digest of all that it is made of (`fingerprint.py`). With
+`enable_compilation_cache()` it is kept on disk under that name, where a later process finds it
+without tracing anything.
+"""
+
+import atexit
+import contextlib
+import functools as ft
+import logging
+import os
+import pathlib
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from ..device import on_cpu
+from ..progress import say_compiling
+from ..tracing import is_inside_program, is_traced
+from . import compilation_cache, thorough
+from .compile import compiler_options, quick_jit
+from .fingerprint import IndescribableError, digest, surroundings
+from .garbage_collector import uncollected
+from .loader_messages import silence
+from .portable import Executable, Portable, build, trace
+from .program_store import ProgramStore
+
+
+# Seconds that are spent in a program before it is compiled thoroughly, beside what goes on. Twice
+# as much: repeated calls stay slow for twice as long, and fewer processes are started in vain.
+_WORTH_A_PROCESS = 0.5
+
+_log = logging.getLogger(__name__)
+
+
+class Stored:
+    """`function(*arguments)` for one job, all of which is done by the same program.
+
+    A job that is `large` waits until the program is compiled thoroughly. Any other takes it if it
+    is there, and otherwise the one that is compiled quickly. What has no digest, or is traced, is
+    left to `equinox.filter_jit`, or `quick_jit` if it is not large.
+    """
+
+    def __init__(self, function: Callable, large: bool):
+        self._function, self._large = function, large
+        self._chosen: dict[str, Executable] = {}
+
+    def __call__(self, *arguments: Any) -> Any:
+        if is_traced(arguments) or is_inside_program() or not _is_simple():
+            return self._plain(arguments)
+        arrays, rest = eqx.partition(arguments, eqx.is_array)
+        leaves, structure = jax.tree_util.tree_flatten(arrays)
+
+        def flat(*leaves):
+            return self._function(*eqx.combine(structure.unflatten(leaves), rest))
+
+        try:
+            known = _known(digest(self._function, surroundings(), arguments))
+            if known.key not in self._chosen:
+                with known.lock, uncollected:
+                    self._chosen[known.key] = known.choose(lambda: trace(flat, leaves), self._large)
+        except IndescribableError:
+            return self._plain(arguments)
+        return known.run(self._chosen[known.key], leaves)
+
+    def _plain(self, arguments):
+        program = _plain_program(self._function, self._large)
+        with _one_by_one, uncollected:  # two threads would both compile it
+            program.lower(*arguments).compile()
+        return program(*arguments)
+
+
+@ft.cache
+def _plain_program(function: Callable, large: bool) -> Callable:
+    return eqx.filter_jit(function) if large else quick_jit(function)
+
+
+class _Known:
+    """A program, and what this process has of it."""
+
+    def __init__(self, key: str):
+        self.key, self.lock = key, threading.Lock()
+        self._programs: dict[str, Executable] = {}
+        self._seconds = 0.0
+        self._process: subprocess.Popen | None = None
+
+    def choose(self, traced: Callable[[], Portable], large: bool) -> Executable:
+        """The program for a job; `traced` gives what it is compiled from."""
+        found = self._find("thorough")
+        if found is None and large:
+            self._compile_beside(traced)
+            return self._find("thorough") or self._make("thorough", traced, {})
+        return found or self._find("quick") or self._make("quick", traced, compiler_options())
+
+    def run(self, program: Executable, arrays: list[jax.Array]) -> Any:
+        begin = time.perf_counter()
+        results = jax.block_until_ready(program(*arrays))
+        if program is self._programs.get("quick"):
+            with self.lock:
+                self._seconds += time.perf_counter() - begin
+                if self._seconds > _WORTH_A_PROCESS and self._process is None:
+                    self._start()
+        return results
+
+    def _find(self, tier: str) -> Executable | None:
+        """The program, if it is in memory or on disk."""
+        if tier not in self._programs:
+            data = _store().read(self._name(tier))
+            try:
+                if data is not None:
+                    with silence():
+                        self._programs[tier] = Executable.from_bytes(data)
+            except Exception as error:  # whatever JAX raises for programs of another XLA
+                _log.debug("a program on disk is not used: %s", error)
+        return self._programs.get(tier)
+
+    def _make(self, tier: str, traced, options) -> Executable:
+        with _compiling():
+            program = self._programs[tier] = build(self._traced(traced), options)
+            if compilation_cache.folder() is not None:
+                _store().write(self._name(tier), program.to_bytes())
+        return program
+
+    def _traced(self, traced) -> Portable:
+        """What the program is compiled from, on disk from now on."""
+        data = _store().read(self._name("traced"))
+        if data is not None:
+            return Portable.from_bytes(data)
+        program = traced()
+        _store().write(self._name("traced"), program.to_bytes())
+        return program
+
+    def _compile_beside(self, traced) -> None:
+        """Wait for another process to compile the program thoroughly."""
+        with _compiling():
+            if self._process is None:
+                self._traced(traced)
+                self._start()
+            if self._process is not None:
+                self._process.wait()
+
+    def _start(self) -> None:
+        names = self._name("traced"), self._name("thorough")
+        self._process = thorough.start(_store().folder, *names)
+
+    def _name(self, what: str) -> str:
+        return f"{self.key}-{what}"
+
+
+_programs: dict[str, _Known] = {}
+_one_by_one = threading.Lock()
+
+
+def _known(key: str) -> _Known:
+    return _programs.setdefault(key, _Known(key))
+
+
+def _store() -> ProgramStore:
+    return ProgramStore((compilation_cache.folder() or _temporary_folder()) / "programs")
+
+
+@ft.cache
+def _temporary_folder() -> pathlib.Path:
+    """One that is deleted when this process ends."""
+    folder, owner = tempfile.mkdtemp(prefix="hybridjax-"), os.getpid()
+    atexit.register(lambda: os.getpid() == owner and shutil.rmtree(folder, ignore_errors=True))
+    return pathlib.Path(folder)
+
+
+def _forget() -> None:
+    """A forked process has none of the other threads, one of which may have held a lock."""
+    global _one_by_one
+    _one_by_one = threading.Lock()
+    _programs.clear()
+    _temporary_folder.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+@contextlib.contextmanager
+def _compiling() -> Iterator[None]:
+    say_compiling(True)
+    try:
+        yield
+    finally:
+        say_compiling(False)
+
+
+def _is_simple() -> bool:
+    """Whether JAX computes on the first CPU, and runs programs as they are."""
+    device = jax.config.jax_default_device
+    first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
+    names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
+    return on_cpu() and first and not any(getattr(jax.config, name) for name in names)

@@ -1,0 +1,180 @@
+"""A system of which only the programs of its functions are left.
+
+What JAX traces of a closed system can depend on these programs only, and on words and numbers that
+can be looked at. So it is known by a digest of them (`_core/compilation/fingerprint.py`), also in
+another process, where a user's classes and functions could not be told apart.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._core.compilation.fingerprint import Program
+from ..systems.chart import Chart
+from ..systems.output import Output
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+from ..systems.transition import Scheduled, Transition
+from .target import AbstractLevels
+
+
+class _Event(NamedTuple):
+    """What is left of a transition; no guard: it is scheduled."""
+
+    name: str
+    source: str
+    target: str
+    guard: Program | None
+    reset: Program
+    enabled: Program | None
+
+
+class _Chart(NamedTuple):
+    name: str
+    states: tuple[str, ...]
+    field: Program
+
+
+class _Output(NamedTuple):
+    name: str
+    functions: tuple[tuple[str, Program], ...]
+    """Charts that have it, each with a function."""
+
+
+class _Closed(NamedTuple):
+    """What is left of a system."""
+
+    inputs: tuple[str, ...]
+    charts: tuple[_Chart, ...]
+    events: tuple[_Event, ...]
+    outputs: tuple[_Output, ...]
+
+
+class ClosedSystem(HybridSystem):
+    """A system made of programs, with the numbers of one that was written by a user."""
+
+    numbers: list[Array]
+    schedules: list[Scheduled | None]
+    closed: _Closed = eqx.field(static=True)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return self.closed.inputs
+
+    def charts(self):
+        return {x.name: _ClosedChart(self.numbers, x) for x in self.closed.charts}
+
+    def transitions(self):
+        return [
+            Transition(
+                x.name,
+                x.source,
+                x.target,
+                self._function(x.guard) if schedule is None else schedule,
+                reset=self._function(x.reset),
+                enabled=None if x.enabled is None else self._function(x.enabled),
+            )
+            for x, schedule in zip(self.closed.events, self.schedules, strict=True)
+        ]
+
+    def outputs(self):
+        return [
+            Output(x.name, {chart: self._function(program) for chart, program in x.functions})
+            for x in self.closed.outputs
+        ]
+
+    def _function(self, program: Program | None):
+        assert program is not None
+        return lambda t, q, u: program(self.numbers, t, q, u)
+
+
+class _ClosedChart(Chart):
+    numbers: list[Array]
+    closed: _Chart = eqx.field(static=True)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return self.closed.states
+
+    def field(self, t, q, u):
+        return self.closed.field(self.numbers, t, q, u)
+
+
+class ClosedLevels(AbstractLevels):
+    """Level functions of a closed system's sections."""
+
+    programs: tuple[Program | None, ...] = eqx.field(static=True)
+    """For each chart; none where no section can be crossed."""
+
+    def present(self, s, a):
+        return self.programs[a] is not None
+
+    def level(self, s, a, i, t, q):
+        program = self.programs[a]
+        assert program is not None
+        return program(s.system.numbers, jnp.asarray(i, int), t, q)
+
+
+def close(
+    system: HybridSystem, outputs: tuple[str | Output, ...], levels: AbstractLevels | None
+) -> tuple[ClosedSystem, ClosedLevels | None]:
+    """`system` and `levels` as programs; the system can be asked for `outputs` by their names.
+
+    **Raises:** `IndescribableError` if something has no digest.
+    """
+    arrays, rest = eqx.partition((system, outputs, levels), eqx.is_array)
+    numbers, structure = jax.tree_util.tree_flatten(arrays)
+    s, array = Structure(system), jax.ShapeDtypeStruct
+
+    def program(function: Callable, *arguments: jax.ShapeDtypeStruct) -> Program:
+        def run(numbers, *arguments):
+            system, outputs, levels = eqx.combine(structure.unflatten(numbers), rest)
+            return function(Structure(system), outputs, levels, *arguments)
+
+        return Program(run, numbers, *arguments)
+
+    def at(a: int) -> tuple[jax.ShapeDtypeStruct, ...]:
+        return array((), float), array((s.dims[a],), float), array((s.nu,), float)
+
+    def chart(a: int) -> _Chart:
+        field = program(lambda s, z, levels, *x: s.field(a, *x), *at(a))
+        return _Chart(s.names[a], tuple(map(str, s.charts[a].states)), field)
+
+    def event(g: int, x: Transition) -> _Event:
+        point, by_clock = at(s.chart_index(x.source)), isinstance(x.guard, Scheduled)
+        guard = lambda s, z, levels, *x: s.guard(g, *x)  # noqa: E731
+        enabled = lambda s, z, levels, *x: s.enabled(g, *x)  # noqa: E731
+        return _Event(
+            x.name,
+            x.source,
+            x.target,
+            None if by_clock else program(guard, *point),
+            program(lambda s, z, levels, *x: s.reset(g, *x), *point),
+            None if x.enabled is None else program(enabled, *point),
+        )
+
+    def output(k: int, name: str) -> _Output:
+        one = lambda a: lambda s, z, levels, *x: s.resolve_outputs(z[k])(a, *x)[0]  # noqa: E731
+        there = [a for a in charts if s.resolve_outputs(outputs[k]).defined(a)]
+        return _Output(str(name), tuple((s.names[a], program(one(a), *at(a))) for a in there))
+
+    def level(a: int) -> Program | None:
+        if levels is None or not levels.present(s, a):
+            return None
+        function = lambda s, z, levels, i, t, q: levels.level(s, a, i, t, q)  # noqa: E731
+        return program(function, array((), int), *at(a)[:2])
+
+    charts = range(len(s.charts))
+    closed = _Closed(
+        tuple(map(str, s.inputs)),
+        tuple(map(chart, charts)),
+        tuple(event(g, x) for g, x in enumerate(s.transitions)),
+        tuple(output(k, x) for k, x in enumerate(s.resolve_outputs(outputs).names)),
+    )
+    schedules = [x.guard if isinstance(x.guard, Scheduled) else None for x in s.transitions]
+    of_sections = None if levels is None else ClosedLevels(tuple(map(level, charts)))
+    return ClosedSystem(numbers, schedules, closed), of_sections
