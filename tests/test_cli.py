@@ -34,7 +34,8 @@ def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
-        assert main(["reproduce", "--quick", "--out", str(out), "--param", "M=2.0"]) == 0
+        options = ["--quick", "--out", str(out), "--param", "M=2.0", "--formats", "png,svg"]
+        assert main(["reproduce", *options]) == 0
     return out
 
 
@@ -81,7 +82,9 @@ def test_reproduce_draws_its_figures(results):
     names = ["fig1_cycle_isochron", "fig1_cycle_kinematic", "fig3_harmonics", "fig4_bode"]
     for name in (*names, "multipliers", "poles_zeros"):
         assert (results / f"{name}.png").stat().st_size > 10_000
-        assert (results / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert "<svg" in (results / f"{name}.svg").read_text()
+    files = {path.suffix for path in results.iterdir() if not path.name.startswith(".")}
+    assert files == {".json", ".npz", ".png", ".svg"}
 
 
 @pytest.mark.parametrize(
@@ -114,6 +117,8 @@ WRONG = {
         "--out x --experiments 1000000000000": "--experiments: 1000000000000 is not between 1 and",
         "--out x --seed -1": "--seed: -1 is negative",
         "--out x --seed x": "--seed: 'x' is not a whole number",
+        "--out x --formats gif": "--formats: 'gif' is not one of png, pdf, svg",
+        "--out x --formats png,png": "--formats: 'png,png' is not a list of different names",
         "--out x --amplitude 0": "--amplitude: 0 is not a positive number",
         "--out x --amplitude inf": "--amplitude: 'inf' is not a number",
     },
@@ -163,7 +168,8 @@ def protocols(monkeypatch):
     """What `reproduce` would be asked for; it does nothing, and converges."""
     asked = []
 
-    def reproduce(out, protocol):
+    def reproduce(out, protocol, formats):
+        assert formats == ("png",)
         asked.append(protocol)
         return {"families": {"isochron": {"converged": protocol.seed == 0}}}
 

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any
 
@@ -44,12 +44,12 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
 
 
 @contextlib.contextmanager
-def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
+def meanwhile(work: Callable[[], Any]) -> Iterator[Future]:
     """A context during which `work` is done in a thread of its own, under the caller's
     configuration of JAX. It ends when both have ended, and raises what `work` raised."""
     with ThreadPoolExecutor(1) as pool:
         running = pool.submit(_configured(work))
-        yield
+        yield running
         running.result()
 
 

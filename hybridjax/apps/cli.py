@@ -13,6 +13,7 @@ from .option_types import (
     assignment,
     count,
     crossing,
+    formats,
     names,
     positive,
     seed,
@@ -105,7 +106,13 @@ def _add_reproduce(commands) -> None:
     add("--param", action="append", default=[], metavar="NAME=VALUE", type=assignment,
         help="change a parameter of the hopper, e.g. M=1.8; may be repeated")  # fmt: skip
     add("--quick", action="store_true", help="a short form, with other defaults")
+    _add_formats(reproduce)
     reproduce.set_defaults(run=_reproduce, parser=reproduce)
+
+
+def _add_formats(command) -> None:
+    command.add_argument("--formats", type=formats, default=("png",), metavar="NAMES",
+        help="of the figures: png, pdf, svg, or several with commas (default: png)")  # fmt: skip
 
 
 def _add_identify(commands) -> None:
@@ -142,6 +149,7 @@ def _add_identify(commands) -> None:
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
     add("--drift", type=positive, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
+    _add_formats(identify)
     identify.set_defaults(run=_identify, parser=identify)
 
 
@@ -162,7 +170,7 @@ def _identify(options) -> int:
     from .recording_report import PAGE, report_folder, write_results
 
     enable_x64()
-    with report_folder(options.out, options.input) as folder:
+    with report_folder(options.out, options.input, options.formats) as folder:
         recording = read_recording(*options.files, time=options.time)
         print(recording)
         if options.phase is not None:
@@ -182,7 +190,7 @@ def _identify(options) -> int:
             timing=options.timing, drift=options.drift,
         )  # fmt: skip
         print(found)
-        write_results(folder, found)
+        write_results(folder, found, options.formats)
     print(os.path.join(options.out, PAGE))
     return _status(found.fit.result == Result.OK)
 
@@ -212,6 +220,7 @@ def _reproduce(options) -> int:
             parameters=dict(options.param),
             **sizes,
         ),
+        options.formats,
     )
     return _status(all(family["converged"] for family in summary["families"].values()))
 

@@ -2,9 +2,10 @@
 
 import argparse
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 from .._core import limits
+from .._core.files.figure_formats import Format
 
 
 def count(text: str) -> int:
@@ -36,6 +37,15 @@ def names(text: str) -> tuple[str, ...]:
     found = tuple(name.strip() for name in text.split(","))
     if "" in found or len(set(found)) < len(found):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of different names")
+    return found
+
+
+def formats(text: str) -> tuple[str, ...]:
+    """Formats of figures with commas in between."""
+    found, known = names(text), get_args(Format)
+    for name in found:
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"{name!r} is not one of {', '.join(known)}")
     return found
 
 

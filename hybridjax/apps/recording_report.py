@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import __version__, plot
 from .._core.boundary.checked import checked
+from .._core.files.figure_formats import Format
 from .._core.files.results_folder import results_folder
 from ..io import save
 from ..linear.htf import HTF
@@ -27,13 +28,15 @@ _POINTS = 240  # frequencies at which transfer functions are written
 
 
 @checked
-def write_report(folder: str | os.PathLike, found: Identification) -> Path:
+def write_report(
+    folder: str | os.PathLike, found: Identification, formats: Sequence[Format] = ("png",)
+) -> Path:
     """Write all results of a recording into a folder. They appear when all of them are ready.
 
     - `report.html`: everything in one page that needs no other file.
     - `sections.csv`: deviations of inputs and outputs at the sections. `cycle.csv`: their average.
     - `htf.npz`, `fit.npz`: for `hj.load`. `summary.json`: the numbers.
-    - `figures/`: PNG and PDF.
+    - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
 
     Other files in the folder stay as they are. Results of an earlier report are replaced, unless
     they were changed since; a hidden list in the folder says which they are.
@@ -43,21 +46,26 @@ def write_report(folder: str | os.PathLike, found: Identification) -> Path:
     **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these names,
     or the folder cannot be written.
     """
-    with report_folder(folder, found.data.inputs) as new:
-        write_results(new, found)
+    with report_folder(folder, found.data.inputs, formats) as new:
+        write_results(new, found, formats)
     return Path(folder) / PAGE
 
 
 def report_folder(
-    folder: str | os.PathLike, inputs: Sequence[str]
+    folder: str | os.PathLike, inputs: Sequence[str], formats: Sequence[Format]
 ) -> contextlib.AbstractContextManager[Path]:
     """A new folder for the results, which at the end are put into `folder`."""
     files = (PAGE, "sections.csv", "cycle.csv", "htf.npz", "fit.npz", "summary.json")
     figures = ["phase", "sections", "multipliers", "impulse_responses", "validation"]
     for by_input in _by_input(inputs):
         figures += [f"bode{by_input}", f"harmonics{by_input}"]
-    images = [f"figures/{name}{suffix}" for name in figures for suffix in (".png", ".pdf")]
+    images = [f"figures/{name}.{format}" for name in figures for format in _shown(formats)]
     return results_folder(Path(folder), "report", [*files, *images])
+
+
+def _shown(formats: Sequence[Format]) -> tuple[Format, ...]:
+    """With the one that the page shows, first."""
+    return tuple(dict.fromkeys(("png", *formats)))
 
 
 def _by_input(inputs: Sequence[str]) -> list[str]:
@@ -65,7 +73,7 @@ def _by_input(inputs: Sequence[str]) -> list[str]:
     return [f"_{x.replace('/', '-')}" for x in inputs] if len(inputs) > 1 else [""]
 
 
-def write_results(folder: Path, found: Identification) -> None:
+def write_results(folder: Path, found: Identification, formats: Sequence[Format]) -> None:
     """Write all results into a folder that is new."""
     from matplotlib import pyplot
 
@@ -73,7 +81,7 @@ def write_results(folder: Path, found: Identification) -> None:
     htf = _htf(found)
     images = {}
     for name, drawn in _figures(found, htf).items():
-        image, _ = look.save(folder / "figures" / name, drawn)
+        image, *_ = look.save(folder / "figures" / name, drawn, _shown(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
         pyplot.close(drawn.figure)
     save(folder / "htf.npz", htf)

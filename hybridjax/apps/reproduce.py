@@ -3,20 +3,24 @@
 Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
 """
 
+import copy
 import dataclasses
 import json
 import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from .. import __version__
 from .._core.compilation.compilation_cache import enable_compilation_cache
+from .._core.files.figure_formats import Format
 from .._core.files.results_folder import results_folder
 from .._core.precision import enable_x64
+from .._core.threads import in_threads, meanwhile, thread_count
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData
@@ -34,14 +38,11 @@ from ..maps.placed import PlacedSections
 from ..models.hopper import VerticalHopper
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
+from ..sections.abstract import AbstractSections
 from ..sections.clock import ClockPhase
 from ..sections.crossing import Crossing
 from ..sections.kinematic import KinematicPhase
 from .paper_report import OUTPUTS, summarize, table
-
-
-SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
-DEVIATIONS = {"yM": r"$\delta y_M$", "vM": r"$\delta \dot y_M$"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,16 @@ class Protocol:
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-class Family(eqx.Module):
+class Exact(NamedTuple):
+    """What is known of one family of sections without experiments."""
+
+    placed: PlacedSections
+    ldtp: LDTP
+    exact: HTF
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
     """Everything that was found with one family of sections."""
 
     placed: PlacedSections
@@ -84,12 +94,20 @@ class _Clock:
         print(f"[{now - self.begin:6.1f} s] {text}", flush=True)
         self.last = now
 
+    def beside(self) -> "_Clock":
+        """For what is done at the same time."""
+        other = copy.copy(self)  # with the same `seconds`
+        other.last = time.perf_counter()
+        return other
 
-def reproduce(out: str | os.PathLike, protocol: Protocol) -> dict:
+
+def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format]) -> dict:
     """Run the protocol and write figures, `summary.json` and `results.npz` into the folder `out`.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
+
+    **Arguments:** `formats` of the figures, as in `hj.plot.save`.
 
     **Returns:** what `summary.json` holds.
 
@@ -97,19 +115,19 @@ def reproduce(out: str | os.PathLike, protocol: Protocol) -> dict:
     written, or one in which another file has the name of a result; `ComputationError` if a step
     fails.
     """
-    with results_folder(Path(out), "reproduce", _names(protocol.families)) as folder:
-        return _reproduce(folder, protocol)
+    with results_folder(Path(out), "reproduce", _names(protocol.families, formats)) as folder:
+        return _reproduce(folder, protocol, formats)
 
 
-def _names(families: Sequence[str]) -> list[str]:
+def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
     """Of all that is written."""
     cycles = [f"fig1_cycle_{family}" for family in families]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
-    files = [f"{figure}{suffix}" for figure in figures for suffix in (".png", ".pdf")]
+    files = [f"{figure}.{format}" for figure in figures for format in formats]
     return ["summary.json", "results.npz", *files]
 
 
-def _reproduce(out: Path, protocol: Protocol) -> dict:
+def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
     enable_x64()
     enable_compilation_cache()
     clock = _Clock()
@@ -119,16 +137,32 @@ def _reproduce(out: Path, protocol: Protocol) -> dict:
     cycle = _find(hopper)
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
     clock.done("cycle", f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
-    families = {}
+    exact = {}
     for name in protocol.families:
-        families[name] = _identify(cycle, name, design, protocol, clock)
-    orbit = cycle.trajectory()
-    perturbed = _perturbed(cycle)
+        exact[name] = _exact(cycle, _sections(name, protocol.n_sections), design)
+        clock.done(f"exact_{name}", f"{name}: sections, exact A, B, C, D and HTF")
+
+    def identify(name):
+        return _identify(name, exact[name], design, protocol, clock.beside())
+
+    def identify_all():
+        workers = min(len(exact), thread_count(None))
+        return dict(zip(exact, in_threads(identify, exact, workers), strict=True))
+
+    # The families' programs compile side by side; meanwhile matplotlib is imported, and draws.
+    with meanwhile(identify_all) as identified:
+        figures = _figures()
+        orbit, perturbed = cycle.trajectory(), _perturbed(cycle)
+        placed = {name: known.placed for name, known in exact.items()}
+        for name in figures.save(out, formats, figures.cycles(placed, perturbed)):
+            clock.done(name, name)
+    clock = clock.beside()
+    families = identified.result()
     summary = summarize(protocol, cycle, families)
     _write_results(out / "results.npz", protocol, cycle, orbit, families)
     clock.done("results", "results.npz")
-    for name in _figures(out, cycle, families, perturbed):
-        clock.done(name, f"{name}.png, {name}.pdf")
+    for name in figures.save(out, formats, figures.comparisons(cycle, families)):
+        clock.done(name, name)
     summary["seconds"] = {**clock.seconds, "total": time.perf_counter() - clock.begin}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))
@@ -172,7 +206,7 @@ def _find(hopper: VerticalHopper) -> LimitCycle:
         return find_limit_cycle(hopper, settle=60.0)
 
 
-def _sections(name: str, count: int):
+def _sections(name: str, count: int) -> AbstractSections:
     apex = Crossing("vM", "falling")
     if name == "isochron":
         return ClockPhase(count, anchor=apex)
@@ -181,12 +215,15 @@ def _sections(name: str, count: int):
     )
 
 
-def _identify(cycle, name, design, protocol, clock) -> Family:
-    placed = place_sections(cycle, _sections(name, protocol.n_sections))
+def _exact(cycle: LimitCycle, sections: AbstractSections, design: Design) -> Exact:
+    placed = place_sections(cycle, sections)
     ldtp = linearize(cycle, placed, OUTPUTS)
-    exact = ldtp.htf(design.frequencies)
-    clock.done(f"exact_{name}", f"{name}: sections, exact A, B, C, D and HTF")
-    data = run_experiments(cycle, placed, design, OUTPUTS, discard=protocol.cycles - protocol.keep)
+    return Exact(placed, ldtp, ldtp.htf(design.frequencies))
+
+
+def _identify(name: str, known: Exact, design: Design, protocol: Protocol, clock: _Clock) -> Family:
+    cycle, discard = known.placed.cycle, protocol.cycles - protocol.keep
+    data = run_experiments(cycle, known.placed, design, OUTPUTS, discard=discard)
     clock.done(f"experiments_{name}", f"{name}: experiments, {data.summary()}")
     if not data.ok.any():
         raise ComputationError(
@@ -195,14 +232,12 @@ def _identify(cycle, name, design, protocol, clock) -> Family:
         )
     estimate = estimate_htf(data)
     family = Family(
-        placed,
-        ldtp,
-        exact,
+        *known,
         data,
         estimate,
         fit_rational(estimate),
-        fit_rational(exact),
-        fit_multipliers(estimate, ldtp),
+        fit_rational(known.exact),
+        fit_multipliers(estimate, known.ldtp),
     )
     clock.done(f"fits_{name}", f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
     return family
@@ -268,7 +303,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
             "times": "clock time, from section 0 to one period later",
         },
     }
-    np.savez_compressed(path, header=np.array(json.dumps(header)), **arrays)
+    np.savez(path, header=np.array(json.dumps(header)), **arrays)
 
 
 def _on_grid(estimate: HTF, f) -> np.ndarray:
@@ -278,34 +313,11 @@ def _on_grid(estimate: HTF, f) -> np.ndarray:
     return H
 
 
-def _figures(out, cycle, families: Mapping[str, Family], perturbed):
-    """Draw and save the figures one by one, yielding their names."""
+def _figures() -> ModuleType:
+    """The module that draws, imported when it is needed: matplotlib is heavy."""
     import matplotlib
 
     matplotlib.use("Agg")  # files only: no window is opened, and none is needed
-    from matplotlib import pyplot
+    from . import paper_figures
 
-    from .. import plot
-
-    pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
-    rational = {name: family.rational for name, family in families.items()}
-    estimates = {}
-    for name, family in families.items():
-        estimates[f"2p1z, {name}"] = family.rational
-        estimates[f"structured, {name}"] = family.structured
-    drawings = {
-        f"fig1_cycle_{name}": lambda family=family: plot.cycle(
-            cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed, labels=SYMBOLS
-        )
-        for name, family in families.items()
-    }
-    drawings |= {
-        "fig3_harmonics": lambda: plot.harmonics(pairs, labels=DEVIATIONS),
-        "fig4_bode": lambda: plot.bodes(pairs, fits=rational, labels=DEVIATIONS),
-        "multipliers": lambda: plot.multipliers(cycle, estimates, labels=SYMBOLS),
-        "poles_zeros": lambda: plot.poles_zeros(rational, labels=SYMBOLS),
-    }
-    for name, draw in drawings.items():
-        plot.save(out / name, draw())
-        pyplot.close("all")
-        yield name
+    return paper_figures

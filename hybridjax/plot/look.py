@@ -6,7 +6,7 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import matplotlib
 import numpy as np
@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from .._core.boundary.checked import checked
 from .._core.boundary.scalars import Whole
+from .._core.files.figure_formats import Format
 from .._core.files.writing import replacing
 from .._core.signal import unit_of, with_unit
 from ..errors import DefinitionError
@@ -64,8 +65,10 @@ _STYLE = {
     "lines.markersize": 4,
     "figure.dpi": 150,
 }
-# Text stays text: fonts are embedded whole (TrueType), and can be searched and edited.
+# Text stays text: it can be searched and edited.
 _FONTS_IN_FILES = {"pdf.fonttype": 42, "svg.fonttype": "none"}
+# Figures that have no layout engine are given none.
+_IN_FILES = _FONTS_IN_FILES | {"figure.autolayout": False, "figure.constrained_layout.use": False}
 
 
 @functools.cache
@@ -167,33 +170,38 @@ def letters(axes: Any) -> None:
 
 @checked
 def save(
-    path: str | os.PathLike, plot: Plot | Figure | Axes, dpi: Resolution = 150
-) -> tuple[Path, Path]:
-    """Write a figure as PNG and as PDF.
+    path: str | os.PathLike,
+    plot: Plot | Figure | Axes,
+    formats: Sequence[Format] = ("png",),
+    dpi: Resolution = 150,
+) -> tuple[Path, ...]:
+    """Write a figure, in one file for each format.
 
-    **Arguments:** `path` without suffix (one of `.png`, `.pdf` is dropped); `plot`, or any figure
-    or Axes of matplotlib; `dpi` of the PNG.
+    **Arguments:** `path` without suffix (that of a format is dropped); `plot`, or any figure or
+    Axes of matplotlib; `formats`, of "png", "pdf" and "svg"; `dpi` of a PNG.
 
-    **Returns:** the paths of the PNG and of the PDF.
+    **Returns:** the paths.
 
     **Raises:** `DefinitionError` if they cannot be written.
     """
     figure = plot.get_figure(root=True) if isinstance(plot, Axes) else plot
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
-    if path.suffix in (".png", ".pdf"):
+    if path.suffix[1:] in get_args(Format):
         path = path.with_suffix("")
     if not path.name:
         raise DefinitionError(f"'{path}' is a folder: add the name of a file without its suffix.")
-    paths = path.with_name(path.name + ".png"), path.with_name(path.name + ".pdf")
+    paths = tuple(path.with_name(f"{path.name}.{format}") for format in formats)
     layout = figure.get_layout_engine()
-    try:
-        with matplotlib.rc_context(_FONTS_IN_FILES):
-            for one in paths:
+    with matplotlib.rc_context(_IN_FILES):
+        try:
+            if layout is not None:
+                layout.execute(figure)
+                figure.set_layout_engine(None)  # once for all files
+            for one, format in zip(paths, formats, strict=True):
                 with replacing(one) as new:
-                    figure.savefig(new, format=one.suffix[1:], dpi=dpi)
-                figure.set_layout_engine("none")  # the second file as the first
-    finally:
-        if layout is not None:
-            figure.set_layout_engine(layout)
+                    figure.savefig(new, format=format, dpi=dpi)
+        finally:
+            if layout is not None:
+                figure.set_layout_engine(layout)
     return paths

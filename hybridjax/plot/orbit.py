@@ -1,14 +1,14 @@
 """A limit cycle in phase space (paper Fig. 1)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
+from ..engine import kernels
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
 from ..maps.placed import PlacedSections
@@ -121,9 +121,15 @@ def _pieces(trajectory: Trajectory, x: str, y: str):
     ]
 
 
-def _point(s: Structure, a: int, names, t, q) -> np.ndarray:
-    """Where a state lies in the plane."""
-    return np.asarray(s.resolve_outputs(names)(a, t, q[: s.dims[a]], jnp.zeros(s.nu)))
+def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
+    """Where states (n, L) of chart a lie in the plane, and which way they move: (L, 2) each."""
+    q, u = q[: s.dims[a]], np.zeros((s.nu, 1))
+    flow = kernels.field(s, a, t, q, u)[:, 0]
+    point, by_time, *by_state = np.moveaxis(
+        kernels.outputs(s, a, tuple(s.resolve_outputs(names).items), t, q, u), 1, 0
+    )
+    rate = by_time + sum(x * f for x, f in zip(by_state, flow, strict=False))
+    return point.T, rate.T
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
@@ -131,8 +137,9 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
     for k in np.flatnonzero(orbit.event >= 0):
         transition = s.transitions[orbit.event[k]]
         a, b = s.chart_index(transition.source), s.chart_index(transition.target)
-        before = _point(s, a, names, orbit.t[k], orbit.before[k])
-        after = _point(s, b, names, orbit.t[k], orbit.after[k])
+        here, t = slice(k, k + 1), orbit.t[k : k + 1]
+        (before,), _ = _points(s, a, names, t, orbit.before[here].T)
+        (after,), _ = _points(s, b, names, t, orbit.after[here].T)
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
@@ -163,13 +170,8 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit, step
     width, height = ax.get_position().size * ax.get_figure(root=True).get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
-    lanes = placed.lanes
-    charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     bars = []
-    for i in range(placed.n_sections):
-        a, t, q = int(charts[i]), times[i], states[:, i]
-        here = _point(s, a, names, t, q)
-        along = _along(s, placed, i, a, t, q, names, unit)
+    for i, (here, along) in enumerate(_meetings(s, placed, names, unit)):
         bars.append(np.stack([here - _BAR * along, here + _BAR * along]))
         if step and i % step == 0:
             beside = np.stack([here + side * (_BAR + _ROOM) * along for side in (-1, 1)]) / unit
@@ -184,18 +186,20 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit, step
     ax.plot(*flat, color="0.35", lw=0.8, zorder=4, label=f"sections ({placed.n_sections})")
 
 
-def _along(s: Structure, placed: PlacedSections, i, a, t, q, names, unit) -> np.ndarray:
-    """A step of length 1 on the page along section i, in the units of the axes."""
-    states = s.charts[a].states
-    normal = np.asarray(placed.normal[i])
-    inside = [1 + states.index(n) for n in names if n in states]
-    others = np.delete(normal, inside)
-    if len(inside) == 2 and np.any(normal) and not np.any(np.abs(others) > 1e-12):
-        slope = normal[inside]
-        step = np.array([-slope[1], slope[0]]) / unit
-    else:
-        f = s.field(a, t, jnp.asarray(q[: s.dims[a]]), jnp.zeros(s.nu))
-        ahead = _point(s, a, names, t + 1e-6, q[: s.dims[a]] + 1e-6 * np.asarray(f))
-        step = (ahead - _point(s, a, names, t, q)) / unit
-        step = np.array([-step[1], step[0]])
-    return unit * step / (np.linalg.norm(step) or 1.0)
+def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tuple]:
+    """For each section where the cycle meets it, and a step of length 1 on the page along it, in
+    the units of the axes."""
+    lanes, normals = placed.lanes, np.asarray(placed.normal)
+    charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
+    points, rates = np.empty((2, len(charts), 2))
+    for a in np.unique(charts):
+        here = charts == a
+        points[here], rates[here] = _points(s, int(a), names, times[here], states[:, here])
+    for a, normal, point, rate in zip(charts, normals, points, rates, strict=True):
+        states = s.charts[a].states
+        inside = [1 + states.index(name) for name in names if name in states]
+        others = np.delete(normal, inside)
+        curve = len(inside) == 2 and np.any(normal) and not np.any(np.abs(others) > 1e-12)
+        x, y = normal[inside] * unit if curve else rate / unit
+        step = np.array([-y, x])
+        yield point, unit * step / (np.linalg.norm(step) or 1.0)

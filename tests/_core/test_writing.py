@@ -261,7 +261,7 @@ def module(path):
 WRITERS = {
     "save": (module, "x.npz"),
     "write_design": (design, "x.csv"),
-    "plot.save": (figure, "x.pdf"),
+    "plot.save": (figure, "x.png"),
 }
 
 

@@ -199,16 +199,34 @@ def test_failed_experiment():
 # The look
 
 
-def test_saved_as_png_and_pdf(tmp_path):
+def test_saved_in_several_formats(tmp_path):
     plot = hj.plot.multipliers([0.5])
-    png, pdf = hj.plot.save(tmp_path / "multipliers.png", plot)
+    png, pdf, svg = hj.plot.save(tmp_path / "multipliers.png", plot, ("png", "pdf", "svg"))
     assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
-    assert {p.name for p in tmp_path.iterdir()} == {"multipliers.png", "multipliers.pdf"}
+    assert "<svg" in svg.read_text()
+    assert [p.name for p in (png, pdf, svg)] == [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
     again = hj.plot.save(str(tmp_path / "v1.0"), plot.figure)
-    assert [p.name for p in again] == ["v1.0.png", "v1.0.pdf"]
+    assert [p.name for p in again] == ["v1.0.png"]
+    assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
         hj.plot.save(tmp_path / "absent" / "x", plot.ax)
+
+
+def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
+    plot, count = hj.plot.multipliers([0.5]), 0
+    execute = ConstrainedLayoutEngine.execute
+
+    def counted(self, figure):
+        nonlocal count
+        count += 1
+        execute(self, figure)
+
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", counted)
+    hj.plot.save(tmp_path / "x", plot, ("png", "pdf"))
+    assert count == 1
+    labels = [plot.ax.xaxis.label.get_window_extent(), plot.ax.yaxis.label.get_window_extent()]
+    assert all(plot.figure.bbox.contains(*corner) for box in labels for corner in box.corners())
 
 
 def test_global_settings_stay(estimate):
