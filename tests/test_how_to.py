@@ -19,5 +19,5 @@ def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypa
             session.run(text)
             printed = capsys.readouterr().out
         elif language == "text":
-            assert same_output(text, printed), f"{page} shows\n{text}\nbut this is printed\n{printed}"
+            assert same_output(text, printed), f"{page} shows\n{text}\nbut prints\n{printed}"
     pyplot.close("all")

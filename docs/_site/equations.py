@@ -6,7 +6,9 @@ import re
 from math_core import LatexToMathML
 
 
-_WRITTEN = re.compile(r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL)
+_WRITTEN = re.compile(
+    r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
+)
 _CONVERTER = LatexToMathML()
 
 
