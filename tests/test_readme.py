@@ -1,10 +1,7 @@
 """The README's python blocks run, one after the other, and print what it shows."""
 
-import pathlib
 import re
 import shlex
-import sys
-import types
 
 import numpy as np
 import pytest
@@ -14,32 +11,14 @@ import hybridjax as hj
 from hybridjax.apps.cli import main
 
 from .conftest import OUTPUTS
+from .sessions import ROOT, Session, blocks, same_output
 
 
-ROOT = pathlib.Path(__file__).parents[1]
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CLAIMS = ROOT / "CLAIMS.md"
-NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
 
 
-def blocks(language):
-    return [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text())
-            if kind == language]  # fmt: skip
-
-
-def same_output(shown: str, printed: str) -> bool:
-    """The same words, and the same numbers: to 6 digits, or small ones to a factor of 5."""
-    words = [NUMBER.sub("#", text).split() for text in (shown, printed)]
-    a, b = (
-        np.array([float(x.replace(" ", "")) for x in NUMBER.findall(text)])
-        for text in (shown, printed)
-    )
-    if words[0] != words[1] or a.shape != b.shape:
-        return False
-    close = np.abs(a - b) <= 1e-6 * np.abs(b)
-    small = (np.abs(a) < 1e-3) & (np.abs(b) < 1e-3)
-    rounding = (np.abs(a) < 1e-11) & (np.abs(b) < 1e-11)
-    return bool(np.all(close | rounding | (small & (b < 5 * a) & (a < 5 * b))))
+def blocks_of(language):
+    return [text for kind, text in blocks("README.md") if kind == language]
 
 
 def test_the_comparison_sees_differences():
@@ -51,10 +30,9 @@ def test_the_comparison_sees_differences():
 
 def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    session = types.ModuleType("readme_session")
-    monkeypatch.setitem(sys.modules, session.__name__, session)
-    for code, shown in zip(blocks("python"), blocks("text"), strict=True):
-        exec(compile(code, "README.md", "exec"), vars(session))
+    session = Session("README.md", monkeypatch)
+    for code, shown in zip(blocks_of("python"), blocks_of("text"), strict=True):
+        session.run(code)
         printed = capsys.readouterr().out
         assert same_output(shown, printed), (
             f"README.md shows\n{shown}\nbut this is printed\n{printed}"
@@ -79,23 +57,23 @@ def trials(tmp_path, hopper_cycle):
 def test_every_session_and_command_runs(tmp_path, monkeypatch, trials):
     """In the order in which they stand, in one session: fences of python, py and bash."""
     monkeypatch.chdir(tmp_path)
-    session = types.ModuleType("whole_readme_session")
-    monkeypatch.setitem(sys.modules, session.__name__, session)
-    for language, text in BLOCK.findall((ROOT / "README.md").read_text()):
+    session = Session("README.md", monkeypatch)
+    for language, text in blocks("README.md"):
         if language in ("python", "py"):
-            exec(compile(text, "README.md", "exec"), vars(session))
+            session.run(text)
         elif language == "bash" and text.startswith("hybridjax"):
             assert main(shlex.split(text)[1:]) in (None, 0)
     pyplot.close("all")
-    found = session.found.fit.compare(session.cycle.multipliers)
+    made = session.module
+    found = made.found.fit.compare(made.cycle.multipliers)
     assert found.max_error < 1e-2 and (tmp_path / "report" / "report.html").exists()
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
-        value, true = (float(getattr(x, name)) for x in (session.fit.system, session.hopper))
+        value, true = (float(getattr(x, name)) for x in (made.fit.system, made.hopper))
         assert abs(value / true - 1) < 1e-4, name
 
 
 def test_links_lead_somewhere():
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if "://" not in link:
@@ -103,7 +81,7 @@ def test_links_lead_somewhere():
 
 
 def test_files_that_documents_name_are_there():
-    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]:
         if page.name != "CHANGELOG.md":
             for name in re.findall(r"`(\w+/[\w/]+\.py)\b", page.read_text()):
                 places = ROOT / name, ROOT / "hybridjax" / name
@@ -111,7 +89,7 @@ def test_files_that_documents_name_are_there():
 
 
 def test_there_is_one_test_command_for_ci_to_find():
-    found = [block for block in blocks("bash") if re.match("python3 -m venv .* pytest$", block)]
+    found = [block for block in blocks_of("bash") if re.match("python3 -m venv .* pytest$", block)]
     assert len(found) == 1
     script = ROOT / ".ci/run"
     assert script.stat().st_mode & 0o100 and "README.md" in script.read_text()

@@ -1,0 +1,50 @@
+"""What stands beside docs/ and belongs to the site: executed notebooks, and lists of the root."""
+
+import base64
+import json
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+
+ROOT = Path(__file__).parents[2]
+LISTS = {"CHANGELOG.md": "changelog.md", "CLAIMS.md": "claims.md", "KNOWN_GAPS.md": "known-gaps.md"}
+
+
+def on_files(files, config):
+    for name, page in LISTS.items():
+        files.append(File.generated(config, page, abs_src_path=str(ROOT / name)))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        for name, content in _pages(path).items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page, **_) -> str:
+    """Links of docs/ to what stands beside it."""
+    up = "../" * page.file.src_uri.count("/")
+    markdown = re.sub(r"\]\((?:\.\./)+(notebooks/\w+)\.ipynb", rf"]({up}\1.md", markdown)
+    for name, target in LISTS.items():
+        markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
+    return markdown
+
+
+def _pages(path: Path) -> dict[str, str | bytes]:
+    """A notebook as a page, and its pictures."""
+    parts, pictures = [], {}
+    for cell in json.loads(path.read_text())["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            data = output.get("data", {"text/plain": output.get("text")})
+            if "image/png" in data:
+                name = f"{path.stem}-{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode(data["image/png"])
+                parts.append(f"![]({name})")
+            else:
+                parts.append(f"```text\n{''.join(data['text/plain'])}\n```")
+    return {f"{path.stem}.md": "\n\n".join(parts)} | pictures

@@ -1,0 +1,37 @@
+"""Public names in text lead to their entries in the reference: `hj.linearize`, and `LDTP`."""
+
+import re
+from collections import Counter
+from pathlib import Path
+
+
+REFERENCE = Path(__file__).parents[1] / "reference"
+_CODE = re.compile(r"(?<!<span></span>)<code>((?:hj\.)?(\w[\w.]*\w))([^<]*)</code>")
+
+
+def _entries() -> dict[str, str]:
+    """Those that are known by their last word: one of a kind, and no word of everyday."""
+    pages = "".join(path.read_text() for path in REFERENCE.glob("*.md"))
+    names = re.findall(r"^::: (\S+)", pages, re.MULTILINE)
+    count = Counter(name.split(".")[-1] for name in names)
+    last = {name.split(".")[-1]: name for name in names}
+    return {word: name for word, name in last.items() if count[word] == 1 and _special(word)}
+
+
+def _special(word: str) -> bool:
+    return "_" in word or not word.islower()
+
+
+def on_page_content(content: str, page, **_) -> str:
+    entries = _entries()
+    # What does not exist stops a strict build; the changelog also names what once was.
+    optional = "optional " if page.file.src_uri == "changelog.md" else ""
+
+    def linked(code: re.Match) -> str:
+        whole, name, rest = code.groups()
+        identifier = f"hybridjax.{name}" if whole.startswith("hj.") else entries.get(name)
+        if identifier is None:
+            return code[0]
+        return f'<autoref {optional}identifier="{identifier}"><code>{whole}{rest}</code></autoref>'
+
+    return _CODE.sub(linked, content)

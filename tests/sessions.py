@@ -1,0 +1,44 @@
+"""Sessions in documents: fences of python that run one after the other, and what they print."""
+
+import pathlib
+import re
+import sys
+import types
+
+import numpy as np
+
+
+ROOT = pathlib.Path(__file__).parents[1]
+NUMBER = re.compile(r"[+-]?\s?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
+
+
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Language and text of each fence of a document."""
+    text = (ROOT / page).read_text()
+    return re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+class Session:
+    """A module in which a document's blocks are executed."""
+
+    def __init__(self, page: str, monkeypatch):
+        self.page, self.module = page, types.ModuleType(re.sub(r"\W", "_", page))
+        monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
+
+    def run(self, code: str) -> None:
+        exec(compile(code, self.page, "exec"), vars(self.module))
+
+
+def same_output(shown: str, printed: str) -> bool:
+    """The same words, and the same numbers: to 6 digits, or small ones to a factor of 5."""
+    words = [NUMBER.sub("#", text).split() for text in (shown, printed)]
+    a, b = (
+        np.array([float(x.replace(" ", "")) for x in NUMBER.findall(text)])
+        for text in (shown, printed)
+    )
+    if words[0] != words[1] or a.shape != b.shape:
+        return False
+    close = np.abs(a - b) <= 1e-6 * np.abs(b)
+    small = (np.abs(a) < 1e-3) & (np.abs(b) < 1e-3)
+    rounding = (np.abs(a) < 1e-11) & (np.abs(b) < 1e-11)
+    return bool(np.all(close | rounding | (small & (b < 5 * a) & (a < 5 * b))))

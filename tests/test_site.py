@@ -1,0 +1,63 @@
+"""The site: every public name is in its reference, and it needs no other host."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+
+import pytest
+
+import hybridjax as hj
+
+from .sessions import ROOT
+
+
+def public_names() -> list[str]:
+    """What the tables of public names (`__init__.pyi`) and `hj.errors` hold."""
+    names = []
+    for table in (ROOT / "hybridjax").rglob("__init__.pyi"):
+        package = ".".join(table.parent.relative_to(ROOT).parts)
+        for line in ast.parse(table.read_text()).body:
+            if isinstance(line, ast.ImportFrom) and line.module:  # (others import namespaces)
+                names += [f"{package}.{alias.asname}" for alias in line.names]
+    errors = [name for name, thing in vars(hj.errors).items() if isinstance(thing, type)]
+    return names + [f"hybridjax.errors.{x}" for x in errors if not hasattr(hj, x)]
+
+
+def test_every_public_name_is_in_the_reference_once():
+    pages = "".join(page.read_text() for page in (ROOT / "docs/reference").glob("*.md"))
+    assert Counter(re.findall(r"^::: (\S+)$", pages, re.MULTILINE)) == Counter(public_names())
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("mkdocs", reason="pip install '.[docs]' installs what builds the site")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder]
+    built = subprocess.run(command, cwd=ROOT, env=os.environ, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+def test_nothing_is_fetched_from_another_host(site):
+    fetched = re.compile(r"<(?!a\s)[^>]*\s(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
+    for page in site.rglob("*.html"):
+        assert not fetched.findall(page.read_text()), page
+    for style in site.rglob("*.css"):
+        assert not re.findall(r"url\([\"']?(?:https?:)?//|@import", style.read_text()), style
+
+
+def test_equations_are_rendered(site):
+    page = (site / "mathematics.html").read_text()
+    assert page.count("<math") > 100 and "arithmatex" not in page
+    assert "$" not in re.sub(r"<(pre|code|script).*?</\1>", "", page, flags=re.DOTALL)
+
+
+def test_notebooks_come_with_their_pictures(site):
+    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
+        page = (site / "notebooks" / f"{notebook.stem}.html").read_text()
+        pictures = re.findall(r'src="([\w-]+\.png)"', page)
+        assert len(pictures) == notebook.read_text().count('"image/png"') > 0
+        assert all((site / "notebooks" / name).exists() for name in pictures)
