@@ -1,5 +1,6 @@
 """C3D files: markers, analog channels, events."""
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ from .columns import Columns, Wanted, missing_library, with_unit
 
 # Quantities that stand among the markers, with units of their own.
 _MODELED = ("ANGLE", "FORCE", "MOMENT", "POWER", "SCALAR")
+# Bytes of the header up to its first and last frame; blocks, of which one holds, at this byte, the
+# kind of the processor; the one that writes numbers with the large end first.
+_HEADER, _BLOCK, _PROCESSOR, _BIG_ENDIAN = 10, 512, 3, b"\x56"
 # The header counts no more frames than this.
-_COUNTED = 65534
+_COUNTED = 65535
 _MINUTE = 60.0
 
 
@@ -34,11 +38,10 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     except (OSError, ValueError, RuntimeError, MemoryError) as error:
         raise FileFormatError(f"'{path}' is no C3D file, or damaged.") from error
     header, parameters, data = file["header"]["points"], file["parameters"], file["data"]
-    first, last = header["first_frame"], header["last_frame"]
-    frames = data["points"].shape[2]
-    if last < _COUNTED and frames != last - first + 1:
+    first, frames, told = header["first_frame"], data["points"].shape[2], _number_of_frames(path)
+    if told not in (None, frames):
         raise FileFormatError(
-            f"'{path}' has {frames} frames, but its header says {last - first + 1}: it is damaged."
+            f"'{path}' has {frames} frames, but its header says {told}: it is damaged."
         )
     tables = []
     for columns in (_points(parameters["POINT"], data), _analogs(parameters["ANALOG"], data)):
@@ -53,6 +56,16 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     if tables:
         tables[0] = tables[0]._replace(events=_events(parameters.get("EVENT", {})))
     return tables
+
+
+def _number_of_frames(path: Path) -> int | None:
+    """What the header says, which ezc3d corrects; None where it cannot count that far."""
+    with open(path, "rb") as file:
+        head = file.read(_HEADER)
+        file.seek(_BLOCK * (head[0] - 1) + _PROCESSOR)
+        order = ">" if file.read(1) == _BIG_ENDIAN else "<"
+    first, last = struct.unpack(f"{order}HH", head[-4:])
+    return last - first + 1 if last < _COUNTED else None
 
 
 Named = list[tuple[str, Float[np.ndarray, " n"]]]

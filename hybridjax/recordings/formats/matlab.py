@@ -32,16 +32,18 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
     from scipy.io import loadmat, matlab, whosmat
 
     try:
-        if matlab.matfile_version(path)[0] == _HDF5:
-            return read_matlab_hdf5(path, wanted)
-        _check_size(path)
-        names = [name for name, _, _ in whosmat(path)]
-        chosen = [x for x in names if wanted.includes(x) or wanted.reaches(x)]
-        found = loadmat(path, simplify_cells=True, variable_names=chosen)
+        version, _ = matlab.matfile_version(path)
+        if version != _HDF5:
+            _check_size(path)
+            names = [name for name, _, _ in whosmat(path)]
+            chosen = [x for x in names if wanted.includes(x) or wanted.reaches(x)]
+            found = loadmat(path, simplify_cells=True, variable_names=chosen)
     except (OSError, FileFormatError):
         raise
     except Exception as error:  # whatever broken bytes make scipy stumble over
         raise FileFormatError(f"'{path}' is no MATLAB file, or damaged.") from error
+    if version == _HDF5:
+        return read_matlab_hdf5(path, wanted)
     own = {name: value for name, value in found.items() if not name.startswith("__")}
     return read_tree(path, dict(_leaves(path, (), own, wanted)), ".", wanted)
 

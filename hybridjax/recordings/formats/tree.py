@@ -60,8 +60,8 @@ def read_tree(
         around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
         if around is None:
             raise DefinitionError(
-                f"'{path}' has no array '{wanted.time}' beside '{name}', or in a group around it: "
-                "name that with the times by `time`, or choose `signals`."
+                f"'{path}' has no times '{wanted.time}' for '{name}' in its group or one around "
+                "it: name the array that holds them by `time`, or choose `signals`."
             )
         if around not in tables:
             clock = clocks[around]
