@@ -1,4 +1,5 @@
 from . import (
+    convert as convert,
     engine as engine,
     errors as errors,
     experiments as experiments,

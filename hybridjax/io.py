@@ -27,7 +27,7 @@ from .linear.ldtp import LDTP
 
 Saved = Design | ExperimentData | HTF | LDTP | RationalFit | Record | SeriesFit | StructuredFit
 
-_KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
+KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 
 
 @checked
@@ -47,8 +47,8 @@ def save(path: str | os.PathLike, thing: Saved) -> None:
     """
     path = Path(path)
     kind = type(thing).__name__
-    if type(thing) is not _KINDS.get(kind):
-        raise DefinitionError(f"save takes {', '.join(_KINDS)}; it cannot write a {kind}.")
+    if type(thing) is not KINDS.get(kind):
+        raise DefinitionError(f"save takes {', '.join(KINDS)}; it cannot write a {kind}.")
     if path.suffix != ".npz":
         raise DefinitionError(f"save writes npz files: let the name '{path.name}' end in '.npz'.")
     if is_traced(thing):
@@ -66,4 +66,4 @@ def load(path: str | os.PathLike) -> Saved:
     `PrecisionError` in single precision.
     """
     require_x64()
-    return read_module(Path(path), _KINDS)
+    return read_module(Path(path), KINDS)

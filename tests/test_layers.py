@@ -30,6 +30,7 @@ LAYERS = [
     "testing",
     "plot",
     "io",
+    "convert",
     "apps",
     "__main__",
 ]

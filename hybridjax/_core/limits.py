@@ -17,6 +17,8 @@ WORKERS = 10**4
 """Threads."""
 WINDOW = 2**26
 """Samples of one input in one window of a design."""
+RECORDED = 2**29
+"""Samples of all signals of one trial, on one axis of time."""
 
 DECLARED = 10**7
 """Any whole number in the header of a file: sections, periods, experiments, chunks."""

@@ -123,8 +123,8 @@ def _add_identify(commands) -> None:
         "multipliers, harmonic transfer functions and impulse responses, with a report.",
     )
     add = identify.add_argument
-    add("files", nargs="+", metavar="FILE", help="one trial in each; the first line of a CSV file "
-        "names its columns")  # fmt: skip
+    add("files", nargs="+", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
+        "HDF5, C3D, OpenSim, ROS and more")  # fmt: skip
     add("--input", required=True, type=names, metavar="NAMES", help="measured perturbations")
     add("--outputs", required=True, type=names, metavar="NAMES", help="measured outputs")
     phase = identify.add_mutually_exclusive_group(required=True)
@@ -171,7 +171,9 @@ def _identify(options) -> int:
 
     enable_x64()
     with report_folder(options.out, options.input, options.formats) as folder:
-        recording = read_recording(*options.files, time=options.time)
+        named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
+        signals = tuple(dict.fromkeys(named))
+        recording = read_recording(*options.files, time=options.time, signals=signals)
         print(recording)
         if options.phase is not None:
             position, velocity = options.phase

@@ -16,8 +16,9 @@ from .._core.boundary.kinds import PeriodCount, Positive, SectionCount
 from .._core.files.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
+from .formats.columns import Wanted
 from .phase.winding import Phase
-from .read import read_columns
+from .read import read_tables
 from .recording import Recording
 
 
@@ -75,7 +76,8 @@ def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
 
     **Raises:** `FileFormatError` if it is no such table, or has experiments of different lengths.
     """
-    columns = read_columns(Path(path)).values
+    (columns, *_) = read_tables(Path(path), Wanted("time"))
+    columns = columns.values
     needed = ("experiment", "cycle", "section", "phase")
     if not set(needed) <= set(columns):
         raise FileFormatError(f"'{path}' has no columns {', '.join(needed)}: no table by phase.")

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core import limits
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
@@ -199,6 +200,51 @@ class Recording(eqx.Module):
         units = dict(zip(first.signals, first.units, strict=True))
         joined = Recording(first.trials[0].time, signals, units=units, notes=notes)
         return eqx.tree_at(lambda r: r.trials, joined, tuple(trials))
+
+    @staticmethod
+    def beside(recordings: Iterable["Recording"]) -> "Recording":
+        """Signals that were recorded side by side, with times of their own, as one recording.
+
+        All share one axis of time, on which each is missing (NaN) where it was not sampled: nothing
+        is interpolated. Trials of the same place belong together; times must count from one zero.
+
+        **Raises:** `DefinitionError` if there is none, numbers of trials differ, a signal is there
+        twice, or the common axis is too long.
+        """
+        recordings = list(recordings)
+        if len({len(x.trials) for x in recordings}) != 1:
+            raise DefinitionError(
+                "`recordings` must hold one or more recordings with the same number of trials."
+            )
+        names = [name for x in recordings for name in x.signals]
+        units = dict(zip(names, (unit for x in recordings for unit in x.units), strict=True))
+        notes = [note for x in recordings for note in x.notes]
+        if len(units) < len(names):
+            twice = next(x for x in names if names.count(x) > 1)
+            raise DefinitionError(f"two of the recordings have a signal '{twice}'.")
+        joined = []
+        for trials in zip(*(x.trials for x in recordings), strict=True):
+            name = trials[0].name
+            time = np.unique(np.concatenate([t.time for t in trials]))
+            if len(time) * len(names) > limits.RECORDED:
+                raise DefinitionError(
+                    f"trial '{name}': {len(names)} signals at {len(time)} times are too many "
+                    "together: choose `signals`."
+                )
+            if any(len(t.time) < len(time) for t in trials):
+                notes.append("signals have different rates or clocks: they are missing in between")
+            values = np.full((len(time), len(names)), np.nan)
+            first = 0
+            for t in trials:
+                last = first + t.values.shape[1]
+                values[np.searchsorted(time, t.time), first:last] = t.values
+                first = last
+            events = {key: at for t in trials for key, at in t.events.items()}
+            signals = dict(zip(names, values.T, strict=True))
+            joined.append(
+                Recording(time, signals, events=events, units=units, name=name, notes=notes)
+            )
+        return Recording.join(joined)
 
     def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
         """The same with one more event: a signal crosses a level.

@@ -307,3 +307,22 @@ def test_constant_input(wave):
     still = hj.Recording(t, {"f": 0 * t + 3, "x": values[:, 1], "v": values[:, 2]})
     with pytest.raises(hj.DefinitionError, match="input f is constant"):
         sample(still)
+
+
+def test_signals_with_clocks_of_their_own(rhythm):
+    """Position and velocity are never sampled together, the input more often than either."""
+    t, (force, x, v) = rhythm.trials[0].time, rhythm.trials[0].values.T
+    own = hj.Recording.beside(
+        [
+            hj.Recording(t, {"force": force}),
+            hj.Recording(t[::2], {"x": x[::2]}),
+            hj.Recording(t[1::2], {"v": v[1::2]}),
+        ]
+    )
+    angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0.0, 0.0), scale=(1.0, 1.0))
+    for phase, near in ((hj.Crossing("v", "falling"), 1e-5), (angle, 1e-3)):
+        data = [sample(r, phase, outputs=("x", "v"), inputs="force") for r in (rhythm, own)]
+        assert data[1].missing == 0 and data[1].cycles == data[0].cycles
+        together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
+        np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=near)

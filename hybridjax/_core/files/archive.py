@@ -44,7 +44,7 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
     kind = type(thing).__name__
     if (wrong := _wrong_field(thing)) is not None:
         raise DefinitionError(f"this {kind} cannot be saved: {wrong}.")
-    static, arrays = _taken_apart(thing)
+    static, arrays = taken_apart(thing)
     header = {
         "format": _FORMAT,
         "format_version": _VERSION,
@@ -52,7 +52,7 @@ def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
         "kind": kind,
         "part": part,
         "static": static,
-        "units": {str(name): name.unit for name in _signals(static)},
+        "units": {str(name): name.unit for name in signals_in(static)},
         "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
         "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
     }
@@ -79,11 +79,11 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
         raise FileFormatError(
             f"'{path}' was replaced by another file: delete it, and make it again."
         )
-    static = _restored(header["static"], header["units"])
+    static = restored(header["static"], header["units"])
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
     try:
-        thing = _put_together(kind, static, members)
+        thing = put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
@@ -92,7 +92,7 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
     return thing
 
 
-def _taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Static fields and arrays; a module among the fields becomes a dictionary of its own static
     fields, and arrays with its name before theirs."""
     static, arrays = {}, {}
@@ -101,15 +101,15 @@ def _taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarra
         if field.metadata.get("static", False):
             static[field.name] = value
         elif isinstance(value, eqx.Module):
-            static[field.name], inner = _taken_apart(value)
+            static[field.name], inner = taken_apart(value)
             arrays |= {f"{field.name}.{name}": array for name, array in inner.items()}
         elif value is not None:
             arrays[field.name] = np.asarray(value)
     return static, arrays
 
 
-def _put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
-    """The module that `_taken_apart` took apart. Fields that are not there are `None`, or have
+def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+    """The module that `taken_apart` took apart. Fields that are not there are `None`, or have
     their defaults where they are static."""
     other = ValueError(f"its fields are not those of {kind.__name__}")
     if not isinstance(static, dict):
@@ -127,7 +127,7 @@ def _put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> 
         elif inner is not None and name in static:
             own = {k: arrays.pop(k) for k in list(arrays) if k.startswith(f"{name}.")}
             own = {k.removeprefix(f"{name}."): array for k, array in own.items()}
-            values[name] = _put_together(inner, static.pop(name), own)
+            values[name] = put_together(inner, static.pop(name), own)
         else:
             values[name] = arrays.pop(name, None)
     if static or arrays:
@@ -165,21 +165,21 @@ def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
     return header
 
 
-def _signals(value: Any) -> Iterator[Signal]:
+def signals_in(value: Any) -> Iterator[Signal]:
     """All names with a unit."""
     if isinstance(value, Signal) and value.unit:
         yield value
     elif isinstance(value, dict | tuple):
         for part in value.values() if isinstance(value, dict) else value:
-            yield from _signals(part)
+            yield from signals_in(part)
 
 
-def _restored(value: Any, units: Mapping[str, str]) -> Any:
+def restored(value: Any, units: Mapping[str, str]) -> Any:
     """JSON's lists as the tuples that they were, and names with their units."""
     if isinstance(value, dict):
-        return {key: _restored(part, units) for key, part in value.items()}
+        return {key: restored(part, units) for key, part in value.items()}
     if isinstance(value, list):
-        return tuple(_restored(part, units) for part in value)
+        return tuple(restored(part, units) for part in value)
     return Signal(value, str(units[value])) if isinstance(value, str) and value in units else value
 
 

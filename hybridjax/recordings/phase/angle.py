@@ -10,7 +10,7 @@ from ...errors import DefinitionError
 from ...sections.crossing import Crossing
 from ...sections.kinematic import KinematicPhase
 from ..recording import Recording
-from ..smoothing import FEWEST, bridgeable, gaps, spline
+from ..smoothing import FEWEST, bridgeable, gaps, inside, spline
 from ..spikes import without_spikes
 from .tracker import track
 from .winding import LONGEST_GAP, Phase, Winding
@@ -28,6 +28,9 @@ _FEWEST_TURNS = 2
 # Of 1, the length of the mean of unit vectors at the angles where the anchor is crossed. Doubled:
 # all crossings must lie at one angle but for rounding.
 _ANCHOR_UNITY = 0.5
+# Of two signals, the share of samples at common times, up to which they have clocks of their own.
+# (Not to be doubled: it would be all of them.)
+_APART = 0.5
 # Growth of the phase, in cycles, that counts as growth. Doubled: nothing changes, this is rounding.
 _GROWTH = 1e-12
 
@@ -75,6 +78,7 @@ def kinematic_angles(
     samples = []
     for trial in recording.trials:
         signals = np.stack([without_spikes(trial.values[:, k]) for k in columns], axis=1)
+        signals = _brought_together(trial.time, signals)
         both = np.isfinite(signals).all(axis=1)
         if both.sum() < FEWEST:
             raise DefinitionError(
@@ -96,6 +100,22 @@ def kinematic_angles(
         return angles
     first = _angle_at(recording, anchor, bandwidth, angles)
     return [Angle(time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles]
+
+
+def _brought_together(
+    time: Float[np.ndarray, " n"], signals: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Of two signals that were hardly ever sampled at the same times, each also where the other one
+    was, by interpolation; not in gaps."""
+    seen = np.isfinite(signals)
+    if seen.all(axis=1).sum() > _APART * seen.sum(axis=0).min() or seen.sum(axis=0).min() < FEWEST:
+        return signals
+    signals = signals.copy()
+    for k, known in enumerate(seen.T):
+        holes = gaps(time, known, bridgeable(time, known))
+        at = seen.any(axis=1) & ~known & ~inside(holes, time, time)
+        signals[at, k] = spline(time, signals[:, k], np.inf)(time[at])
+    return signals
 
 
 def function_angles(recording: Recording, function: AngleFunction) -> list[Angle]:

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
-from ...errors import FileFormatError
-from ..headers import is_unit, split_header
+from ....errors import FileFormatError
+from ...headers import is_unit, split_header
+from ..columns import Columns
 from .lines import is_comment, read_lines, uncommented
-from .table import Columns, Table, read_table, split_line, split_names, to_number
+from .table import Table, read_table, split_line, split_names, to_number
+from .trc import is_trc, read_trc
 from .vicon import is_vicon, read_vicon
 
 
@@ -14,22 +16,28 @@ _END_OF_OPENSIM_HEADER = "endheader"
 _LONGEST_HEADER = 100
 
 
-def read_text(path: Path) -> Columns:
-    """The columns of a text file: names in its first line, or as OpenSim and Vicon write them.
+def read_text(path: Path) -> list[Columns]:
+    """The columns of a text file: names in its first line, or as OpenSim, Motion Analysis and Vicon
+    write them.
 
     **Raises:** `FileFormatError` for what is no table, with the line.
     """
     lines = read_lines(path)
     head = [x.strip().lower() for x in lines[:_LONGEST_HEADER]]
     if _END_OF_OPENSIM_HEADER in head:
-        return _opensim(path, lines, head.index(_END_OF_OPENSIM_HEADER))
+        return [_opensim(path, lines, head.index(_END_OF_OPENSIM_HEADER))]
+    if is_trc(lines):
+        return [read_trc(path, lines)]
     if is_vicon(lines):
         return read_vicon(path, lines)
-    return _plain(path, lines)
+    return [read_plain(path, lines)]
 
 
-def _plain(path: Path, lines: list[str]) -> Columns:
-    """Names in the first line that is no comment, perhaps units below, then numbers."""
+def read_plain(path: Path, lines: list[str]) -> Columns:
+    """Names in the first line that is no comment, perhaps units below, then numbers.
+
+    **Raises:** as `read_text`.
+    """
     filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
     told = [k for k in filled if not is_comment(lines[k])]
     if not told:

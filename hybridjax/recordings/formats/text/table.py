@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...errors import FileFormatError
+from ....errors import FileFormatError
+from ..columns import Columns
 from .lines import is_comment
 
 
@@ -20,13 +21,6 @@ _MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
 
 # Characters of a field that a message shows. Doubled: longer messages.
 _SHOWN = 40
-
-
-class Columns(NamedTuple):
-    """What a file holds: columns by their headers, and what was assumed to read them."""
-
-    values: dict[str, Float[np.ndarray, " n"]]
-    notes: tuple[str, ...] = ()
 
 
 class Table(NamedTuple):

@@ -3,7 +3,7 @@
 import codecs
 from pathlib import Path
 
-from ...errors import FileFormatError
+from ....errors import FileFormatError
 
 
 # Bytes that no text holds, in whatever encoding with one byte for each ASCII character.

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import FileFormatError
-from .table import Columns, Table, read_table, split_names, to_number
+from ....errors import FileFormatError
+from ..columns import Columns
+from .table import Table, read_table, split_names, to_number
 
 
 # Lines of a block: its title, its rate, names of devices, of components, and units.
@@ -18,14 +19,14 @@ def is_vicon(lines: list[str]) -> bool:
     return len(_blocks(lines[: 2 * _HEADER])) > 0
 
 
-def read_vicon(path: Path, lines: list[str]) -> Columns:
-    """All blocks on one axis of time; of the slower ones samples are missing in between.
+def read_vicon(path: Path, lines: list[str]) -> list[Columns]:
+    """A table for each block; times count from the first frame.
 
     Columns are named by device, or marker, and component, such as `Plate 1.Fx`.
 
     **Raises:** `FileFormatError` for blocks whose frames do not have one rate, and as `read_table`.
     """
-    values, notes, clocks = {}, [], []
+    blocks = []
     for start, stop in _blocks(lines):
         separator, names = _names(lines[start : start + _HEADER])
         table = Table(path, names, lines[start + _HEADER : stop], start + _HEADER, separator)
@@ -33,33 +34,17 @@ def read_vicon(path: Path, lines: list[str]) -> Columns:
         columns = {name.lower(): name for name in found.values}
         frame = found.values.pop(columns[_FRAME])
         sub = found.values.pop(columns.get(_SUBFRAME, ""), np.zeros(len(frame)))
-        if (
-            not np.isfinite(frame + sub).all()
-            or (np.diff(frame + sub / (sub.max() + 1)) <= 0).any()
-        ):
+        parts = int(np.nan_to_num(sub).max()) + 1
+        if not np.isfinite(frame + sub).all() or (np.diff(frame + sub / parts) <= 0).any():
             raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
-        parts = int(sub.max()) + 1
-        clocks.append((frame, sub, parts, float(lines[start + 1].strip(" ,;\t")) / parts))
-        notes += found.notes
-        twice = found.values.keys() & values.keys()
-        if twice:
-            raise FileFormatError(f"'{path}' has two columns '{min(twice)}'.")
-        values |= {name: (len(clocks) - 1, column) for name, column in found.values.items()}
-    finest = max(parts for _, _, parts, _ in clocks)
-    rate = clocks[0][3]
-    if any(finest % parts or other != rate for _, _, parts, other in clocks):
+        rate = float(lines[start + 1].strip(" ,;\t")) / parts
+        time = ((frame - 1) * parts + sub) / (parts * rate)
+        blocks.append((rate, Columns({"time (s)": time} | found.values, found.notes)))
+    if len({rate for rate, _ in blocks}) > 1:
         raise FileFormatError(
             f"'{path}' has blocks whose frames differ in rate: export them one by one."
         )
-    ticks = [np.rint((f - 1) * finest + s * (finest // n)).astype(int) for f, s, n, _ in clocks]
-    every = np.unique(np.concatenate(ticks))
-    out = {"time (s)": every / (finest * rate)}
-    for name, (block, column) in values.items():
-        out[name] = np.full(len(every), np.nan)
-        out[name][np.searchsorted(every, ticks[block])] = column
-    if len(set(map(len, ticks))) > 1:
-        notes.append("signals have different rates: those of the slower are missing in between")
-    return Columns(out, tuple(dict.fromkeys(notes)))
+    return [columns for _, columns in blocks]
 
 
 def _blocks(lines: list[str]) -> list[tuple[int, int]]:

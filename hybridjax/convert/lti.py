@@ -1,0 +1,109 @@
+"""Periodic systems as time-invariant ones, whose samples are whole periods; python-control, scipy.
+
+Lifting (Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2) stacks the inputs and outputs of
+all sections of a period.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive
+from .._core.precision import require_x64
+from .._core.signal import Signal, unit_of
+from .._core.tracing import is_traced
+from ..linear.htf import HTF
+from ..linear.ldtp import LDTP
+from .packages import package
+
+
+@checked
+def to_lti(model: LDTP) -> LDTP:
+    r"""The same system, with one sample for each period.
+
+    Sample k of the result has the state at section 0 of period k; the inputs `u[n]`, held from
+    section n of that period on; and the outputs `y[n]` at section n of the *same* period, before
+    `u[n]` acts but for the feed-through D. So the outputs of a period depend on its own inputs: the
+    new D holds the responses within a period (zero for inputs that come later), C the way from
+    section 0 to each section, B that from each input to section 0 of the next period, A is the
+    monodromy matrix. Names are `u[0]`, ..., `u[N-1]` for an input `u`; all inputs of section 0 come
+    first, then those of section 1.
+
+    Its response G at $z = e^{2 \pi i f}$, f in cycles per period, holds all harmonics:
+    $H_m(f) = \frac{1}{N} \sum_{n, r} G_{n r}\, e^{-2 \pi i (f + m) n / N} e^{2 \pi i f r / N}$.
+
+    **Returns:** an `LDTP` of one section, with the dimension of the state at section 0.
+
+    **Raises:** `PrecisionError` in single precision.
+    """
+    require_x64(model)
+    A, B, C, D, d, ny = model.A, model.B, model.C, model.D, model.A.shape[-1], len(model.outputs)
+    N, _, nu = B.shape
+
+    def advance(carry, section):
+        # The state at section n: from that at section 0, and from the inputs since then.
+        from_state, from_inputs = carry
+        n, A, B, C, D = section
+        rows = C @ from_state, jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
+        return (A @ from_state, jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B)), rows
+
+    carry = jnp.eye(d), jnp.zeros((d, N, nu))
+    (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
+    first = d if is_traced(model.dims) else int(model.dims[0])
+    return LDTP(
+        A[None, :first, :first],
+        B.reshape(1, d, N * nu)[:, :first],
+        C.reshape(1, N * ny, d)[:, :, :first],
+        D.reshape(1, N * ny, N * nu),
+        inputs=_at_sections(model.inputs, N),
+        outputs=_at_sections(model.outputs, N),
+        coordinates=None if model.coordinates is None else model.coordinates[:1],
+    )
+
+
+def _at_sections(names: tuple[str, ...], n_sections: int) -> tuple[str, ...]:
+    return tuple(Signal(f"{x}[{n}]", unit_of(x)) for n in range(n_sections) for x in names)
+
+
+@checked
+def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
+    """An object of python-control.
+
+    - An `LDTP` becomes a `control.StateSpace` of its lifted system (`to_lti`), with dt = `period`.
+    - An `HTF` becomes a `control.FrequencyResponseData` with an output `y[m]` for each output y and
+      harmonic m: `H_m` at the *input* frequency. All outputs of the first harmonic come first.
+
+    **Arguments:** `period`: in seconds, say; with 1 times are counted in periods.
+
+    **Raises:** `DefinitionError` where python-control is not installed.
+    """
+    if isinstance(thing, LDTP):
+        lti = to_lti(thing)
+        matrices = (np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D))
+        return package("control").StateSpace(
+            *matrices, period, inputs=_plain(lti.inputs), outputs=_plain(lti.outputs)
+        )
+    H = np.moveaxis(np.asarray(thing.H), 1, -1)
+    outputs = [f"{y}[{m}]" for m in thing.harmonics for y in thing.outputs]
+    return package("control").FrequencyResponseData(
+        H.reshape(len(outputs), len(thing.inputs), -1),
+        2 * np.pi * np.asarray(thing.f) / period,
+        inputs=_plain(thing.inputs),
+        outputs=outputs,
+    )
+
+
+@checked
+def to_scipy(model: LDTP, *, period: Positive = 1.0) -> Any:
+    """The lifted system (`to_lti`) as `scipy.signal.dlti`, with dt = `period`."""
+    from scipy.signal import dlti
+
+    lti = to_lti(model)
+    return dlti(*(np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D)), dt=period)
+
+
+def _plain(names: tuple[str, ...]) -> list[str]:
+    return [str(x) for x in names]

@@ -1,0 +1,61 @@
+"""Results as `pandas.DataFrame`."""
+
+from typing import Any
+
+import numpy as np
+
+from .._core.boundary.checked import checked
+from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
+from ..identify.rational.fit import RationalFit
+from ..linear.htf import HTF
+from ..orbits.branches.branch import Branch
+from ..orbits.sweep.limit_cycles import LimitCycles
+from ..recordings.data import SectionData
+from ..recordings.recording import Recording
+from .packages import package
+from .xarray_datasets import to_xarray
+
+
+Tabular = Recording | SectionData | HTF | LimitCycles | Branch | MultiplierEstimate | RationalFit
+
+
+@checked
+def to_pandas(thing: Tabular) -> Any:
+    """A `pandas.DataFrame`.
+
+    - `Recording`, `SectionData`: a row for each sample, with time and trial;
+      `Recording.from_frame` reads one trial of it.
+    - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0`, ...
+    - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
+    - Fits: a row for each multiplier, with its standard error; of a `RationalFit` one for each
+      output and pole.
+
+    **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
+    """
+    frame = package("pandas").DataFrame
+    if isinstance(thing, MultiplierEstimate):
+        values = thing.multipliers
+        return frame(
+            {
+                "multiplier": values,
+                "modulus": np.abs(values),
+                "standard_error": thing.standard_errors,
+            }
+        )
+    if isinstance(thing, RationalFit):
+        outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
+        poles, multipliers = thing.poles.ravel(), thing.multipliers.ravel()
+        return frame({"output": outputs, "pole": poles, "multiplier": multipliers})
+    dataset = to_xarray(thing)
+    if isinstance(thing, HTF):
+        return dataset.drop_vars(
+            ["input_unit", "output_unit", "variance_freedom"], errors="ignore"
+        ).to_dataframe()
+    row = next(iter(dataset.data_vars.values())).dims[0]
+    columns = {}
+    for name, x in (dataset.coords | dataset.data_vars).items():
+        if x.dims == (row,):
+            columns[name] = x.values
+        elif x.dims[0] == row:
+            columns |= {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
+    return frame(columns)

@@ -1,0 +1,1 @@
+"""What files hold, format by format, as columns by name."""

@@ -1,0 +1,389 @@
+"""Files of each kind, written by the library of their kind, and what is refused in one sentence."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core import limits
+from hybridjax.errors import FileFormatError
+
+
+SLOW, FAST = np.arange(20) / 100, np.arange(190) / 1000
+X, F = np.sin(20 * SLOW), np.cos(30 * FAST)
+
+
+def samples(recording, name):
+    """Times and values of one signal where it was sampled."""
+    (trial,) = recording.trials
+    x = trial.values[:, recording.column(name)]
+    return trial.time[np.isfinite(x)], x[np.isfinite(x)]
+
+
+def check_two_rates(path, x="x", f="f", digits=15, **how):
+    """Both signals are there, each with the times at which it was sampled and no others."""
+    found = hj.read_recording(path, **how)
+    for name, time, values in ((x, SLOW, X), (f, FAST, F)):
+        t, v = samples(found, name)
+        np.testing.assert_allclose(t, time, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(v, values, rtol=10.0**-digits, atol=10.0**-digits)
+    return found
+
+
+def refused(says, *paths, kind=FileFormatError, **how):
+    with pytest.raises(kind, match=says) as error:
+        hj.read_recording(*paths, **how)
+    assert str(paths[0]) in str(error.value) and "\n" not in str(error.value)
+
+
+# MATLAB and HDF5
+
+
+def write_v5(path, variables, **how):
+    scipy_io = pytest.importorskip("scipy.io")
+    scipy_io.savemat(path, variables, **how)
+
+
+def write_v73(path, variables):
+    """As MATLAB writes it: axes reversed, classes as attributes, a block of its own in front."""
+    h5py = pytest.importorskip("h5py")
+
+    def fill(group, values):
+        for name, value in values.items():
+            if isinstance(value, dict):
+                fill(group.create_group(name), value)
+                group[name].attrs["MATLAB_class"] = np.bytes_("struct")
+            elif isinstance(value, str):
+                group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
+                group[name].attrs["MATLAB_class"] = np.bytes_("char")
+            else:
+                group[name] = (
+                    np.atleast_2d(value).T if np.ndim(value) == 2 else np.atleast_2d(value)
+                )
+                group[name].attrs["MATLAB_class"] = np.bytes_("double")
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        fill(file, variables)
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM")
+
+
+NESTED = {
+    "force": {"time": FAST, "f": F, "events": {"strike": np.array([0.05, 0.1])}},
+    "x": X,
+    "pair": np.stack([X, 2 * X], axis=1),
+    "time": SLOW,
+    "rate": 100.0,
+    "subject": "S3",
+}
+
+
+@pytest.mark.parametrize("write", [write_v5, write_v73])
+def test_matlab(tmp_path, write):
+    write(tmp_path / "x.mat", NESTED)
+    found = check_two_rates(tmp_path / "x.mat", f="force.f")
+    assert set(found.signals) == {"force.f", "x", "pair.0", "pair.1"}
+    np.testing.assert_array_equal(samples(found, "pair.1")[1], 2 * X)
+    np.testing.assert_array_equal(found.trials[0].events["strike"], [0.05, 0.1])
+    only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
+    assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
+    assert len(only.trials[0].time) == len(SLOW)
+    refused("no signal 'y'; it has ", tmp_path / "x.mat", signals="y", kind=hj.DefinitionError)
+
+
+@pytest.mark.parametrize("write", [write_v5, write_v73])
+def test_two_clocks_without_groups(tmp_path, write):
+    write(tmp_path / "x.mat", {"time": SLOW, "x": X, "f": F})
+    refused("'f' has .*190.* numbers, but its times 'time' 20", tmp_path / "x.mat")
+    assert hj.read_recording(tmp_path / "x.mat", signals=["x"]).signals == ("x",)
+    write(tmp_path / "y.mat", {"t": SLOW, "x": X})
+    refused("no times 'time' for '[tx]'", tmp_path / "y.mat", kind=hj.DefinitionError)
+    assert hj.read_recording(tmp_path / "y.mat", time="t").signals == ("x",)
+
+
+def test_arrays_of_structs(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    kind = [("time", "O"), ("x", "O")]
+    write_v5(tmp_path / "x.mat", {"trials": np.array([(SLOW, X), (SLOW, X)], dtype=kind)})
+    refused("'trials' is an array of structs", tmp_path / "x.mat")
+    write_v73(tmp_path / "y.mat", {"time": SLOW, "x": X})
+    with h5py.File(tmp_path / "y.mat", "r+") as file:
+        group = file.create_group("trials")
+        group["x"] = np.array([file["x"].ref, file["x"].ref], h5py.ref_dtype)
+    refused("'trials' is an array of structs", tmp_path / "y.mat")
+    assert hj.read_recording(tmp_path / "y.mat", signals="x").signals == ("x",)
+
+
+def test_hdf5(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        file["time"], file["x"], file["daq/f"] = SLOW, X, F
+        file["daq/time"] = 1000 * FAST
+        file["daq/time"].attrs["units"], file["daq/f"].attrs["units"] = "ms", "N"
+        file["note"] = "left leg"
+    found = check_two_rates(path, f="daq/f")
+    assert found.unit("daq/f") == "N" and found.unit("x") == ""
+    assert hj.read_recording(path, signals="daq").signals == ("daq/f",)
+    with h5py.File(path, "r+") as file:
+        file["x"].attrs["units"] = np.nan
+    refused("the unit of 'x' is nan", path)
+    path.write_bytes(path.read_bytes()[:1000])
+    refused("no HDF5 file, or damaged", path)
+
+
+# Tables
+
+
+def table(**more):
+    pandas = pytest.importorskip("pandas")
+    return pandas.DataFrame({"time": SLOW, "x (m)": X, "event go": SLOW == SLOW[7], **more})
+
+
+def test_feather(tmp_path):
+    pytest.importorskip("pyarrow")
+    table(y=X).to_feather(tmp_path / "x.feather")
+    found = hj.read_recording(tmp_path / "x.feather", signals="x")
+    np.testing.assert_array_equal(samples(found, "x")[1], X)
+    assert found.unit("x") == "m" and found.trials[0].events["go"] == [SLOW[7]]
+    refused("no signal 'z'; it has ", tmp_path / "x.feather", signals="z", kind=hj.DefinitionError)
+    (tmp_path / "x.feather").write_bytes(b"ARROW1" + bytes(100))
+    refused("no feather file, or damaged", tmp_path / "x.feather")
+
+
+def test_excel(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    path, book = tmp_path / "x.xlsx", openpyxl.Workbook()
+    book.active.title = "walk"
+    for row in (["# subject, 3"], ["time", "x"], ["ms", None], *zip(1000 * SLOW, X, strict=True)):
+        book.active.append([float(v) if isinstance(v, np.floating) else v for v in row])
+    book.active["B8"] = None
+    book.create_sheet("notes")
+    book.save(path)
+    found = hj.read_recording(path)
+    t, x = samples(found, "x")
+    np.testing.assert_allclose(x, np.delete(X, 4), rtol=1e-15)
+    np.testing.assert_allclose(t, np.delete(SLOW, 4), rtol=1e-15)
+    assert "of 2 sheets the first one, 'walk', was read" in found.notes
+    book.active["B9"] = "high"
+    book.save(path)
+    refused("line 9: column 'x' holds 'high'", path)
+    path.write_text("no zip")
+    refused("no Excel file, or damaged", path)
+
+
+TRC = """PathFileType\t4\t(X/Y/Z)\twalk.trc
+DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames
+100.00\t100.00\t3\t2\tmm\t100.00\t1\t3
+Frame#\tTime\tR.ASIS\t\t\tL.ASIS\t\t
+\t\tX1\tY1\tZ1\tX2\tY2\tZ2
+
+1\t0.00\t1\t2\t3\t4\t5\t6\t
+2\t0.01\t1.5\t2\t3\t\t\t\t
+3\t0.02\t2\t2\t3\t4\t5\t6.5\t
+"""
+
+
+def test_trc(tmp_path):
+    path = tmp_path / "walk.trc"
+    path.write_text(TRC)
+    found = hj.read_recording(path)
+    assert found.signals[:2] == ("R.ASIS.x", "R.ASIS.y") and found.unit("L.ASIS.z") == "mm"
+    np.testing.assert_array_equal(samples(found, "R.ASIS.x"), [[0, 0.01, 0.02], [1, 1.5, 2]])
+    np.testing.assert_array_equal(samples(found, "L.ASIS.z"), [[0, 0.02], [6, 6.5]])
+    assert hj.read_recording(path, signals="L.ASIS").signals[0] == "L.ASIS.x"
+    path.write_text(TRC.replace("100.00\t3", "100.00\t4"))
+    refused("3 frames, but its header says 4", path)
+    path.write_text(TRC.replace("Frame#", "Number"))
+    refused("does not name 'Frame#'", path)
+
+
+# C3D
+
+
+def write_c3d(path, *, first=0, events=((0.05, "Left", "Strike"), (0.1, "Left", "Strike"))):
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d()
+    points = np.ones((4, 2, len(SLOW)))
+    points[0, 0], points[1, 0], points[2, 1, 3] = X, 2 * X, np.nan
+    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    file["parameters"]["POINT"]["LABELS"]["value"] = ("LASI", "LKnee")
+    file["parameters"]["POINT"]["UNITS"]["value"] = ("mm",)
+    file.add_parameter("POINT", "ANGLES", ("LKnee",))
+    file.add_parameter("POINT", "ANGLE_UNITS", ("deg",))
+    file["data"]["points"] = points
+    file["header"]["points"]["first_frame"] = first
+    file["parameters"]["ANALOG"]["RATE"]["value"] = [1000.0]
+    file["parameters"]["ANALOG"]["LABELS"]["value"] = ("Fz1",)
+    file["parameters"]["ANALOG"]["UNITS"]["value"] = ("N",)
+    file["data"]["analogs"] = np.append(F, np.zeros(10))[None, None]
+    for at, context, label in events:
+        file.add_event([0, at], context, label)
+    file.write(str(path))
+
+
+def test_c3d(tmp_path):
+    path = tmp_path / "walk.c3d"
+    write_c3d(path)
+    found = hj.read_recording(path)
+    t, x = samples(found, "LASI.x")
+    np.testing.assert_allclose(t, SLOW, atol=1e-15)
+    np.testing.assert_allclose(x, X, atol=1e-6)
+    t, f = samples(found, "Fz1")
+    np.testing.assert_allclose(t[:190], FAST, atol=1e-15)
+    np.testing.assert_allclose(f[:190], F, atol=1e-6)
+    assert [found.unit(x) for x in ("LASI.y", "LKnee.x", "Fz1")] == ["mm", "deg", "N"]
+    assert len(samples(found, "LKnee.z")[0]) == len(SLOW) - 1
+    np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7)
+    analog = hj.read_recording(path, signals="Fz1")
+    assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
+    refused("no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError)
+    path.write_bytes(path.read_bytes()[:2500])
+    refused("frames, but its header says 20", path)
+    path.write_bytes(b"no")
+    refused("no C3D file, or damaged", path)
+
+
+def test_events_outside_of_the_recording(tmp_path):
+    path = tmp_path / "walk.c3d"
+    write_c3d(path, first=10)
+    found = hj.read_recording(path)
+    assert found.trials[0].time[0] == 0.1
+    np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)
+    assert "1 events 'Left Strike' outside of the recording were left out" in found.notes
+    write_c3d(path, first=50)
+    refused("all events 'Left Strike' .* are outside of the recording", path)
+
+
+# ROS
+
+
+def write_bag(path, version):
+    """Two topics with stamps that are not the times of arrival, one without, one of images."""
+    pytest.importorskip("rosbags")
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if version == "bag" else Stores.ROS2_HUMBLE)
+    kinds = store.types
+    second, late = 10**9, 30_000_000
+
+    def header(t):
+        stamp = kinds["builtin_interfaces/msg/Time"](5 + int(t), round(t % 1 * second))
+        extra = {"seq": 0} if version == "bag" else {}
+        return kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="", **extra)
+
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    messages = []
+    for t, x in zip(SLOW, X, strict=True):
+        point = kinds["geometry_msgs/msg/PointStamped"](
+            header(t), kinds["geometry_msgs/msg/Point"](x, 2 * x, 0.0)
+        )
+        messages.append((t, "/body", point))
+    for t, f in zip(FAST, F, strict=True):
+        wrench = kinds["geometry_msgs/msg/Wrench"](vector(f, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+        messages.append((t, "/plate", kinds["geometry_msgs/msg/WrenchStamped"](header(t), wrench)))
+    for t in SLOW:
+        messages.append((t, "/count", kinds["std_msgs/msg/Float64"](t)))
+        layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+        image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
+        messages.append((t, "/image", image))
+    if version == "bag":
+        writer = rosbag1.Writer(path)
+    else:
+        plugin = rosbag2.StoragePlugin[version.upper()]
+        writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    with writer:
+        connections = {}
+        for t, topic, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            pack = store.serialize_ros1 if version == "bag" else store.serialize_cdr
+            arrival = round((5 + t) * second) + late
+            writer.write(connections[topic], arrival, pack(message, kind))
+
+
+@pytest.mark.parametrize("version", ["bag", "mcap", "sqlite3"])
+def test_bags(tmp_path, version):
+    path = tmp_path / ("x.bag" if version == "bag" else "x")
+    write_bag(path, version)
+    found = hj.read_recording(path, signals=["body.point", "plate.wrench.force.x", "count"])
+    assert found.signals == (
+        "body.point.x", "body.point.y", "body.point.z", "plate.wrench.force.x", "count.data",
+    )  # fmt: skip
+    shift = 0.03  # of arrival, from which times count
+    t, f = samples(found, "plate.wrench.force.x")
+    np.testing.assert_allclose(t, FAST - shift, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(f, F)
+    np.testing.assert_allclose(samples(found, "body.point.y"), [SLOW - shift, 2 * X], atol=1e-12)
+    np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
+    assert any("times of count are those of arrival" in note for note in found.notes)
+    refused("no signal 'imu.x'; it has body, count", path, signals="imu.x", kind=hj.DefinitionError)
+    refused("no signal 'body.pose'; it has", path, signals="body.pose", kind=hj.DefinitionError)
+    if version != "bag":
+        (single,) = (x for x in path.iterdir() if x.suffix != ".yaml")
+        alone = hj.read_recording(single, signals="plate.wrench.force.x")
+        np.testing.assert_array_equal(samples(alone, "plate.wrench.force.x")[1], F)
+    else:
+        path.write_bytes(path.read_bytes()[:500])
+        refused("no bag of ROS, or damaged", path)
+
+
+def test_a_bag_without_messages_of_ros(tmp_path):
+    mcap = pytest.importorskip("mcap.writer")
+    path = tmp_path / "x.mcap"
+    with open(path, "wb") as file:
+        writer = mcap.Writer(file)
+        writer.start()
+        schema = writer.register_schema("sample", "jsonschema", b"{}")
+        channel = writer.register_channel("/x", "json", schema)
+        writer.add_message(channel, 1, b'{"x": 1}', 1)
+        writer.finish()
+    refused("no bag of ROS, or damaged", path)
+
+
+# All of them
+
+
+@pytest.mark.parametrize(
+    ("suffix", "library", "extra"),
+    [
+        (".c3d", "ezc3d", "c3d"),
+        (".h5", "h5py", "mat"),
+        (".xlsx", "openpyxl", "tables"),
+        (".feather", "pyarrow", "tables"),
+        (".mcap", "rosbags.highlevel", "ros"),
+    ],
+)
+def test_libraries_that_are_not_there(tmp_path, monkeypatch, suffix, library, extra):
+    monkeypatch.setitem(__import__("sys").modules, library, None)
+    (tmp_path / f"x{suffix}").write_bytes(b"x")
+    with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"):
+        hj.read_recording(tmp_path / f"x{suffix}")
+
+
+def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file.create_dataset("time", shape=(10**10,), chunks=(1000,), dtype=float)
+    refused("declares arrays of 80000000000 bytes", tmp_path / "x.h5")
+    zeros = {"time": np.zeros(2**17), "x": np.zeros(2**17)}
+    write_v5(tmp_path / "x.mat", zeros, do_compression=True)
+    monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
+    refused("unpacks to more than", tmp_path / "x.mat")
+    monkeypatch.setattr(limits, "RECORDED", 100)
+    parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
+    with pytest.raises(hj.DefinitionError, match="2 signals at 191 times are too many"):
+        hj.Recording.beside(parts)
+
+
+def test_recordings_beside_each_other():
+    x, f = hj.Recording(SLOW, {"x": X}, units={"x": "m"}), hj.Recording(FAST + 5e-4, {"f": F})
+    both = hj.Recording.beside([x, f])
+    np.testing.assert_array_equal(samples(both, "x"), [SLOW, X])
+    np.testing.assert_array_equal(samples(both, "f"), [FAST + 5e-4, F])
+    assert both.unit("x") == "m" and "different rates or clocks" in both.notes[0]
+    with pytest.raises(hj.DefinitionError, match="two of the recordings have a signal 'x'"):
+        hj.Recording.beside([x, x])
+    with pytest.raises(hj.DefinitionError, match="same number of trials"):
+        hj.Recording.beside([x, hj.Recording.join([f, f])])
