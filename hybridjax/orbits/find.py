@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation.compile import host_first
-from .._core.executor import namespace
+from .._core.executor import namespace, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
@@ -19,14 +19,15 @@ from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.target import until
-from ..engine.watch import slopes, watch
+from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
 from ..linear.time_response import monodromy
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
+from .clock import check_clock, check_times
 from .cycle import LimitCycle
-from .guess import begin, check_clock, check_section, guessed_lane
+from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
@@ -44,9 +45,6 @@ _VANISHING = 1e-6
 # The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
 # monodromy up to this part of it. Doubled, half as much loss is noticed.
 _CONSERVED = 1e-6
-# The field one period later is the same up to this part of it, and up to this part of the states'
-# sizes in one period. Doubled, half as large an error of a stated period is noticed.
-_SAME_FIELD, _SAME_REST = 1e-6, 1e-9
 # An event is due at the anchor if it would come within this part of the period. Doubled, guesses
 # twice as far from an event are refused.
 _DUE = 1e-9
@@ -140,6 +138,9 @@ def find_limit_cycle(
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
+        charts = np.arange(len(s.charts))
+        times = np.full(len(charts), float(np.asarray(lane.t)[0]))
+        check_times(system, times, charts, near.points.T, settings.scale, near.time)
         max_period = _PATIENCE * near.time if max_period is None else max_period
         anchor, base, expected = begin(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
@@ -153,10 +154,11 @@ def find_limit_cycle(
     map, solution = _in_own_sizes(map, _solve(map), given)
     codes = np.ravel(solution.turn.codes)
     cycle = _cycle(map, solution, tuple(int(g) for g in codes if g >= 0))
-    code = Result(int(cycle.result))
+    code, legs = Result(int(cycle.result)), to_host(cycle.legs)
+    check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         if cycle.clocked:
-            _check_clock(cycle)
+            _check_begin(cycle)
         if conserved:
             _check_conserved(cycle)
     if throw and code != Result.OK:
@@ -274,35 +276,25 @@ def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
-def _check_clock(cycle: LimitCycle) -> None:
-    """Raise where the cycle of a clocked system is not what it seems to be."""
-    s, system = Structure(cycle.system), cycle.system
-    a, t = int(cycle.anchor.chart[0]), float(np.asarray(cycle.anchor.t)[0])
-    f, later, guards, rates = jax.device_get(_at_anchor(cycle))
-    f, later = f[: s.dims[a]], later[: s.dims[a]]
-    slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)
-    if np.any(np.abs(later - f) > _SAME_FIELD * np.abs(f) + _SAME_REST * slow):
-        raise ComputationError(
-            f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "
-            f"that {type(system).__name__}.period() states: at t = {t:.6g} it is {f}, one period "
-            f"later {later}."
-        )
+def _check_begin(cycle: LimitCycle) -> None:
+    """Raise where the cycle of a clocked system begins at an event."""
+    guards, rates = jax.device_get(_at_anchor(cycle))
     due = (rates < 0) & (np.abs(guards) <= -_DUE * float(cycle.period) * rates)
     if due.any():
+        name = Structure(cycle.system).transitions[int(np.argmax(due))].name
         raise ComputationError(
-            f"the search begins exactly at the event '{s.transitions[int(np.argmax(due))].name}', "
-            "which may or may not belong to the turn: give a guess at another time."
+            f"the search begins exactly at the event '{name}', which may or may not belong to the "
+            "turn: give a guess at another time."
         )
 
 
 @host_first
 def _at_anchor(cycle: LimitCycle):
-    """The field at the anchor (d,) and one period later, the guards there (G,) and their rates."""
+    """The guards (G,) at the anchor, and their rates."""
     s, anchor, xp = Structure(cycle.system), cycle.anchor, namespace(cycle.period)
-    u, later = xp.zeros((s.nu, 1)), anchor.t + cycle.period
-    f = [slopes(s, t, anchor.chart, anchor.q, u)[:, 0] for t in (anchor.t, later)]
+    u = xp.zeros((s.nu, 1))
     seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
-    return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
+    return seen.value[:-1, 0], seen.rate[:-1, 0]
 
 
 def _explain(cycle: LimitCycle, code: Result) -> str:
