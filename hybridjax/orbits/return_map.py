@@ -166,7 +166,7 @@ class ReturnMap(eqx.Module):
             )
             return moved, None
 
-        there, _ = self._round(q, flow)
+        there, _ = self.travel(q, flow)
         return there
 
     def turn_with_jacobian(
@@ -206,7 +206,7 @@ class ReturnMap(eqx.Module):
                 factor = jnp.concatenate([jnp.concatenate([factor, column], axis=1), last])
             return moved, (lanes, factor, tape.code)
 
-        there, (legs, factors, codes) = self._round(q, flow)
+        there, (legs, factors, codes) = self.travel(q, flow)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
         codes, product = codes[..., 0], monodromy(factors)
         off, by_state = self.held(q)
@@ -280,7 +280,7 @@ class ReturnMap(eqx.Module):
     def _with(self, system: HybridSystem) -> "ReturnMap":
         return dataclasses.replace(self, system=system)
 
-    def _round(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
+    def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
         """One turn, piece by piece, each done by `flow`, and what `flow` returned besides."""
         targets, xp = self._leg_targets(), namespace(q)
         each, common = eqx.partition(targets, _per_lane(targets))

@@ -98,7 +98,8 @@ def test_a_force_that_jumps_with_the_clock():
 
     class Square(hj.HybridSystem):
         def charts(self):
-            return {"a": Field(("x",), lambda t, q, u: (-q[0] + jnp.where(t % 1.0 < 0.5, 1.0, 0.0),))}
+            force = lambda t: jnp.where(t % 1.0 < 0.5, 1.0, 0.0)  # noqa: E731
+            return {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
 
         def transitions(self):
             return (hj.Transition("half", "a", "a", hj.Scheduled(0.5)),)
