@@ -26,8 +26,8 @@ from .scale import sizes_of
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
 # zero. Doubled, weaker multipliers are taken for zeros of resets.
 _RANK = 1e-9
-# A piece of the turn contracts too much if its weakest direction keeps less than this: of 16 digits,
-# so many are lost. Doubled, one more turn is computed a little more often.
+# A piece of the turn contracts too much if its weakest direction keeps less than this: of 16
+# digits, so many are lost. Doubled, one more turn is computed a little more often.
 _CONTRACTS = 1e-6
 
 

@@ -16,17 +16,17 @@ from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..engine.lanes import Lanes
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.target import until
 from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
-from ..linear.time_response import monodromy
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
 from .clock import check_clock, check_times
+from .conserved import check_conserved
 from .cycle import LimitCycle
+from .explain import coincident, events_of, explain
 from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
@@ -42,9 +42,6 @@ _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
-# The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
-# monodromy up to this part of it. Doubled, half as much loss is noticed.
-_CONSERVED = 1e-6
 # An event is due at the anchor if it would come within this part of the period. Doubled, guesses
 # twice as far from an event are refused.
 _DUE = 1e-9
@@ -111,7 +108,7 @@ def find_limit_cycle(
         require_x64(system, guess, section, settings)
         check_system(system)
     s = Structure(system)
-    settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings
+    settings = (Settings() if settings is None else settings).filled(LIMIT_CYCLE)
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     check_section(s, section)
@@ -150,19 +147,20 @@ def find_limit_cycle(
     map = dataclasses.replace(map, conserved=conserved)
     if traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
-    _check_values(system, map.anchor, conserved)
+    s.resolve_outputs(tuple(conserved)).require(int(map.anchor.chart[0]))
     map, solution = _in_own_sizes(map, _solve(map), given)
-    codes = np.ravel(solution.turn.codes)
-    cycle = _cycle(map, solution, tuple(int(g) for g in codes if g >= 0))
+    if int(solution.result) == Result.OK and coincident(solution.turn):
+        solution = solution._replace(result=jnp.asarray(Result.COINCIDENCE, jnp.int32))
+    cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
     check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         if cycle.clocked:
             _check_begin(cycle)
         if conserved:
-            _check_conserved(cycle)
+            check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(_explain(cycle, code))
+        raise ComputationError(explain(cycle, solution.turn, float(map.expected)))
     return cycle
 
 
@@ -245,37 +243,6 @@ def _check_fits(
         )
 
 
-def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, Array]) -> None:
-    s = Structure(system)
-    s.resolve_outputs(tuple(conserved)).require(int(anchor.chart[0]))
-
-
-def _check_conserved(cycle: LimitCycle) -> None:
-    """Raise where a quantity that should be conserved is not."""
-    lost = [name for name in cycle.conserved if name not in _kept(cycle, tuple(cycle.conserved))]
-    if lost:
-        raise DefinitionError(
-            f"'{lost[0]}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
-            "cycle change it in one turn. Leave it out of `conserved`."
-        )
-
-
-def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
-    """Those outputs that are conserved near the cycle, with their values: their gradients are left
-    eigenvectors of the monodromy."""
-    s = Structure(cycle.system)
-    a, t = int(cycle.anchor.chart[0]), cycle.anchor.t[0]
-    q, u = cycle.anchor.q[: s.dims[a], 0], jnp.zeros(s.nu)
-    returned = np.asarray(monodromy(cycle.factors))[: s.dims[a], : s.dims[a]]
-    sizes = np.asarray(cycle.return_map.sizes)[: s.dims[a]]
-    outputs = s.resolve_outputs(names)
-    gradients = np.asarray(jax.jacfwd(lambda q: outputs(a, t, q, u))(q))
-    changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= _CONSERVED * np.abs(gradients * sizes).max(axis=1)
-    values = np.asarray(outputs(a, t, q, u))
-    return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
-
-
 def _check_begin(cycle: LimitCycle) -> None:
     """Raise where the cycle of a clocked system begins at an event."""
     guards, rates = jax.device_get(_at_anchor(cycle))
@@ -295,28 +262,3 @@ def _at_anchor(cycle: LimitCycle):
     u = xp.zeros((s.nu, 1))
     seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
     return seen.value[:-1, 0], seen.rate[:-1, 0]
-
-
-def _explain(cycle: LimitCycle, code: Result) -> str:
-    name = type(cycle.system).__name__
-    if code == Result.SINGULAR:
-        kept = _kept(cycle, tuple(output.name for output in cycle.system.outputs()))
-        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {"energy": 1.0}
-        return (
-            f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
-            "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
-            "is wanted by the value of the quantity (an output of the system), e.g. "
-            f"`conserved={example}`, or take the one nearest to the guess with "
-            "`throw=False`."
-        )
-    reason = code.message
-    if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
-        reason = "Newton came to a state from where one period ends in another chart"
-    elif code == Result.NOT_CONVERGED:
-        reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
-        if cycle.conserved:
-            reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
-    return (
-        f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "
-        "if the cycle is stable, e.g. `settle=60 * period`."
-    )

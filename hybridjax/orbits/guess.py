@@ -138,7 +138,10 @@ def begin(
         target = toward(np.full(1, np.inf), event, np.asarray(lanes.t) + max_period)
         moved = _go(system, lanes, section, target, settings)
         where = "through the guess, across the flow" if by_default else str(section)
-        _require(moved, f"{doing} ({where})", s, _other_section(s) if by_default else "")
+        advice = _other_section(s) if by_default else ""
+        if moved.result[0] == Result.SECTION_MISSED:
+            advice += f"Or allow more time than {max_period:.3g}, by `max_period`. "
+        _require(moved, f"{doing} ({where})", s, advice)
         return moved.lanes
 
     if not on_section:
