@@ -104,10 +104,11 @@ class LimitCycle(eqx.Module):
         that the cycle was chosen by stands for a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
-        blocks, finite = self._blocks(), bool(np.isfinite(self.factors).all())
+        blocks = self._blocks()
         # (Of an autonomous flow, the weakest direction is its own, which was taken out.)
-        of_all = 1 if self.clocked else 2
-        if finite and min(weakest(block, of_all) for block in blocks) < _CONTRACTS:
+        besides = 0 if self.clocked else 1
+        went_round = np.isfinite(self.residual)
+        if went_round and min(weakest(block, besides) for block in blocks) < _CONTRACTS:
             blocks = fine_factors(self.return_map)
         values = product_eigenvalues(blocks, rtol=_RANK)
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1

@@ -113,11 +113,10 @@ def _about_guards(cycle: LimitCycle, turn: Turn) -> str:
     seen: dict[int, list[float]] = {}
     for a, t, q in _points(s, turn):
         if guards := s.guards(a):
-            values = kernels.watched(s, a, None, t, q, np.zeros((s.nu, 1)), np.zeros(1, np.int32))[
-                :, 0
-            ]
-            for g, row in zip(guards, values, strict=True):
-                seen.setdefault(g, []).extend(s.transitions[g].sign * row)
+            u, index = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+            rows = kernels.watched(s, a, None, t, q, u, index)[:, 0]
+            for g, values in zip(guards, rows, strict=True):
+                seen.setdefault(g, []).extend(s.transitions[g].sign * values)
     told = "; ".join(
         f"the guard of '{s.transitions[g].name}', which should be {s.transitions[g].direction}, "
         f"went from {values[0]:.3g} to {values[-1]:.3g} (between {min(values):.3g} and "

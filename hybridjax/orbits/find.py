@@ -91,13 +91,15 @@ def find_limit_cycle(
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
         do not depend on units (under a JAX transformation, on the guess).
-    - `settings`: accuracy of the flow; 1e-12 by default.
+    - `settings`: accuracy of the flow, 1e-12 by default, and how many steps it may take, which
+        `linearize` takes over.
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
-    **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
-    found: no convergence, an event or section that does not come, grazing, an equilibrium in
-    place of a cycle, or a singular J - I (there is a whole family of cycles, from a conserved
-    quantity or a symmetry; see `conserved`).
+    **Raises:** `DefinitionError` for bad arguments, and for functions that depend on time otherwise
+    than `system.period()` states; `ComputationError` if no isolated cycle is found: no
+    convergence, an event or section that does not come, events that coincide, grazing, an
+    equilibrium in place of a cycle, or a singular J - I (there is a whole family of cycles, from a
+    conserved quantity or a symmetry; see `conserved`).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a

@@ -63,8 +63,10 @@ def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
     return to.T, back
 
 
-def weakest(factor: Matrix, of_all: int = 1) -> float:
-    """What a factor leaves of its weakest direction, or of the second weakest with `of_all` = 2, as
-    a part of what it leaves of the strongest, or of 1 if that shrinks, too."""
+def weakest(factor: Matrix, besides: int = 0) -> float:
+    """What a factor leaves of its weakest direction, besides so many weaker ones, as a part of
+    what it leaves of the strongest, or of 1 if that shrinks, too."""
     singular = np.linalg.svd(factor, compute_uv=False)
-    return singular[-of_all] / max(singular[0], 1.0) if len(singular) >= of_all else np.inf
+    if len(singular) <= besides:
+        return np.inf
+    return singular[-1 - besides] / max(singular[0], 1.0)
