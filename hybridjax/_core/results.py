@@ -23,6 +23,8 @@ class Result(enum.IntEnum):
     BAD_INPUT = 10
     EQUILIBRIUM = 11
     EXTRA_TURNS = 12
+    COINCIDENCE = 13
+    STEP_COLLAPSE = 14
 
     @property
     def message(self) -> str:
@@ -44,6 +46,11 @@ _MESSAGES = {
     Result.BAD_INPUT: "the start or the input is NaN or infinite",
     Result.EQUILIBRIUM: "the iteration ended in an equilibrium instead of a cycle",
     Result.EXTRA_TURNS: "a turn met the section more often than asked (its period is shorter)",
+    Result.COINCIDENCE: "two events coincide on the cycle: their order is not fixed beside it",
+    Result.STEP_COLLAPSE: (
+        "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "
+        "the guard of a transition"
+    ),
 }
 
 

@@ -17,7 +17,7 @@ from .lanes import Lanes
 from .solver.tableau import VERNER76
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
 from .target import Target
-from .watch import ChartFlow
+from .watch import ChartFlow, slopes
 
 
 class _Moves(NamedTuple):
@@ -41,17 +41,25 @@ class _Linear(NamedTuple):
 
 
 def chain(
-    s: Structure, lanes: Lanes, target: Target, tape: Tape, of_states: bool
+    s: Structure,
+    lanes: Lanes,
+    target: Target,
+    tape: Tape,
+    of_states: bool,
+    across: Float[np.ndarray, "A d"] | None = None,
 ) -> tuple[Float[np.ndarray, "L n m"], Float[np.ndarray, "n L"]]:
     """Derivatives of (t, q) at the end of a record by (t, q, u) at its start, at u = 0, or by q
-    only; and (t, q) at the end."""
+    only; and (t, q) at the end.
+
+    With `across`, sizes of states by chart, for autonomous systems and targets at which the
+    direction of the flow means nothing: it is taken out of every move, so that nothing is drowned
+    in it, however strongly the flow contracts.
+    """
     n, L = 1 + s.d, len(lanes.t)
     moves = _moves(lanes, tape)
-    found = _Linear(np.zeros((len(moves.t), n)), np.zeros((len(moves.t), n, n + s.nu)))
-    for a in np.unique(moves.chart):
-        here = np.flatnonzero(moves.chart == a)
-        own = _linear(s, int(a), _Moves(*(x[..., here] for x in moves)), target)
-        found.end[here], found.by[here] = own
+    found = _linear_moves(s, moves, target)
+    if across is not None:
+        found.by[:, :, 1:n] = found.by[:, :, 1:n] @ _across(s, moves, across)
     columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
     end = np.concatenate([lanes.t[None], lanes.q]).T
     for turn in range(1 + max(moves.turn, default=-1)):
@@ -61,6 +69,47 @@ def chain(
         columns[lane, :, n:] += by[:, :, n:]
         end[lane] = found.end[now]
     return columns[:, :, 1:n] if of_states else columns, end.T
+
+
+class Link(NamedTuple):
+    """One move of a lane."""
+
+    chart: int
+    """The chart in which it starts."""
+    field: Float[np.ndarray, " d"]
+    """The field at its start."""
+    jacobian: Float[np.ndarray, "n n"]
+    """Derivative of (t, q) at its end by those at its start, padded."""
+
+
+def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
+    """The moves of one lane."""
+    moves = _moves(lanes, tape)
+    found, f, n = _linear_moves(s, moves, target), _fields(s, moves), 1 + s.d
+    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, found.by[:, :, :n], strict=True)]
+
+
+def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
+    n, M = 1 + s.d, len(moves.t)
+    found = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
+    for a in np.unique(moves.chart):
+        here = np.flatnonzero(moves.chart == a)
+        own = _linear(s, int(a), _Moves(*(x[..., here] for x in moves)), target)
+        found.end[here], found.by[here] = own
+    return found
+
+
+def _fields(s: Structure, moves: _Moves) -> Float[np.ndarray, "d M"]:
+    """The field where moves start."""
+    return slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1)))
+
+
+def _across(s: Structure, moves: _Moves, sizes) -> Float[np.ndarray, "M d d"]:
+    """Projections of states along the flow where moves start, orthogonal in sizes."""
+    size = sizes[moves.chart]
+    f = _fields(s, moves).T / size
+    f = f / np.linalg.norm(f, axis=1, keepdims=True)
+    return np.eye(s.d) - (size * f)[:, :, None] * (f / size)[:, None, :]
 
 
 def _moves(lanes: Lanes, tape: Tape) -> _Moves:

@@ -60,11 +60,13 @@ def tape_jacobian(
     tape: Tape,
     of_states: bool = False,
     wanted: Bool[Array, ""] | bool = True,
+    across: Float[Array, "A d"] | None = None,
 ) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
     """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
-    (t, q) at the targets; both are zeros if they are not `wanted`."""
+    (t, q) at the targets; both are zeros if they are not `wanted`. `across`: see `chain`; traced,
+    it makes no difference."""
     if on_host(lanes.t):
-        return chain(s, lanes, target, tape, of_states)
+        return chain(s, lanes, target, tape, of_states, across)
     columns, end = _push(s.source, lanes, target, tape, of_states, wanted)
     return columns.transpose(2, 1, 0), end
 

@@ -20,7 +20,7 @@ from .solver.step import Step
 # Default accuracies: the error that one step may have, relative to the size of each state. A tenth
 # of the accuracy costs about 1.4 times as many steps (the method has order 7).
 SIMULATION = 1e-10
-"""Single trajectories (`simulate`), and settings that do not say."""
+"""Single trajectories (`simulate`)."""
 LIMIT_CYCLE = 1e-12
 """Limit cycles, and all that is linearized along them."""
 SWEEP = 1e-9
@@ -52,12 +52,12 @@ class Settings(eqx.Module):
     """Accuracy and effort of the flow.
 
     The estimated error of a step in state k of chart a is at most
-    `rtol * |q[k]| + atol * scale[a, k]`.
+    `rtol * |q[k]| + atol * scale[a, k]`. What is not given is what the call takes by default.
     """
 
-    rtol: Float[Array, ""]
+    rtol: Float[Array, ""] | None
     """Error of a step relative to each state's own size."""
-    atol: Float[Array, ""]
+    atol: Float[Array, ""] | None
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
@@ -73,19 +73,24 @@ class Settings(eqx.Module):
 
     def __init__(
         self,
-        rtol: PositiveScalar = SIMULATION,
-        atol: PositiveScalar = SIMULATION,
+        rtol: PositiveScalar | None = None,
+        atol: PositiveScalar | None = None,
         max_steps: StepCount = 256,
         scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
     ):
-        self.rtol, self.atol = _kept(rtol), _kept(atol)
+        self.rtol, self.atol, self.scale = map(_kept, (rtol, atol, scale))
         self.max_steps = max_steps
-        self.scale = None if scale is None else _kept(scale)
+
+    def filled(self, accuracy: float) -> "Settings":
+        """With this accuracy where none is given."""
+        rtol, atol = (accuracy if x is None else x for x in (self.rtol, self.atol))
+        return Settings(rtol, atol, self.max_steps, self.scale)
 
 
-def _kept(x: Array | float) -> Array:
+def _kept(x: Array | float | None) -> Array | None:
     """The host's arrays as they are, for what else there is JAX's."""
-    return x if isinstance(x, np.ndarray) and x.dtype == np.float64 else real(x)
+    kept = x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64)
+    return x if kept else real(x)
 
 
 def size(settings: Settings, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:

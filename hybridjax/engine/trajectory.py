@@ -26,7 +26,7 @@ from .events import start_lanes
 from .hermite import interpolate
 from .move import record
 from .search.stride import initial_step
-from .settings import Settings
+from .settings import SIMULATION, Settings
 from .tape import IDLE
 from .target import until
 from .watch import slopes
@@ -156,7 +156,7 @@ def simulate(
             f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
             f"shape ({s.dims[a]},); it has {start.state.shape}."
         )
-    settings = Settings() if settings is None else settings
+    settings = (Settings() if settings is None else settings).filled(SIMULATION)
     u = _constant_input(s, input)[:, None]
     if callable(input):
         system = Driven(system, input)

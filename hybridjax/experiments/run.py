@@ -51,8 +51,8 @@ def run_experiments(
         whole number of periods; all that are not discarded are then for estimation.
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
     - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
-        linearization predicts, so that there is almost no transient, and "steady" in the periodic
-        response itself, found by Newton's method, with none.
+        linearization predicts, which leaves a transient of second order in the inputs, and "steady"
+        in the periodic response itself, found by Newton's method, with none.
     - `discard`: cycles that come before the design's periods and are meant to be discarded. By
         default 20 from the cycle (the paper's) and 0 from a periodic start.
     - `process_noise`: a random input beside the excitation, which is not recorded.

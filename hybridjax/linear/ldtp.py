@@ -245,7 +245,9 @@ class LDTP(eqx.Module):
 
         Their product is never formed, so that multipliers far below `1e-16` of the largest keep
         their digits. Zeros are not found by size: they are counted from the dimensions and the
-        ranks of the factors (as by `rank`).
+        ranks of the factors (as by `rank`). A direction that contracts to less than `1e-12` of the
+        others between two neighboring sections is counted with them: more sections show it, and so
+        does `LimitCycle.multipliers`. What is too small for a number, below 1e-308, is given as 0.
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """

@@ -36,7 +36,8 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
 
 
 def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.ndarray, " r"]:
-    """The non-zero eigenvalues of the product, the largest first, conjugate pairs exact.
+    """The non-zero eigenvalues of the product, the largest first, conjugate pairs exact. Those that
+    are too small for a number are zero.
 
     The factors are restricted to the range of the product, on which they are square and regular;
     then the periodic QR algorithm (Bojanczyk, Golub and Van Dooren, "The periodic Schur
@@ -50,8 +51,9 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
     if not regular:
         return np.zeros(0, complex)
     triangular = _periodic_schur([factor.astype(complex) for factor in regular])
-    eigenvalues = np.prod([np.diag(factor) for factor in triangular], axis=0)
-    eigenvalues = _pair_conjugates(eigenvalues)
+    # (By logarithms, lest the product of some be too small or too large for a number.)
+    logarithms = np.sum([np.log(np.diag(factor)) for factor in triangular], axis=0)
+    eigenvalues = _pair_conjugates(np.exp(logarithms))
     return eigenvalues[np.lexsort((-eigenvalues.imag, -np.abs(eigenvalues)))]
 
 

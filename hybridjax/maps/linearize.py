@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation.compile import host_first
+from .._core.compilation.compile import at_ease, host_first
 from .._core.executor import Array, namespace, on_host, to_host
 from .._core.lanes.per_lane import by_lane
 from .._core.progress import working
 from .._core.results import Result
-from .._core.tracing import is_traced
+from .._core.tracing import is_inside_program, is_traced
 from ..engine import kernels
 from ..engine.jacobian import tape_jacobian
 from ..engine.lanes import for_each_chart, only
@@ -55,7 +55,11 @@ def linearize(
     for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
     names, columns = _inputs(s, inputs)
-    A, B = _section_jacobians(placed)
+    if traced or is_inside_program():
+        A, B = _section_jacobians(placed)
+    else:
+        with at_ease():
+            A, B = _section_jacobians(to_host(placed))
     C, D = _output_jacobians(placed, tuple(z.items))
     d = s.d + 1
     if not traced:
@@ -87,14 +91,21 @@ def _inputs(
     return tuple(known[k] for k in columns), columns
 
 
-@host_first
 def _section_jacobians(
     placed: PlacedSections,
 ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
-    """A and B, padded; NaN where the flow failed."""
+    """A and B, padded; NaN where the flow failed.
+
+    (On the host, the direction of an autonomous flow does not drown what contracts strongly.)
+    """
     n = 1 + placed.lanes.q.shape[0]
     following, _, target = placed.onwards()
-    jacobian, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
+    across = None
+    if on_host(placed.lanes.t) and not placed.cycle.clocked and np.isinf(placed.bound.time).all():
+        across = placed.cycle.settings.scale
+    jacobian, _ = tape_jacobian(
+        placed.structure(), placed.lanes, target, placed.tape, across=across
+    )
     xp = namespace(jacobian)
     jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
     embed, select = placed.frames()

@@ -54,7 +54,8 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     """Find a family's sections on a cycle, and check them.
 
     **Arguments:** `sections`, a family (`ClockPhase`, `KinematicPhase`, `SectionList`), or a list
-    of `Crossing` and `AtEvent`.
+    of `Crossing` and `AtEvent`. The way from each section to the next may take as many steps as the
+    cycle's `settings` allow, and 1024 at least.
 
     **Raises:** `DefinitionError` for a family that does not fit the system; `ComputationError` that
     names the first section that the cycle does not cross, crosses more than once, touches

@@ -48,6 +48,8 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
             hint = ""
             if code == Result.SECTION_MISSED:
                 hint = " Does it lie on an event of the cycle? Then move it a little."
+            elif code == Result.STEP_LIMIT:
+                hint = " Give them to the search for the cycle, or place more sections."
             raise ComputationError(
                 f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: "
                 f"{reason}.{hint}"

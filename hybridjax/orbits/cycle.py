@@ -19,6 +19,7 @@ from ..linear.multipliers import product_eigenvalues
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from .fine_factors import fine_factors, weakest
 from .return_map import ReturnMap
 from .scale import sizes_of
 
@@ -26,6 +27,9 @@ from .scale import sizes_of
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
 # zero. Doubled, weaker multipliers are taken for zeros of resets.
 _RANK = 1e-9
+# A piece of the turn contracts too much if its weakest direction keeps less than this: of 16
+# digits, so many are lost. Doubled, one more turn is computed a little more often.
+_CONTRACTS = 1e-6
 
 
 @checked_methods
@@ -95,20 +99,31 @@ class LimitCycle(eqx.Module):
         """The non-zero Floquet multipliers, the largest first (on the host).
 
         Computed from the factors without forming their product, so that small ones are right
-        too; zeros that stem from resets and sections are counted by rank and left out. Each
-        conserved quantity that the cycle was chosen by stands for a multiplier of exactly 1.
+        too; where one of the pieces contracts so much that it drowns in rounding, from single
+        steps of one more turn. Zeros that stem from resets and sections are counted by rank and
+        left out; 0 stands for what is too small for a number, below 1e-308. Each conserved quantity
+        that the cycle was chosen by stands for a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
-        dims, factors = self.dims, np.asarray(self.factors)
-        sizes = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
-        after = np.roll(np.arange(len(dims)), -1)  # the piece that follows
-        factors = factors * sizes[:, None, :] / sizes[after, :, None]
-        blocks = [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
+        blocks = self._blocks()
+        # (Of an autonomous flow, the weakest direction is its own, which was taken out.)
+        besides = 0 if self.clocked else 1
+        went_round = np.isfinite(self.residual)
+        if went_round and min(weakest(block, besides) for block in blocks) < _CONTRACTS:
+            blocks = fine_factors(self.return_map)
         values = product_eigenvalues(blocks, rtol=_RANK)
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
         return values
+
+    def _blocks(self) -> list[np.ndarray]:
+        """The factors in sizes of the states, without padding."""
+        dims, factors = self.dims, np.asarray(self.factors)
+        sizes = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
+        after = np.roll(np.arange(len(dims)), -1)  # the piece that follows
+        factors = factors * sizes[:, None, :] / sizes[after, :, None]
+        return [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
 
     @property
     def stable(self) -> bool:
@@ -172,4 +187,6 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
 
 
 def _format(z: complex) -> str:
+    if z == 0:
+        return "below 1e-308"
     return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"

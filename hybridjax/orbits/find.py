@@ -15,18 +15,18 @@ from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
-from ..engine import kernels
-from ..engine.lanes import Lanes
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.target import until
-from ..engine.watch import slopes, watch
+from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
-from ..linear.time_response import monodromy
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem
+from .clock import check_clock, check_times
+from .conserved import check_conserved
 from .cycle import LimitCycle
-from .guess import begin, check_clock, check_section, guessed_lane
+from .explain import coincident, events_of, explain
+from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
@@ -41,12 +41,6 @@ _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
-# The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
-# monodromy up to this part of it. Doubled, half as much loss is noticed.
-_CONSERVED = 1e-6
-# The field one period later is the same up to this part of it, and up to this part of the states'
-# sizes in one period. Doubled, half as large an error of a stated period is noticed.
-_SAME_FIELD, _SAME_REST = 1e-6, 1e-9
 # An event is due at the anchor if it would come within this part of the period. Doubled, guesses
 # twice as far from an event are refused.
 _DUE = 1e-9
@@ -96,13 +90,15 @@ def find_limit_cycle(
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
         do not depend on units (under a JAX transformation, on the guess).
-    - `settings`: accuracy of the flow; 1e-12 by default.
+    - `settings`: accuracy of the flow, 1e-12 by default, and how many steps it may take, which
+        `linearize` takes over.
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
-    **Raises:** `DefinitionError` for bad arguments, `ComputationError` if no isolated cycle is
-    found: no convergence, an event or section that does not come, grazing, an equilibrium in
-    place of a cycle, or a singular J - I (there is a whole family of cycles, from a conserved
-    quantity or a symmetry; see `conserved`).
+    **Raises:** `DefinitionError` for bad arguments, and for functions that depend on time otherwise
+    than `system.period()` states; `ComputationError` if no isolated cycle is found: no
+    convergence, an event or section that does not come, events that coincide, grazing, an
+    equilibrium in place of a cycle, or a singular J - I (there is a whole family of cycles, from a
+    conserved quantity or a symmetry; see `conserved`).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
@@ -113,7 +109,7 @@ def find_limit_cycle(
         require_x64(system, guess, section, settings)
         check_system(system)
     s = Structure(system)
-    settings = Settings(rtol=LIMIT_CYCLE, atol=LIMIT_CYCLE) if settings is None else settings
+    settings = (Settings() if settings is None else settings).filled(LIMIT_CYCLE)
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     check_section(s, section)
@@ -140,6 +136,9 @@ def find_limit_cycle(
             None if period is None else float(period),
         )  # fmt: skip
         settings = _in_sizes(settings, s, near.sizes | given)
+        charts = np.arange(len(s.charts))
+        times = np.full(len(charts), float(np.asarray(lane.t)[0]))
+        check_times(system, times, charts, near.points.T, settings.scale, near.time)
         max_period = _PATIENCE * near.time if max_period is None else max_period
         anchor, base, expected = begin(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
@@ -149,18 +148,20 @@ def find_limit_cycle(
     map = dataclasses.replace(map, conserved=conserved)
     if traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
-    _check_values(system, map.anchor, conserved)
+    s.resolve_outputs(tuple(conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     map, solution = _in_own_sizes(map, _solve(map), given)
-    codes = np.ravel(solution.turn.codes)
-    cycle = _cycle(map, solution, tuple(int(g) for g in codes if g >= 0))
-    code = Result(int(cycle.result))
+    if int(solution.result) == Result.OK and coincident(solution.turn):
+        solution = solution._replace(result=jax.device_put(np.int32(Result.COINCIDENCE)))
+    cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
+    code, legs = Result(int(cycle.result)), to_host(cycle.legs)
+    check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         if cycle.clocked:
-            _check_clock(cycle)
+            _check_begin(cycle)
         if conserved:
-            _check_conserved(cycle)
+            check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(_explain(cycle, code))
+        raise ComputationError(explain(cycle, solution.turn, float(map.expected)))
     return cycle
 
 
@@ -243,89 +244,22 @@ def _check_fits(
         )
 
 
-def _check_values(system: HybridSystem, anchor: Lanes, conserved: Mapping[str, Array]) -> None:
-    s = Structure(system)
-    s.resolve_outputs(tuple(conserved)).require(int(np.asarray(anchor.chart)[0]))
-
-
-def _check_conserved(cycle: LimitCycle) -> None:
-    """Raise where a quantity that should be conserved is not."""
-    lost = [name for name in cycle.conserved if name not in _kept(cycle, tuple(cycle.conserved))]
-    if lost:
-        raise DefinitionError(
-            f"'{lost[0]}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
-            "cycle change it in one turn. Leave it out of `conserved`."
-        )
-
-
-def _kept(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
-    """Those outputs that are conserved near the cycle, with their values: their gradients are left
-    eigenvectors of the monodromy."""
-    cycle = to_host(cycle)
-    s, t = Structure(cycle.system), cycle.anchor.t
-    a = int(cycle.anchor.chart[0])
-    n = s.dims[a]
-    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.settings.scale[a, :n]
-    items = tuple(s.resolve_outputs(names).items)
-    seen = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
-    values, gradients = seen[:, 0], seen[:, 2 : 2 + n]
-    changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= _CONSERVED * np.abs(gradients * sizes).max(axis=1)
-    return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
-
-
-def _check_clock(cycle: LimitCycle) -> None:
-    """Raise where the cycle of a clocked system is not what it seems to be."""
-    s, system = Structure(cycle.system), cycle.system
-    anchor = to_host(cycle.anchor)
-    a, t = int(anchor.chart[0]), float(anchor.t[0])
-    f, later, guards, rates = jax.device_get(_at_anchor(cycle))
-    f, later = f[: s.dims[a]], later[: s.dims[a]]
-    slow = np.asarray(cycle.settings.scale)[a, : s.dims[a]] / float(cycle.period)
-    if np.any(np.abs(later - f) > _SAME_FIELD * np.abs(f) + _SAME_REST * slow):
-        raise ComputationError(
-            f"the field of chart '{s.names[a]}' does not have the period {float(cycle.period):.6g} "
-            f"that {type(system).__name__}.period() states: at t = {t:.6g} it is {f}, one period "
-            f"later {later}."
-        )
+def _check_begin(cycle: LimitCycle) -> None:
+    """Raise where the cycle of a clocked system begins at an event."""
+    guards, rates = jax.device_get(_at_anchor(cycle))
     due = (rates < 0) & (np.abs(guards) <= -_DUE * float(cycle.period) * rates)
     if due.any():
+        name = Structure(cycle.system).transitions[int(np.argmax(due))].name
         raise ComputationError(
-            f"the search begins exactly at the event '{s.transitions[int(np.argmax(due))].name}', "
-            "which may or may not belong to the turn: give a guess at another time."
+            f"the search begins exactly at the event '{name}', which may or may not belong to the "
+            "turn: give a guess at another time."
         )
 
 
 @host_first
 def _at_anchor(cycle: LimitCycle):
-    """The field at the anchor (d,) and one period later, the guards there (G,) and their rates."""
+    """The guards (G,) at the anchor, and their rates."""
     s, anchor, xp = Structure(cycle.system), cycle.anchor, namespace(cycle.period)
-    u, later = xp.zeros((s.nu, 1)), anchor.t + cycle.period
-    f = [slopes(s, t, anchor.chart, anchor.q, u)[:, 0] for t in (anchor.t, later)]
+    u = xp.zeros((s.nu, 1))
     seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
-    return *f, seen.value[:-1, 0], seen.rate[:-1, 0]
-
-
-def _explain(cycle: LimitCycle, code: Result) -> str:
-    name = type(cycle.system).__name__
-    if code == Result.SINGULAR:
-        kept = _kept(cycle, tuple(output.name for output in cycle.system.outputs()))
-        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {"energy": 1.0}
-        return (
-            f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
-            "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
-            "is wanted by the value of the quantity (an output of the system), e.g. "
-            f"`conserved={example}`, or take the one nearest to the guess with "
-            "`throw=False`."
-        )
-    reason = code.message
-    if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
-        reason = "Newton came to a state from where one period ends in another chart"
-    elif code == Result.NOT_CONVERGED:
-        reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
-        if cycle.conserved:
-            reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
-    return (
-        f"no limit cycle of {name} was found: {reason}. Try a better guess, or let it settle first "
-        "if the cycle is stable, e.g. `settle=60 * period`."
-    )
+    return seen.value[:-1, 0], seen.rate[:-1, 0]

@@ -25,15 +25,11 @@ from ..sections.crossing import AtEvent, Crossing
 from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from ..systems.transition import Scheduled
 
 
 # A guess lies on the section if it would meet it within this part of the time in which the states
 # change by their sizes. Doubled, the search begins at guesses that are twice as far from it.
 _ON_SECTION = 1e-6
-# A schedule divides the clock's period if the quotient is this near to a whole number. Doubled,
-# turns that differ twice as much from the last one are taken for equal.
-_WHOLE = 1e-6
 
 
 class _Plane(eqx.Module):
@@ -77,22 +73,6 @@ def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
     q = np.zeros((s.d, 1))
     q[: s.dims[a], 0] = guess.state
     return from_host(start_lanes(s, np.array([guess.time]), np.array([a], np.int32), q))
-
-
-def check_clock(system: HybridSystem) -> None:
-    """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
-    s = Structure(system)
-    period = None if system.period() is None else float(system.period())
-    if period is not None and not (np.isfinite(period) and period > 0):
-        raise DefinitionError(f"the clock's period must be positive; it is {period}.")
-    for transition in s.transitions:
-        if isinstance(transition.guard, Scheduled):
-            ratio = np.inf if period is None else period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < _WHOLE:
-                raise DefinitionError(
-                    f"the schedule of '{transition.name}' must divide the clock's period, which is "
-                    f"{period}: otherwise no turn is like the last one."
-                )
 
 
 def check_section(s: Structure, section: Crossing | AtEvent | None) -> None:
@@ -158,7 +138,10 @@ def begin(
         target = toward(np.full(1, np.inf), event, np.asarray(lanes.t) + max_period)
         moved = _go(system, lanes, section, target, settings)
         where = "through the guess, across the flow" if by_default else str(section)
-        _require(moved, f"{doing} ({where})", s, _other_section(s) if by_default else "")
+        advice = _other_section(s) if by_default else ""
+        if moved.result[0] == Result.SECTION_MISSED:
+            advice += f"Or allow more time than {max_period:.3g}, by `max_period`. "
+        _require(moved, f"{doing} ({where})", s, advice)
         return moved.lanes
 
     if not on_section:

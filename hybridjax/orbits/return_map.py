@@ -78,6 +78,8 @@ class Turn(NamedTuple):
     direction of the flow."""
     codes: Int[Array, "K R"] | None
     """Events of each piece, by index of the transition; negative where there is none."""
+    times: Float[Array, "K R"] | None
+    """When they happened."""
     period: Float[Array, ""]
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
@@ -166,7 +168,7 @@ class ReturnMap(eqx.Module):
             )
             return moved, None
 
-        there, _ = self._round(q, flow)
+        there, _ = self.travel(q, flow)
         return there
 
     def turn_with_jacobian(
@@ -204,9 +206,9 @@ class ReturnMap(eqx.Module):
                 column = _derivative(end)[:, None]
                 last = jnp.zeros((1, n + 1)).at[0, n].set(1.0)
                 factor = jnp.concatenate([jnp.concatenate([factor, column], axis=1), last])
-            return moved, (lanes, factor, tape.code)
+            return moved, (lanes, factor, tape.code, tape.t)
 
-        there, (legs, factors, codes) = self._round(q, flow)
+        there, (legs, factors, codes, times) = self.travel(q, flow)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
         codes, product = codes[..., 0], monodromy(factors)
         off, by_state = self.held(q)
@@ -220,8 +222,8 @@ class ReturnMap(eqx.Module):
             factors = self._across(legs, factors)
         defect = xp.abs(there.residual) + xp.abs(off)
         return Turn(
-            there.residual, jacobian, by_parameter, legs, factors, codes, there.period,
-            xp.max(defect / self.sizes), there.result, self._meetings(legs, codes),
+            there.residual, jacobian, by_parameter, legs, factors, codes, times[..., 0],
+            there.period, xp.max(defect / self.sizes), there.result, self._meetings(legs, codes),
         )  # fmt: skip
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
@@ -280,7 +282,7 @@ class ReturnMap(eqx.Module):
     def _with(self, system: HybridSystem) -> "ReturnMap":
         return dataclasses.replace(self, system=system)
 
-    def _round(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
+    def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
         """One turn, piece by piece, each done by `flow`, and what `flow` returned besides."""
         targets, xp = self._leg_targets(), namespace(q)
         each, common = eqx.partition(targets, _per_lane(targets))

@@ -50,6 +50,8 @@ class GuessSizes(NamedTuple):
     time: float
     """In which the states change by their sizes: one over the rate of the fastest mode, or over the
     clock's if that is faster."""
+    points: Float[np.ndarray, "A d"]
+    """A state in every chart that resets lead to; NaN in the others."""
 
 
 def sizes_near(
@@ -78,7 +80,7 @@ def sizes_near(
         turn, time = period, min(time, period / (2 * np.pi))
     size = np.abs(near.q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
     floor = _floor(seen, turn).reshape(s.d, n, R).max(axis=1)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, floor)), time)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, floor)), time, points)
 
 
 def sizes_on(

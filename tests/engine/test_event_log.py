@@ -75,7 +75,12 @@ def test_lanes_that_fail():
     lanes = start_lanes(s, jnp.zeros(3), jnp.zeros(3, jnp.int32), q)
     moved = jax.jit(
         lambda lanes: move(
-            s, lanes, jnp.zeros((1, 3)), until(jnp.full(3, 5.0)), Settings(), event_log=4
+            s,
+            lanes,
+            jnp.zeros((1, 3)),
+            until(jnp.full(3, 5.0)),
+            Settings(1e-10, 1e-10),
+            event_log=4,
         )
     )(lanes)
     assert moved.result.tolist() == [hj.Result.ZENO, hj.Result.BAD_INPUT, hj.Result.OK]

@@ -231,3 +231,11 @@ def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     error = np.abs(data.y[:, :, 0] + data.cycle_outputs[:, 0] - true).max(axis=1) / size
     assert np.ptp(true) > 0.1 * size  # the inputs do something
     assert np.all(error <= data.error) and np.all(data.error < 1e-8)
+
+
+def test_sections_that_are_too_far_apart_for_the_steps_allowed(hopper_cycle, monkeypatch):
+    monkeypatch.setattr("hybridjax.experiments.stepping.plan.PATIENCE", 3)
+    settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
+    cycle = dataclasses.replace(hopper_cycle, settings=settings)
+    with pytest.raises(hj.ComputationError, match="from section 0 to .*limit on steps .*max_steps"):
+        hj.run_experiments(cycle, hj.ClockPhase(3), np.zeros((1, 6, 1)), "yM", discard=0)

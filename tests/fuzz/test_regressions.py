@@ -19,6 +19,9 @@ from ..toys import Field
 from .campaign import check
 
 
+SETTINGS = Settings(1e-10, 1e-10)
+
+
 class Threshold(hj.HybridSystem):
     """x' = -1, with an event where x + u falls through zero: the input moves the guard."""
 
@@ -87,7 +90,7 @@ def two_pieces(x, first, second):
     )
     h = None
     for end, u in ((1.0, first), (2.0, second)):
-        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), Settings(), h)
+        moved = move(s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h)
         lanes, h = moved.lanes, moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 
@@ -120,7 +123,7 @@ def across(x, time, duration):
     s = Structure(Rounded(-0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))))
     lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
     u = jnp.zeros((1, 1))
-    moved = move(s, lanes, u, until(t + duration), Settings())
+    moved = move(s, lanes, u, until(t + duration), SETTINGS)
     return moved.result[0], moved.lanes.events[0]
 
 
@@ -157,7 +160,7 @@ def around(level, width, other):
         s, t, q = Structure(Layer(*numbers)), jnp.zeros(1), jnp.array([[1.0], [0.0]])
         span = jnp.asarray(2.9)
         lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
-        moved, tape = record(s, lanes, jnp.zeros((1, 1)), until(t + span), Settings())
+        moved, tape = record(s, lanes, jnp.zeros((1, 1)), until(t + span), SETTINGS)
         first = jnp.argmax(tape.code[:, 0] >= 0)
         return moved.result[0], moved.lanes.events[0], tape.t[first, 0]
 

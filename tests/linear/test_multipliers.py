@@ -151,6 +151,14 @@ def test_structural_zeros_are_counted_not_guessed():
     assert len(product_eigenvalues([np.diag([1.0, 0.0])] * 10, RTOL)) == 1
 
 
+def test_products_that_leave_the_range_of_numbers():
+    tiny = np.diag([1.0, 1e-200])
+    huge = np.diag([1.0, 1e150])
+    found = product_eigenvalues([tiny, tiny, huge, huge, tiny, huge], 0.0)
+    np.testing.assert_allclose(found, [1, 1e-150], rtol=1e-12, atol=0)
+    np.testing.assert_array_equal(product_eigenvalues([tiny, tiny], 0.0), [1, 0])
+
+
 def test_defective_and_cyclic_products():
     jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
     np.testing.assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)

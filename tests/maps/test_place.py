@@ -1,5 +1,7 @@
 """Sections on a cycle: of every kind, and every way in which they can be wrong."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -207,3 +209,11 @@ def test_outputs_of_any_kind_and_feedthrough(hopper_cycle, placed_isochrons, iso
     flight = np.asarray(ldtp.dims) == 4
     np.testing.assert_allclose(ldtp.C[flight, 1], [[-5.0, 0.0, 5.0, 0.0]] * flight.sum())
     np.testing.assert_allclose(ldtp.C[~flight, 1], [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum())
+
+
+def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
+    monkeypatch.setattr("hybridjax.maps.place.PATIENCE", 3)
+    settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
+    cycle = dataclasses.replace(hopper_cycle, settings=settings)
+    with pytest.raises(hj.ComputationError, match="max_steps.* Give them to the search for the cy"):
+        hj.place_sections(cycle, hj.ClockPhase(2))

@@ -61,6 +61,16 @@ def test_the_hopper_after_settling(reference):
     assert cycle.iterations <= 2
 
 
+def test_settings_that_say_nothing_of_accuracy(hopper_cycle):
+    """They leave each call its own."""
+    more_steps = hj.Settings(max_steps=512)
+    assert repr(more_steps) == "Settings(max_steps=512)"
+    cycle = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, settings=more_steps)
+    assert cycle.settings.rtol == cycle.settings.atol == 1e-12 and cycle.settings.max_steps == 512
+    loose = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, settings=hj.Settings(rtol=1e-8))
+    assert loose.settings.rtol == 1e-8 and loose.settings.atol == 1e-12
+
+
 def test_the_lossy_hopper(lossy_cycle):
     state = [1.87978886663710, 1.75832736962547]
     np.testing.assert_allclose(lossy_cycle.anchor.q[:2, 0], state, atol=1e-10)

@@ -51,7 +51,7 @@ def test_a_schedule_that_does_not_fit_the_clock():
 
 
 def test_a_period_that_the_field_does_not_have():
-    with pytest.raises(hj.ComputationError, match="does not have the period 1"):
+    with pytest.raises(hj.DefinitionError, match="does not have the period 1"):
         hj.find_limit_cycle(Forced(), hj.Guess("a", (0.0,)))
 
 

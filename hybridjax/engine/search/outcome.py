@@ -24,6 +24,9 @@ from .state import Approach, State, Task
 # Steps below this part of the time allowed (in double and in single precision) are not taken: the
 # lane is stuck. Twice as much gives up one halving earlier.
 _SHORTEST_STEP = 1e-13, 1e-6
+# A lane that is stuck blows up if its largest state changes by more than this part in that step:
+# otherwise its field jumps. Any number between rounding and a tenth tells the two apart.
+_STILL = 1e-3
 # Attempts to land on a crossing before the step in which it was seen is halved. More of them only
 # cost time where the cubic interpolant is no guide to the crossing.
 _LANDING_TRIES = 8
@@ -155,6 +158,8 @@ def eventfully(
     stuck = (too_long | refine | lost) & (h < at_precision(*_SHORTEST_STEP) * task.span)
     graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
     result = update_result(state.result, graze, Result.GRAZING)
+    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
+    result = update_result(result, stuck & still, Result.STEP_COLLAPSE)
     result = update_result(result, stuck, Result.BLOW_UP)
     result = update_result(result, zeno, Result.ZENO)
     result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)

@@ -22,6 +22,7 @@ from ...engine.move import move
 from ...engine.search.stride import Stride
 from ...engine.settings import Settings
 from ...engine.watch import watch
+from ...errors import ComputationError
 from ...maps.place import PATIENCE
 from ...maps.placed import PlacedSections
 
@@ -96,6 +97,8 @@ def make_plan(
     """Find the cheapest way between sections that keeps the accuracy asked for.
 
     **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
+
+    **Raises:** `ComputationError` where no way arrives.
     """
     N = placed.n_sections
     placed = to_host(placed)
@@ -110,6 +113,14 @@ def make_plan(
         error[..., 0] = 0.0
     impact = np.maximum(_impact(J, error, scale), _ROUNDING)
     impact = np.where(np.isnan(impact), np.inf, impact)
+    lost = ~np.isfinite(impact).any(axis=0)
+    if lost.any():
+        k = int(np.argmax(lost))
+        raise ComputationError(
+            f"experiments cannot go from section {k} to {placed.family.describe((k + 1) % N)}: "
+            "the limit on steps is reached even on the cycle. Place more sections, or find the "
+            "cycle with `settings=Settings(max_steps=...)`."
+        )
     estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 
     # The largest share of the accuracy for each section that keeps their sum.
@@ -253,7 +264,8 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
 
     def make() -> Stepping:
         cycle = placed.cycle
-        settings = Settings(accuracy, accuracy, PATIENCE, cycle.settings.scale)
+        patience = max(PATIENCE, cycle.settings.max_steps)
+        settings = Settings(accuracy, accuracy, patience, cycle.settings.scale)
         time = np.full((placed.n_sections, 1), float(cycle.period))
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)

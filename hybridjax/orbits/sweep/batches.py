@@ -287,7 +287,7 @@ def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
     def one(system, anchor, expected):
         own = _own(map, system, anchor, expected)
         turn = own.turn_with_jacobian(own.anchor.q[:, 0], wanted)
-        return own.anchor, own.expected, turn._replace(codes=None), turn.codes.ravel()
+        return own.anchor, own.expected, turn._replace(codes=None, times=None), turn.codes.ravel()
 
     return eqx.filter_vmap(one)(systems, anchor, period)
 

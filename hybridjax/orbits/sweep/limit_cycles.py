@@ -159,7 +159,7 @@ def find_limit_cycles(
     arrays, rest = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
-    settings = Settings(rtol=SWEEP, atol=SWEEP) if settings is None else settings
+    settings = (Settings() if settings is None else settings).filled(SWEEP)
     s = Structure(guess.system)
     known = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))

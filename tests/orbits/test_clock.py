@@ -1,0 +1,113 @@
+"""Functions of time need a clock, and the period that it states."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..toys import Field, Paddle
+
+
+class Oscillator(hj.HybridSystem):
+    """Van der Pol's oscillator with a force that is a function of (t, x)."""
+
+    force: object = eqx.field(static=True)
+    beat: float | None = None
+
+    def charts(self):
+        def field(t, q, u):
+            x, v = q
+            return v, (1 - x**2) * v - x + self.force(t, x)
+
+        return {"a": Field(("x", "v"), field)}
+
+    def period(self):
+        return self.beat
+
+
+class Unclocked(Paddle):
+    def period(self):
+        return None
+
+
+class WrongPaddle(Paddle):
+    def period(self):
+        return 1.1
+
+
+def find(system, x=2.0, v=0.0):
+    return hj.find_limit_cycle(system, hj.Guess("a", (x, v)))
+
+
+def test_a_forgotten_period_of_the_field():
+    with pytest.raises(hj.DefinitionError, match="field of chart 'a' depends on t, .* no period"):
+        find(Oscillator(lambda t, x: 0.5 * jnp.cos(1.3 * t)))
+
+
+def test_a_dependence_on_time_that_the_guess_does_not_show():
+    with pytest.raises(hj.DefinitionError, match="field of chart 'a' depends on t"):
+        find(Oscillator(lambda t, x: 0.1 * x * jnp.cos(1.3 * t)), 0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    "system, message",
+    [
+        (Unclocked(), "guard of 'impact' depends on t, but Unclocked states no period"),
+        (WrongPaddle(), "guard of 'impact' does not have the period 1.1"),
+    ],
+)
+def test_guards(system, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.find_limit_cycle(system, hj.Guess("air", (0.1, 4.7), 0.1))
+
+
+def test_resets():
+    class Flickering(Paddle):
+        """Its paddle stands still, and throws as hard as the time of day wants."""
+
+        def transitions(self):
+            reset = lambda t, q, u: (q[0], -q[1] + jnp.sin(t))  # noqa: E731
+            return (hj.Transition("impact", "air", "air", lambda t, q, u: q[0], reset=reset),)
+
+        def period(self):
+            return None
+
+    with pytest.raises(hj.DefinitionError, match="reset of 'impact' depends on t"):
+        hj.find_limit_cycle(Flickering(), hj.Guess("air", (0.1, 4.7)))
+
+
+def test_schedules():
+    class Ticking(Oscillator):
+        def transitions(self):
+            return (hj.Transition("tick", "a", "a", hj.Scheduled(1.0)),)
+
+    with pytest.raises(hj.DefinitionError, match="'tick' is scheduled, but Ticking states no per"):
+        find(Ticking(lambda t, x: 0.0))
+
+
+def test_time_that_makes_no_difference():
+    """Its period is that of the oscillator alone, from an integration in 34 digits."""
+    cycle = find(Oscillator(lambda t, x: 0.0 * t + jnp.sin(t) ** 2 + jnp.cos(t) ** 2 - 1))
+    np.testing.assert_allclose(cycle.period, 6.66328685932313, rtol=1e-9)
+
+
+def test_a_force_that_jumps_with_the_clock():
+    """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
+
+    class Square(hj.HybridSystem):
+        def charts(self):
+            force = lambda t: jnp.where(t % 1.0 < 0.5, 1.0, 0.0)  # noqa: E731
+            return {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
+
+        def transitions(self):
+            return (hj.Transition("half", "a", "a", hj.Scheduled(0.5)),)
+
+        def period(self):
+            return 1.0
+
+    cycle = hj.find_limit_cycle(Square(), hj.Guess("a", (0.3,), 0.25))
+    x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
+    x = 1 + (x - 1) * np.exp(-0.25)
+    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-6)
