@@ -128,7 +128,8 @@ def close(
     """
     arrays, rest = eqx.partition((system, outputs, levels), eqx.is_array)
     numbers, structure = jax.tree_util.tree_flatten(arrays)
-    s, array = Structure(system), jax.ShapeDtypeStruct
+    s, real = Structure(system), jnp.result_type(float)
+    array = jax.ShapeDtypeStruct
 
     def program(function: Callable, *arguments: jax.ShapeDtypeStruct) -> Program:
         def run(numbers, *arguments):
@@ -138,7 +139,7 @@ def close(
         return Program(run, numbers, *arguments)
 
     def at(a: int) -> tuple[jax.ShapeDtypeStruct, ...]:
-        return array((), float), array((s.dims[a],), float), array((s.nu,), float)
+        return array((), real), array((s.dims[a],), real), array((s.nu,), real)
 
     def chart(a: int) -> _Chart:
         field = program(lambda s, z, levels, *x: s.field(a, *x), *at(a))
@@ -166,7 +167,7 @@ def close(
         if levels is None or not levels.present(s, a):
             return None
         function = lambda s, z, levels, i, t, q: levels.level(s, a, i, t, q)  # noqa: E731
-        return program(function, array((), int), *at(a)[:2])
+        return program(function, array((), jnp.result_type(int)), *at(a)[:2])
 
     charts = range(len(s.charts))
     closed = _Closed(

@@ -15,8 +15,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import quick_jit
-from hybridjax.experiments import campaign, flow_batch
+from hybridjax._core.compilation import stored
+from hybridjax._core.compilation.portable import build
 
 from ..conftest import OUTPUTS, no_compilation
 from ..orbits import hopper_scipy
@@ -171,26 +171,30 @@ def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isoc
         hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS, **BATCH)
 
 
-@pytest.mark.parametrize("small", (True, False))
-def test_the_program_that_is_compiled_ahead_is_the_one_that_runs(
-    hopper_cycle, placed_isochrons, monkeypatch, small
+def test_one_program_serves_all_plans_parameters_and_cycles(
+    hopper_cycle, placed_isochrons, monkeypatch
 ):
-    traced = []
-
-    def counted(*arguments):
-        traced.append(1)
-        return flow_batch.flow_batch(*arguments)
-
-    programs = {True: quick_jit(counted), False: eqx.filter_jit(counted)}
-    monkeypatch.setattr(campaign, "_FLOW", programs)
-    monkeypatch.setattr(campaign, "_SMALL", campaign._SMALL * small)
+    built = []
+    monkeypatch.setattr(stored, "build", lambda *x: (built.append(1), build(*x))[1])
     u = np.zeros((2, 32, 1))
     for accuracy in (1e-7, 1e-8):  # a plan of its own for each
-        data = hj.run_experiments(
+        hj.run_experiments(
             hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0, accuracy=accuracy
         )
-        assert data.ok.all()
-    assert len(traced) == 1
+    other = hj.find_limit_cycle(hj.models.VerticalHopper(k=9.5))
+    hj.run_experiments(other, placed_isochrons.family, u, OUTPUTS, discard=0)
+    assert len(built) <= 1
+
+
+def test_responses_of_users_functions_and_of_their_programs_are_the_same(
+    hopper_cycle, placed_isochrons
+):
+    """What `run_experiments` computes from programs, `response_function` computes from classes."""
+    u = 0.1 * np.random.default_rng(0).standard_normal((2, 64, 1))
+    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0)
+    y = hj.response_function(hopper_cycle, placed_isochrons, OUTPUTS)(u).y
+    y = np.asarray(y).reshape(data.y.shape[0], -1, *data.cycle_outputs.shape) - data.cycle_outputs
+    np.testing.assert_allclose(data.y, y.reshape(data.y.shape), atol=1e-12)
 
 
 @hypothesis.settings(max_examples=15)

@@ -22,6 +22,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from ..vector_math import rewrite
+
 
 _PACKAGE = __name__.partition(".")[0]
 # Objects of JAX in the parameters of equations that their names and `repr` describe.
@@ -100,7 +102,7 @@ def surroundings() -> str:
         if not any(word in name for word in _ASIDE)
     }
     settings = sorted((name, repr(value)) for name, value in values.items())
-    return digest(_installed(), settings, os.environ.get("XLA_FLAGS", ""))
+    return digest(_installed(), settings, os.environ.get("XLA_FLAGS", ""), rewrite.is_enabled())
 
 
 @ft.cache

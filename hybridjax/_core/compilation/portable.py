@@ -10,6 +10,7 @@ import jax.export
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
+from ..executor import Array
 from .fingerprint import IndescribableError
 
 
@@ -41,7 +42,7 @@ class Executable:
         self._compiled = compiled
         self._structure = structure
 
-    def __call__(self, *arrays: jax.Array) -> Any:
+    def __call__(self, *arrays: Array) -> Any:
         results = iter(self._compiled(*arrays))
         return jax.tree_util.tree_map(lambda _: next(results), self._structure)
 
@@ -66,7 +67,7 @@ class Executable:
         return Executable(compiled, structure)
 
 
-def trace(function: Callable, arrays: list[jax.Array]) -> Portable:
+def trace(function: Callable, arrays: list[Array]) -> Portable:
     """`function(*arrays)` as a program.
 
     **Raises:** `IndescribableError` for one that another process could not compile.

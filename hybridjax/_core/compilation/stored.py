@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 
 from ..device import on_cpu
+from ..executor import Array
 from ..progress import say_compiling
 from ..tracing import is_inside_program, is_traced
 from . import compilation_cache, thorough
@@ -100,7 +101,7 @@ class _Known:
             return self._find("thorough") or self._make("thorough", traced, {})
         return found or self._find("quick") or self._make("quick", traced, compiler_options())
 
-    def run(self, program: Executable, arrays: list[jax.Array]) -> Any:
+    def run(self, program: Executable, arrays: list[Array]) -> Any:
         begin = time.perf_counter()
         results = jax.block_until_ready(program(*arrays))
         if program is self._programs.get("quick"):

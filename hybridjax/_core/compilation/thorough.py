@@ -52,13 +52,18 @@ def _end(process: subprocess.Popen, owner: int) -> None:
         process.wait()
 
 
-def _end_with_parent() -> None:
-    os.read(0, 1)  # returns when the other end is closed
-    os._exit(1)
+def watch_parent() -> None:
+    """End this process when the one that started it ends."""
+
+    def watch():
+        os.read(0, 1)  # returns when the other end is closed
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def main(folder: str, traced: str, compiled: str) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    watch_parent()
     with contextlib.suppress(AttributeError):  # Windows has no such thing
         os.nice(10)
     store = ProgramStore(pathlib.Path(folder))

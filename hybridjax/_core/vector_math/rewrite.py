@@ -58,6 +58,10 @@ def enable_vector_math(enabled: bool = True) -> None:
         jax.clear_caches()
 
 
+def is_enabled() -> bool:
+    return _enabled
+
+
 def vectorized(function: Callable) -> Callable:
     """`function` with the functions of `trigonometry` in place of those of `jnp`.
 
