@@ -138,7 +138,11 @@ class Campaign:
         )
 
     def _cycle_outputs(self) -> Float[np.ndarray, "N ny"]:
-        return np.asarray(self.placed.observe(self.outputs.items))
+        items = tuple(self.outputs.items)
+        look = lambda: np.asarray(self.placed.observe(items))  # noqa: E731
+        # (An `Output` may be another one at every call.)
+        named = all(isinstance(item, str) for item in items)
+        return _observed.recall(self.placed, items, look) if named else look()
 
     def _cycle_log(self) -> IntervalEvents:
         """The events of one period of the limit cycle, by the same steps as in experiments."""
@@ -230,6 +234,8 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
         )
 
 
+# States of the cycle at its sections, by their names.
+_observed = Memory()
 _courses = Memory()
 
 

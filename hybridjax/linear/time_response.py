@@ -84,11 +84,11 @@ def periodic_states(
     xp, periods, identity = namespace(A), u.shape[1], np.eye(A.shape[-1])
     # What enters at a section reaches the end of the period through the factors after it.
     phi, after = scan(lambda P, factor: (P @ factor, P), xp.asarray(identity), A[::-1])
-    w = xp.einsum("nij,spnj->spi", after[::-1] @ B, u)
+    w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    x = xp.linalg.solve(resolvent, xp.fft.fft(w, axis=1)[..., None])
-    return xp.mean(x[..., 0], axis=1).real
+    x = xp.linalg.solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
+    return xp.mean(x, axis=0).real.T
 
 
 @jax.jit

@@ -68,7 +68,7 @@ def _program(function, static, structure, rest):
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
     """x with so many lanes, those beyond L copies of its first."""
     if x.shape[-1] == 1:
-        return np.repeat(x, filled, axis=-1)
+        return x.repeat(filled, axis=-1)
     if filled == L:
         return x
     return np.concatenate([x, np.repeat(x[..., :1], filled - L, axis=-1)], axis=-1)

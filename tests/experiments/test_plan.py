@@ -1,0 +1,39 @@
+"""The plan of experiments: the host and XLA find the same ways between sections."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core.compilation import compile
+from hybridjax.engine.settings import Settings
+from hybridjax.experiments.stepping import plan
+from hybridjax.maps.place import PATIENCE
+
+from ..conftest import APEX
+
+
+KINEMATIC = hj.KinematicPhase(
+    7, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
+)
+FAMILIES = {"VerticalHopper": KINEMATIC}
+SLOW = ("BuckConverter", "CompassGait", "Mathieu", "PaddleJuggler", "TwoLeggedBar", "VanDerPol")
+
+
+@pytest.mark.parametrize(
+    "name", [*FAMILIES, *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW)]
+)
+def test_host_and_program_try_the_same_ways(name, monkeypatch):
+    cycle = hj.find_limit_cycle(getattr(hj.models, name)())
+    placed = hj.place_sections(cycle, FAMILIES.get(name, hj.ClockPhase(7)))
+    settings = Settings(1e-9, 1e-9, PATIENCE, cycle.settings.scale)
+    sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
+    scale = np.concatenate([np.full((7, 1), float(cycle.period)), sizes], axis=1)
+    host = plan._try_ways(placed, settings, scale)
+    monkeypatch.setattr(compile, "_WORTH_COMPILING", -1.0)
+    xla = plan._try_ways(placed, settings, scale)
+    after = np.roll(scale, -1, axis=0).T[:, None]
+    np.testing.assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)
+    # Estimates are differences in which the digits of small ones cancel.
+    np.testing.assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
+    for one in ("first", "slack", "lead"):
+        np.testing.assert_allclose(getattr(host, one), getattr(xla, one), rtol=1e-12)
