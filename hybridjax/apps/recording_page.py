@@ -1,6 +1,7 @@
 """What was found in a recording, as one page that needs no other file."""
 
 import html
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -23,6 +24,7 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 1rem auto
 h2 { font-size: 1.25rem; margin: 2rem 0 .5rem; } p { margin: .5rem 0; }
 .table { overflow-x: auto; } table { border-collapse: collapse; margin: .5rem 0; }
 th, td { padding: .2rem .8rem; border-bottom: 1px solid #ddd; text-align: right; }
+td { white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 .main { font-size: 1.1rem; } .main strong { display: block; } .main span { font-size: 1rem; }
 dl { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .5rem 1rem;
@@ -121,14 +123,14 @@ def _summary(found: Identification) -> list[str]:
             _with_units(found)[len(data.inputs) :],
         )
     ]
-    left = "".join(f"<li>{_safe(x)}</li>" for x in left_out(found) + _assumed(found.recording))
+    left = "".join(f"<li>{_sentence(x)}</li>" for x in left_out(found) + _assumed(found.recording))
     return [
         "<h1>Floquet multipliers from a recording</h1>",
         f"<p>{_safe(', '.join(t.name for t in trials))}: from {_safe(names[0])} to "
         f"{_safe(names[1])}, {data.n_sections} sections per cycle.</p>",
         *_multipliers(found),
         f"<dl>{listed}</dl>",
-        *(f'<p class="warn">{_safe(w)}</p>' for w in found.advice.warnings),
+        *(f'<p class="warn">{_sentence(w)}</p>' for w in found.advice.warnings),
         *([] if found.advice.warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
         f"<p>Left out, and assumed:</p><ul>{left}</ul>" if left else "<p>Nothing was left out.</p>",
         "<p>A multiplier says what is left of a deviation from the average cycle one cycle later. "
@@ -247,6 +249,11 @@ def _assumed(recording: Recording) -> list[str]:
 
 def _safe(text: str) -> str:
     return html.escape(text)
+
+
+def _sentence(text: str) -> str:
+    """With names of arguments, which stand between backticks, as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", _safe(text))
 
 
 def _percent(share: float) -> str:
