@@ -55,10 +55,13 @@ def gradient_covariance(
             score += np.einsum("bkid,bki->bd", slopes, error)
             expected += np.einsum("bkid,bkie->bde", slopes, slopes)
             for basis in (inputs, starts):
-                taken = np.einsum("bkr,bkid->brid", basis, slopes)
-                expected -= np.einsum("brid,brie->bde", taken, taken)
+                along = np.einsum("bkr,bkid->brid", basis, slopes)
+                expected -= np.einsum("brid,brie->bde", along, along)
     # In units in which white noise makes the sum one.
-    half = np.linalg.inv(np.linalg.cholesky(expected.sum(axis=0)))
+    try:
+        half = np.linalg.inv(np.linalg.cholesky(expected.sum(axis=0)))
+    except np.linalg.LinAlgError:  # nothing is left of any block
+        return Covariance.unknown(d)
     score, share = score @ half.T, half @ expected @ half.T
     sum_of_squares = score.T @ score
     # Scores add up to zero at the minimum, which takes this part of the sum away.

@@ -233,19 +233,16 @@ def _section_noise(found: Linearization) -> Float[np.ndarray, "N ny"]:
 def _covariance(
     problem: OutputErrorProblem, c: Coefficients, found: Linearization, errors: str, loss: Loss
 ) -> Covariance:
-    """Of c, by cycles, which may depend on their neighbors."""
-    d = len(c)
+    """Of c, by blocks of cycles, which may depend on their neighbors."""
     price = efficiency(problem, found, loss)
     rng = np.random.default_rng(0)
     probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.sampled[..., None]
     noise = linearize(problem, c, probes * price.noise[:, None]).jacobian
     noise = np.einsum("istnac,jstnac,a->ij", noise, noise, price.curvature) / _PROBES
-    by_output = np.einsum("istnac,jstnac->astij", found.jacobian, found.jacobian)
-    parts = by_output.sum(axis=0)
-    square = parts.sum(axis=(0, 1))
-    curvature = np.einsum("astij,a->ij", by_output, price.curvature) - noise
-    if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
-        return sandwich(curvature, np.einsum("astij,a->ij", by_output, price.variance))
+    by_output = np.einsum("istnac,jstnac->aij", found.jacobian, found.jacobian)
+    curvature = np.einsum("aij,a->ij", by_output, price.curvature) - noise
+    if errors == "white" or not np.linalg.eigvalsh(by_output.sum(axis=0))[0] > 0:
+        return sandwich(curvature, np.einsum("aij,a->ij", by_output, price.variance))
     lags = correlated_cycles(multipliers_of(c), problem.y.shape[1])
     gradient = gradient_covariance(problem, c, found, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)

@@ -65,7 +65,7 @@ class SectionRegression(NamedTuple):
 
     @property
     def input_basis(self) -> Float[np.ndarray, "S T k"]:
-        """Orthonormal basis of the weighted rows of the inputs, less what starts and drift explain."""
+        """Orthonormal basis of `remainder`, in the same rows."""
         return (self.remainder @ self.root).reshape(*self.basis.shape[:2], -1)
 
     @property
