@@ -130,21 +130,22 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=500, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=PHASES):
+def coverage(seeds=400, strides=300, noise=1e-4, chunk=50, n_sections=16, first=20000):
     print(
         f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
     )
-    for name in phases:
-        hits, found, said = [], [], []
-        for first in range(0, seeds, chunk):
-            recordings, true = hopper(strides, range(1000 + first, 1000 + first + chunk))
-            for seed, recording in enumerate(recordings, first):
-                data = at_sections(noisy(recording, noise, seed), name, n_sections)
-                fit = hj.fit_series(data.records, 2, check=False)
+    tallies = {name: ([], [], []) for name in PHASES}
+    for done in range(0, seeds, chunk):
+        recordings, true = hopper(strides, range(first + done, first + done + chunk))
+        for seed, recording in enumerate(recordings, first + done):
+            dirty = noisy(recording, noise, seed)
+            for name, (hits, found, said) in tallies.items():
+                fit = hj.fit_series(at_sections(dirty, name, n_sections).records, 2, check=False)
                 hits.append(bool(fit.contains(true[:1])[0]))
                 found.append(distance(fit.multipliers, true))
                 said.append(fit.standard_errors[0])
+        for name, (hits, found, said) in tallies.items():
             p = stats.binomtest(sum(hits), len(hits), 0.95).pvalue
             print(
                 f"{name}: {sum(hits)} of {len(hits)} ({100 * np.mean(hits):.1f} %), p = {p:.2g}; "

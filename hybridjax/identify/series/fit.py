@@ -12,10 +12,11 @@ from ..._core.results import Result
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
-from ..multipliers.covariance import Covariance, correlated_cycles, sandwich, serial_covariance
+from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
 from ..multipliers.denominator import Denominator, multipliers_of
 from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
+from .cycle_blocks import gradient_covariance
 from .cycle_grid import CycleGrid
 from .output_error import Linearization, OutputErrorProblem, linearize
 from .robust import (
@@ -42,12 +43,6 @@ _MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
 # Smallest noise of an output in the units of the moment: rounding. Doubled: outputs without noise
 # count half as much beside noisy ones.
 _ROUNDING = 1e-15
-# Smallest share of its own error that the fit leaves to a sample, so that dividing by it stays
-# finite. Doubled: samples that the fit all but passes through weigh half as much.
-_SMALLEST_REMAINDER = 1e-3
-# Largest correction of a covariance for the freedom that the minimum takes: to 1 / 0.5. Doubled:
-# none.
-_SMALLEST_FREEDOM = 0.5
 
 
 @checked
@@ -85,9 +80,9 @@ def fit_series(
       linear beyond, or the likelihood of Student's distribution with 4 degrees of freedom
       (iteratively reweighted, standard deviations from the median). `noise` is then that of the
       normal errors with which squares would be as accurate.
-    - `errors`: what the covariance is computed from. "residuals": from the misfit cycle by
-      cycle, so that it holds also where noise of successive cycles is dependent (process noise),
-      with Parzen's weights. "white": from its size alone.
+    - `errors`: what the covariance is computed from. "residuals": from the misfit of blocks of
+      successive cycles, so that it holds also where their errors depend on each other (process
+      noise) and on the inputs (distortion). "white": from its size alone.
     - `distortion`: whether to allow for a part of the response of second order, with squares only;
       None: if that explains more than half of the misfit, and lowers the standard errors by 10 % or
       more.
@@ -238,33 +233,19 @@ def _section_noise(found: Linearization) -> Float[np.ndarray, "N ny"]:
 def _covariance(
     problem: OutputErrorProblem, c: Coefficients, found: Linearization, errors: str, loss: Loss
 ) -> Covariance:
-    """Of c, by cycles, which may depend on their neighbors."""
-    d = len(c)
+    """Of c, by blocks of cycles, which may depend on their neighbors."""
     price = efficiency(problem, found, loss)
     rng = np.random.default_rng(0)
     probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.sampled[..., None]
     noise = linearize(problem, c, probes * price.noise[:, None]).jacobian
     noise = np.einsum("istnac,jstnac,a->ij", noise, noise, price.curvature) / _PROBES
-    by_output = np.einsum("istnac,jstnac->astij", found.jacobian, found.jacobian)
-    parts = by_output.sum(axis=0)
-    square = parts.sum(axis=(0, 1))
-    curvature = np.einsum("astij,a->ij", by_output, price.curvature) - noise
-    if errors == "white" or not np.linalg.eigvalsh(square)[0] > 0:
-        return sandwich(curvature, np.einsum("astij,a->ij", by_output, price.variance))
-    # The fit takes a share of each error, which makes it smaller; this makes it as large again on
-    # average (HC2 of MacKinnon and White 1985: HC3 would make it too large by that share).
-    left = np.maximum(1 - found.leverage, _SMALLEST_REMAINDER)
-    error = found.residual / np.sqrt(left)[..., None]
-    score = np.einsum("jstnic,stnic->stj", found.jacobian, error)
+    by_output = np.einsum("istnac,jstnac->aij", found.jacobian, found.jacobian)
+    curvature = np.einsum("aij,a->ij", by_output, price.curvature) - noise
+    if errors == "white" or not np.linalg.eigvalsh(by_output.sum(axis=0))[0] > 0:
+        return sandwich(curvature, np.einsum("aij,a->ij", by_output, price.variance))
     lags = correlated_cycles(multipliers_of(c), problem.y.shape[1])
-    gradient = serial_covariance(score, lags)
-    # The scores add up to zero at the minimum, which takes this part of their covariance away.
-    half = np.linalg.inv(np.linalg.cholesky(square))
-    share = np.einsum("ij,stjk,lk->stil", half, parts, half).reshape(*parts.shape[:2], d * d)
-    taken = np.trace(serial_covariance(share, lags).matrix)
-    corrected = gradient.matrix / max(1 - taken / d, _SMALLEST_FREEDOM)
-    own = share[..., :: d + 1]  # the diagonals
-    return sandwich(curvature, corrected)._replace(freedom=gradient.freedom(own))
+    gradient = gradient_covariance(problem, c, found, lags + 1)
+    return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
 
 
 def _require_signals(grid: CycleGrid) -> None:

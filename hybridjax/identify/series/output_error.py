@@ -8,6 +8,7 @@ where g is free in the first cycles of each record: it stands for inputs and out
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +119,17 @@ class Linearization(NamedTuple):
         )
 
 
+def section_regressions(
+    problem: OutputErrorProblem, c: Coefficients, v: Float[np.ndarray, "S T N nu"], n: int
+) -> Iterator[tuple[list[int], SectionRegression]]:
+    """Those of section n, and the outputs that each is for; `v`: the inputs over chi."""
+    inputs = lagged_inputs(v, n, problem.lags, problem.lead) @ problem.to_lags[n]
+    T = problem.y.shape[1]
+    starts = start_responses(c, problem.first[:, n], T, min(problem.free, T))
+    for weight, outputs in weighted_alike(problem.weight[:, :, n]):
+        yield outputs, SectionRegression.make(inputs, starts, problem.drift, weight)
+
+
 def linearize(
     problem: OutputErrorProblem,
     c: Coefficients,
@@ -144,10 +156,7 @@ def linearize(
 
     def section(n: int) -> None:
         to_lags = problem.to_lags[n]
-        inputs = lagged_inputs(v, n, problem.lags, problem.lead) @ to_lags
-        starts = start_responses(c, problem.first[:, n], T, min(problem.free, T))
-        for weight, outputs in weighted_alike(problem.weight[:, :, n]):
-            regression = SectionRegression.make(inputs, starts, problem.drift, weight)
+        for outputs, regression in section_regressions(problem, c, v, n):
             shape = (len(outputs), y.shape[4])
             x = y[:, :, n, outputs].reshape(S, T, -1)
             a, left = regression.solve(x)

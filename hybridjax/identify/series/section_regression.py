@@ -64,10 +64,14 @@ class SectionRegression(NamedTuple):
         return int((self.weight > 0).sum()) - int(round(float(used)))
 
     @property
+    def input_basis(self) -> Float[np.ndarray, "S T k"]:
+        """Orthonormal basis of `remainder`, in the same rows."""
+        return (self.remainder @ self.root).reshape(*self.basis.shape[:2], -1)
+
+    @property
     def leverage(self) -> Float[np.ndarray, "S T"]:
         """The share of its own error that the fit takes from each sample."""
-        own = ((self.remainder @ self.root) ** 2).sum(axis=1)
-        return (self.basis**2).sum(axis=2) + own.reshape(self.basis.shape[:2])
+        return (self.basis**2).sum(axis=2) + (self.input_basis**2).sum(axis=2)
 
     def solve(
         self, x: Float[np.ndarray, "S T C"]
