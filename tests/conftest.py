@@ -1,5 +1,15 @@
 import contextlib
+import os
 import pathlib
+import tempfile
+
+
+# Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
+# that wait for each other cost ten times the work, and XLA reports each cached program.
+os.environ.update(OPENBLAS_NUM_THREADS="1", TF_CPP_MIN_LOG_LEVEL="3")
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _programs = tempfile.TemporaryDirectory()
+    os.environ["HYBRIDJAX_CACHE"] = _programs.name
 
 import hypothesis
 import jax
@@ -12,6 +22,7 @@ from hybridjax._core.compilation import compile
 
 
 hj.enable_x64()
+hj.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
 hypothesis.settings.register_profile("untimed", hypothesis.settings.default, deadline=None)
 hypothesis.settings.load_profile("untimed")
 

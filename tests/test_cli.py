@@ -32,10 +32,8 @@ def test_help_does_not_import_jax(arguments):
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
-        options = ["--quick", "--out", str(out), "--param", "M=2.0", "--formats", "png,svg"]
-        assert main(["reproduce", *options]) == 0
+    options = ["--quick", "--out", str(out), "--param", "M=2.0", "--formats", "png,svg"]
+    assert main(["reproduce", *options]) == 0
     return out
 
 
@@ -98,8 +96,7 @@ def test_reproduce_draws_its_figures(results):
         (["--quick", "--keep", "36"], "leaves no cycle to discard"),
     ],
 )
-def test_bad_input_is_one_sentence(tmp_path, monkeypatch, arguments, message):
-    monkeypatch.setattr("hybridjax.apps.reproduce.enable_compilation_cache", lambda: None)
+def test_bad_input_is_one_sentence(tmp_path, arguments, message):
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new" / "er"), *arguments])
     assert message in str(error.value) and "\n" not in str(error.value)

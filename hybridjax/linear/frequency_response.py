@@ -1,12 +1,13 @@
-"""The exact harmonic transfer functions of an LDTP system, as one compiled computation."""
+"""The exact harmonic transfer functions of an LDTP system, for the host and for XLA."""
 
 from collections.abc import Iterable
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import Scalar, Vector
+from .._core.compilation.compile import host_first
+from .._core.executor import Array, namespace, scan
 from ..errors import DefinitionError
 from .time_response import monodromy
 
@@ -45,7 +46,7 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     return integers
 
 
-@jax.jit
+@host_first
 def harmonic_transfer(
     A: Float[Array, "N d d"],
     B: Float[Array, "N d nu"],
@@ -64,18 +65,17 @@ def harmonic_transfer(
 
     **Returns:** `H` with harmonic `m` at index `m mod N` (the order of the FFT).
     """
-    n_sections, d, _ = A.shape
-    identity = jnp.eye(d, dtype=A.dtype)
-    z = jnp.exp(2j * jnp.pi / n_sections * jnp.arange(n_sections)[:, None] * f)
-    z_N = jnp.exp(2j * jnp.pi * f)
+    xp, (n_sections, d, _) = namespace(A), A.shape
+    z = xp.exp(2j * np.pi / n_sections * np.arange(n_sections)[:, None] * f)
+    z_N = xp.exp(2j * np.pi * f)
 
     def advance(X, section):
         A, B, z = section
         return A @ X + z[:, None, None] * B, X
 
-    start = jnp.zeros((f.size, d, B.shape[-1]), z.dtype)
-    forced, _ = jax.lax.scan(advance, start, (A, B, z))
-    start = jnp.linalg.solve(z_N[:, None, None] * identity - monodromy(A), forced)
-    _, X = jax.lax.scan(advance, start, (A, B, z))
+    start = xp.zeros((f.size, d, B.shape[-1]), z.dtype)
+    forced, _ = scan(advance, start, (A, B, z))
+    start = xp.linalg.solve(z_N[:, None, None] * np.eye(d) - monodromy(A), forced)
+    _, X = scan(advance, start, (A, B, z))
     G = C[:, None] @ X / z[:, :, None, None] + D[:, None]
-    return jnp.fft.fft(G, axis=0) / n_sections
+    return xp.fft.fft(G, axis=0) / n_sections

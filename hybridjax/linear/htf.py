@@ -6,7 +6,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.interpolate import CubicSpline, make_interp_spline
 
 from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Complexes, Reals
@@ -194,6 +193,8 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if a frequency lies in a gap more than twice as wide as the
         widest step between the frequencies given (or outside them all).
         """
+        from scipy.interpolate import CubicSpline, make_interp_spline  # (a quarter of a second)
+
         if is_traced(self.f, self.H, f):
             raise DefinitionError("`interpolate` works on the host, not inside jit or derivatives.")
         wanted = np.atleast_1d(f)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from scipy import stats
+from scipy import special
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import PeriodCount, Probability
@@ -123,6 +123,6 @@ class MultiplierEstimate(eqx.Module):
     def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""
         if np.isinf(self.covariance_freedom):
-            return stats.chi2.ppf(level, degrees)
+            return 2 * special.gammaincinv(degrees / 2, level)
         rest = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
-        return degrees * self.covariance_freedom / rest * stats.f.ppf(level, degrees, rest)
+        return degrees * self.covariance_freedom / rest * special.fdtri(degrees, rest, level)
