@@ -1,4 +1,4 @@
-"""Equations become MathML, which browsers show without scripts or fonts of the site's own."""
+"""Equations become MathML, which browsers show without scripts."""
 
 import html
 import re
