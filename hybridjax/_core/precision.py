@@ -77,7 +77,7 @@ def single(tree: Any) -> Any:
         if not eqx.is_array(x):
             return x
         x = np.asarray(x)
-        return jnp.asarray(x.astype(narrow.get(x.dtype.kind, x.dtype)))
+        return jax.device_put(x.astype(narrow.get(x.dtype.kind, x.dtype)))
 
     return jax.tree_util.tree_map(convert, tree)
 

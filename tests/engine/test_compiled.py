@@ -16,8 +16,8 @@ SECTIONS, EXPERIMENTS, PERIODS = 7, 3, 5
 FAMILY = hj.KinematicPhase(
     SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
-# Kernels, programs, and what JAX is asked about itself. Then the hopper's period, which is 2 pi over
-# a parameter, and arguments of the program that is compiled while the plan is made.
+# Kernels, programs, and what JAX is asked about itself. Then the hopper's period, which is 2 pi
+# over a parameter, and arguments of the program that is compiled while the plan is made.
 NAMED = {"run", "_bind_program", "flow_batch", "settle_batch", "_constant", "<lambda>"}
 NAMED |= {"true_divide", "stage"}
 

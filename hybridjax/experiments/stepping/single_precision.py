@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._core.compilation.compile import quick_jit
+from ..._core.executor import from_host
 from ..._core.memo import Memory
 from ..._core.precision import single, single_precision
 from ..._core.results import Result
@@ -52,7 +53,7 @@ def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
     half = plan_flow(placed, accuracy / 2)
     # No step is made shorter because of what rounding leaves in its error estimate.
     noise = _ROUNDINGS_PER_STEP * float(jnp.finfo(jnp.float32).eps) / half.settings.rtol
-    slack = jnp.maximum(half.plan.slack, noise)
+    slack = from_host(np.maximum(half.plan.slack, noise))
     rough = dataclasses.replace(half, plan=dataclasses.replace(half.plan, slack=slack))
     rounding = _known.recall(placed, accuracy, lambda: rounding_error(placed, rough))
     if rounding > accuracy / 2:
@@ -82,7 +83,7 @@ def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:
     aside = _DISTANCE * np.random.default_rng(0).standard_normal((_LANES, N, n))
     # Where time is no state, it is that of the section, as it is in each precision.
     start = np.where(moves, np.float32(cycle + scale * aside), cycle)
-    arguments = placed, stepping.plan, stepping.settings, jnp.asarray(start.reshape(-1, n).T)
+    arguments = placed, stepping.plan, stepping.settings, from_host(start.reshape(-1, n).T)
     exact = np.asarray(_sections(*arguments))
     with single_precision():
         rounded = np.asarray(_sections(*single(arguments)), float)
