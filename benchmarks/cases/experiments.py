@@ -9,6 +9,7 @@ import functools as ft
 import json
 import sys
 
+from hybridjax.experiments import campaign
 from peers.contest import Contest, Seconds
 
 from .children import call
@@ -24,6 +25,7 @@ PEERS = (
 
 
 def run(show, options) -> None:
+    campaign._LARGE = 0  # the programs that jobs find after a while
     names = ["c", "heyoka", "scipy"] + ["jaxonomy"] * (options.jaxonomy is not None)
     for model, family in ALL:
         seen = {}
@@ -96,6 +98,7 @@ def main(model: str, family: str, repeat: str, quick: str) -> None:
 
     hj.enable_loop_kernels()
     hj.enable_x64()
+    campaign._LARGE = 0
     found = {}
     _runs(problem(model, family, bool(int(quick))), "loops", found.__setitem__, int(repeat))
     print(json.dumps(found))

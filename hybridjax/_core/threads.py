@@ -1,6 +1,5 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
-import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -41,16 +40,6 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     with ThreadPoolExecutor(_cores() if alone else 1) as pool:
         running = [pool.submit(copy_context().run, work, item) for item in items]
         return [one.result() for one in running]
-
-
-@contextlib.contextmanager
-def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
-    """A context during which `work` is done in a thread of its own, under the caller's
-    configuration of JAX. It ends when both have ended, and raises what `work` raised."""
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(_configured(work))
-        yield
-        running.result()
 
 
 def _cores() -> int:
