@@ -9,8 +9,9 @@ import functools as ft
 import json
 import sys
 
-from hybridjax.experiments import campaign
 from peers.contest import Contest, Seconds
+
+from hybridjax.experiments import campaign
 
 from .children import call
 from .problems import ALL, Problem, first_and_later, problem, program
