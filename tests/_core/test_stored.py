@@ -121,6 +121,7 @@ def test_what_cannot_be_loaded_is_made_again(made, tmp_path, mishap):
 
 
 def test_what_is_used_is_compiled_thoroughly_for_the_next_job(made, beside, monkeypatch):
+    monkeypatch.setattr(stored, "_WORTH_A_PROCESS", 100.0)
     job = Stored(twice, large=False)
     job(X, Y, 3)
     assert not beside
@@ -178,9 +179,11 @@ def test_threads_make_a_program_once(made):
 def test_a_forked_process_shares_no_lock_and_no_folder(monkeypatch):
     monkeypatch.setattr(compilation_cache, "_folder", None)
     before = stored._store().folder
-    stored._known("key").lock.acquire()
+    stored._programs["key"] = stored._Known("key")
+    stored._one_by_one.acquire()
     stored._forget()
-    assert stored._known("key").lock.acquire(timeout=0)
+    assert not stored._programs and stored._one_by_one.acquire(timeout=0)
+    stored._one_by_one.release()
     assert stored._store().folder != before
 
 
