@@ -55,9 +55,9 @@ def made(monkeypatch):
         made.append("traced")
         return trace(*arguments)
 
-    def building(program, options):
+    def building(program, options, kept):
         made.append("quick" if options else "thorough")
-        return build(program, options)
+        return build(program, options, kept)
 
     trace = stored.trace
     monkeypatch.setattr(stored, "trace", tracing)
@@ -72,7 +72,7 @@ def beside(monkeypatch):
     def start(folder, traced, compiled):
         started.append(compiled)
         store = ProgramStore(folder)
-        program = build(Portable.from_bytes(store.read(traced)), {})
+        program = build(Portable.from_bytes(store.read(traced)), {}, kept=True)
         store.write(compiled, program.to_bytes())
         process = subprocess.Popen([sys.executable, "-c", ""])
         process.wait()
@@ -105,6 +105,20 @@ def test_without_a_folder_nothing_outlives_the_process(made, monkeypatch):
     forget()
     check(Stored(twice, large=False)(X, Y, 3))
     assert made == ["traced", "quick", "quick"]
+
+
+def test_programs_come_from_one_cache_only(made, tmp_path):
+    """What JAX has loaded from its own cache on disk does not run if it is written once more."""
+    for _ in range(3):
+        check(Stored(twice, large=False)(X, Y, 3))
+        (path,) = (tmp_path / "programs").glob("*-quick")
+        path.unlink()
+        forget()
+    assert made == ["traced", "quick", "quick", "quick"]
+    check(Stored(twice, large=False)(X, Y, 3))
+    forget()
+    check(Stored(twice, large=False)(X, Y, 3))
+    assert len(made) == 5
 
 
 @pytest.mark.parametrize("mishap", [b"", b"no program", b"\x80\x04N."])

@@ -126,10 +126,11 @@ class _Known:
         return self._programs.get(tier)
 
     def _make(self, tier: str, traced, options) -> Executable:
-        with _compiling():
-            program = self._programs[tier] = build(self._traced(traced), options)
-            if compilation_cache.folder() is not None:
-                _store().write(self._name(tier), program.to_bytes())
+        kept = compilation_cache.folder() is not None
+        with _compiling(), _once() if kept else contextlib.nullcontext():
+            program = self._programs[tier] = build(self._traced(traced), options, kept)
+        if kept:
+            _store().write(self._name(tier), program.to_bytes())
         return program
 
     def _traced(self, traced) -> Portable:
@@ -185,6 +186,19 @@ def _forget() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
+
+
+@contextlib.contextmanager
+def _once() -> Iterator[None]:
+    """A context in which JAX writes no programs to its own cache."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    with _one_by_one:
+        before = getattr(jax.config, name)
+        jax.config.update(name, math.inf)
+        try:
+            yield
+        finally:
+            jax.config.update(name, before)
 
 
 @contextlib.contextmanager
