@@ -1,6 +1,7 @@
 """Nothing is read that may have been written by somebody else, or is damaged."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -88,6 +89,18 @@ def test_what_has_not_been_used_for_longest_goes(store, monkeypatch):
     store.write("three", DATA)
     store.write("four", DATA)
     assert sorted(path.name for path in store.folder.iterdir()) == ["four", "three", "two"]
+
+
+def test_whoever_writes_at_the_same_time_what_is_read_is_whole(store):
+    def write(k):
+        for _ in range(50):
+            store.write("one", bytes([k]) * (1000 * k))
+
+    with ThreadPoolExecutor(3) as pool:
+        writing = [pool.submit(write, k) for k in (1, 2, 3)]
+        while not all(one.done() for one in writing):
+            assert store.read("one") in (DATA, *(bytes([k]) * (1000 * k) for k in (1, 2, 3)))
+    assert [path.name for path in store.folder.iterdir()] == ["one"]
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):

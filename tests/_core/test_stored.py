@@ -55,9 +55,9 @@ def made(monkeypatch):
         made.append("traced")
         return trace(*arguments)
 
-    def building(program, options):
+    def building(program, options, kept):
         made.append("quick" if options else "thorough")
-        return build(program, options)
+        return build(program, options, kept)
 
     trace = stored.trace
     monkeypatch.setattr(stored, "trace", tracing)
@@ -72,7 +72,7 @@ def beside(monkeypatch):
     def start(folder, traced, compiled):
         started.append(compiled)
         store = ProgramStore(folder)
-        program = build(Portable.from_bytes(store.read(traced)), {})
+        program = build(Portable.from_bytes(store.read(traced)), {}, kept=True)
         store.write(compiled, program.to_bytes())
         process = subprocess.Popen([sys.executable, "-c", ""])
         process.wait()
@@ -107,6 +107,20 @@ def test_without_a_folder_nothing_outlives_the_process(made, monkeypatch):
     assert made == ["traced", "quick", "quick"]
 
 
+def test_programs_come_from_one_cache_only(made, tmp_path):
+    """What JAX has loaded from its own cache on disk does not run if it is written once more."""
+    for _ in range(3):
+        check(Stored(twice, large=False)(X, Y, 3))
+        (path,) = (tmp_path / "programs").glob("*-quick")
+        path.unlink()
+        forget()
+    assert made == ["traced", "quick", "quick", "quick"]
+    check(Stored(twice, large=False)(X, Y, 3))
+    forget()
+    check(Stored(twice, large=False)(X, Y, 3))
+    assert len(made) == 5
+
+
 @pytest.mark.parametrize("mishap", [b"", b"no program", b"\x80\x04N."])
 def test_what_cannot_be_loaded_is_made_again(made, tmp_path, mishap):
     check(Stored(twice, large=False)(X, Y, 3))
@@ -121,6 +135,7 @@ def test_what_cannot_be_loaded_is_made_again(made, tmp_path, mishap):
 
 
 def test_what_is_used_is_compiled_thoroughly_for_the_next_job(made, beside, monkeypatch):
+    monkeypatch.setattr(stored, "_WORTH_A_PROCESS", 100.0)
     job = Stored(twice, large=False)
     job(X, Y, 3)
     assert not beside
@@ -178,9 +193,11 @@ def test_threads_make_a_program_once(made):
 def test_a_forked_process_shares_no_lock_and_no_folder(monkeypatch):
     monkeypatch.setattr(compilation_cache, "_folder", None)
     before = stored._store().folder
-    stored._known("key").lock.acquire()
+    stored._programs["key"] = stored._Known("key")
+    stored._one_by_one.acquire()
     stored._forget()
-    assert stored._known("key").lock.acquire(timeout=0)
+    assert not stored._programs and stored._one_by_one.acquire(timeout=0)
+    stored._one_by_one.release()
     assert stored._store().folder != before
 
 

@@ -30,13 +30,3 @@ def test_cores_are_left_to_blas_unless_it_has_one_thread(monkeypatch, blas, core
 def test_errors_are_raised():
     with pytest.raises(ZeroDivisionError):
         threads.on_all_cores(lambda k: 1 / k, [1, 0])
-
-
-def test_what_runs_meanwhile_has_ended_with_its_context():
-    """And has raised its error there."""
-    done = []
-    with threads.meanwhile(lambda: done.append(threading.current_thread())):
-        pass
-    assert done and done != [threading.current_thread()]
-    with pytest.raises(ZeroDivisionError), threads.meanwhile(lambda: 1 / 0):
-        pass

@@ -178,14 +178,13 @@ def test_one_program_serves_all_plans_parameters_and_cycles(
     monkeypatch.setattr(stored, "build", lambda *x: (built.append(1), build(*x))[1])
     u = np.zeros((2, 32, 1))
     for accuracy in (1e-7, 1e-8):  # a plan of its own for each
-        hj.run_experiments(
-            hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0, accuracy=accuracy
-        )
+        hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0, accuracy=accuracy)
     other = hj.find_limit_cycle(hj.models.VerticalHopper(k=9.5))
     hj.run_experiments(other, placed_isochrons.family, u, OUTPUTS, discard=0)
     assert len(built) <= 1
 
 
+@pytest.mark.slow
 def test_responses_of_users_functions_and_of_their_programs_are_the_same(
     hopper_cycle, placed_isochrons
 ):

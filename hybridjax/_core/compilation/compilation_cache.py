@@ -23,6 +23,8 @@ def folder() -> pathlib.Path | None:
 def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
     """Keep compiled programs on disk, so that the next process starts faster.
 
+    What XLA says about programs that it loads is not shown from then on.
+
     **Arguments:** `folder`, by default `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache
     folder (`$XDG_CACHE_HOME` or `~/.cache`).
 

@@ -19,8 +19,9 @@ def enable_loop_kernels() -> None:
     XLA otherwise makes a function of every few operations in a loop, and calls one after the other
     whenever the loop goes round: up to half of the time of an experiment. With whole loops,
     experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long, since large
-    functions do (docs/benchmarks.md has figures). So it pays for long computations, the more so
-    with `enable_compilation_cache()`. Results are the same up to rounding.
+    functions do (docs/benchmarks.md has figures). So it pays for long computations of your own,
+    around `response_function`; `run_experiments` has such programs made where they pay. Results are
+    the same up to rounding.
 
     Call it before JAX computes anything: XLA reads its options once. It concerns all programs of
     JAX in this process and in those that it starts, by the environment variable `XLA_FLAGS`. On

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import uuid
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -87,8 +88,9 @@ def trace(function: Callable, arrays: list[Array]) -> Portable:
     )
 
 
-def build(program: Portable, options: dict[str, Any]) -> Executable:
-    """Compile a program, with these options of the compiler."""
+def build(program: Portable, options: dict[str, Any], kept: bool) -> Executable:
+    """Compile a program, with these options of the compiler. It can be written if it is to be
+    `kept`."""
     shapes = _shapes(program.arguments)
     # (JAX's own form for files needs one more library.)
     blank = jax.jit(lambda *_: [jnp.zeros(shape, kind) for shape, kind in program.results])
@@ -97,7 +99,14 @@ def build(program: Portable, options: dict[str, Any]) -> Executable:
         mlir_module_serialized=program.code,
         module_kept_var_idx=program.kept,
     )
-    lowered = jax.jit(exported.call).lower(*shapes)
+
+    def run(*arrays):
+        return exported.call(*arrays)
+
+    # What was loaded from JAX's own cache on disk cannot be written once more (it would not run):
+    # no program there has this name.
+    run.__name__ = f"program_{uuid.uuid4().hex}" if kept else "program"
+    lowered = jax.jit(run).lower(*shapes)
     return Executable(lowered.compile(compiler_options=options), program.structure)
 
 

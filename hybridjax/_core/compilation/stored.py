@@ -9,6 +9,7 @@ import atexit
 import contextlib
 import functools as ft
 import logging
+import math
 import os
 import pathlib
 import shutil
@@ -64,13 +65,14 @@ class Stored:
             return self._function(*eqx.combine(structure.unflatten(leaves), rest))
 
         try:
-            known = _known(digest(self._function, surroundings(), arguments))
-            if known.key not in self._chosen:
-                with known.lock, uncollected:
-                    self._chosen[known.key] = known.choose(lambda: trace(flat, leaves), self._large)
+            key = digest(self._function, surroundings(), arguments)
+            known = _programs.setdefault(key, _Known(key))
+            with known.lock, uncollected:
+                if key not in self._chosen:
+                    self._chosen[key] = known.choose(lambda: trace(flat, leaves), self._large)
         except IndescribableError:
             return self._plain(arguments)
-        return known.run(self._chosen[known.key], leaves)
+        return known.run(self._chosen[key], leaves)
 
     def _plain(self, arguments):
         program = _plain_program(self._function, self._large)
@@ -107,7 +109,7 @@ class _Known:
         if program is self._programs.get("quick"):
             with self.lock:
                 self._seconds += time.perf_counter() - begin
-                if self._seconds > _WORTH_A_PROCESS and self._process is None:
+                if self._seconds > _WORTH_A_PROCESS:
                     self._start()
         return results
 
@@ -124,10 +126,11 @@ class _Known:
         return self._programs.get(tier)
 
     def _make(self, tier: str, traced, options) -> Executable:
-        with _compiling():
-            program = self._programs[tier] = build(self._traced(traced), options)
-            if compilation_cache.folder() is not None:
-                _store().write(self._name(tier), program.to_bytes())
+        kept = compilation_cache.folder() is not None
+        with _compiling(), _once() if kept else contextlib.nullcontext():
+            program = self._programs[tier] = build(self._traced(traced), options, kept)
+        if kept:
+            _store().write(self._name(tier), program.to_bytes())
         return program
 
     def _traced(self, traced) -> Portable:
@@ -151,6 +154,7 @@ class _Known:
     def _start(self) -> None:
         names = self._name("traced"), self._name("thorough")
         self._process = thorough.start(_store().folder, *names)
+        self._seconds = -math.inf  # once is enough, whatever becomes of it
 
     def _name(self, what: str) -> str:
         return f"{self.key}-{what}"
@@ -158,10 +162,6 @@ class _Known:
 
 _programs: dict[str, _Known] = {}
 _one_by_one = threading.Lock()
-
-
-def _known(key: str) -> _Known:
-    return _programs.setdefault(key, _Known(key))
 
 
 def _store() -> ProgramStore:
@@ -186,6 +186,19 @@ def _forget() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
+
+
+@contextlib.contextmanager
+def _once() -> Iterator[None]:
+    """A context in which JAX writes no programs to its own cache."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    with _one_by_one:
+        before = getattr(jax.config, name)
+        jax.config.update(name, math.inf)
+        try:
+            yield
+        finally:
+            jax.config.update(name, before)
 
 
 @contextlib.contextmanager

@@ -69,7 +69,7 @@ def main(folder: str, traced: str, compiled: str) -> None:
     store = ProgramStore(pathlib.Path(folder))
     program = store.read(traced)
     if program is not None:
-        store.write(compiled, build(Portable.from_bytes(program), {}).to_bytes())
+        store.write(compiled, build(Portable.from_bytes(program), {}, kept=True).to_bytes())
 
 
 if __name__ == "__main__":
