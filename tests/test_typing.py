@@ -133,8 +133,8 @@ UNCHECKED = {
     },
     "the package's own": {
         "Plan.stride", "ReturnMap.at_phase_of", "ReturnMap.departure", "ReturnMap.held",
-        "ReturnMap.judge", "ReturnMap.sizes_in", "ReturnMap.turn", "ReturnMap.turn_with_jacobian",
-        "Structure", "Winding.when",
+        "ReturnMap.judge", "ReturnMap.sizes_in", "ReturnMap.travel", "ReturnMap.turn",
+        "ReturnMap.turn_with_jacobian", "Structure", "Winding.when",
     },
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "EventTimes",

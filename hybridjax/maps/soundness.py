@@ -37,22 +37,17 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
         if isinstance(placed.family.anchor, Crossing):
             raise ComputationError(
                 f"the cycle has no point where {placed.family.anchor} (the anchor of section 0): "
-                f"{Result(first).message}."
+                f"{_reason(first)}"
             )
-        raise ComputationError(
-            f"{describe(0)} is not reached on the cycle: {Result(first).message}."
-        )
+        raise ComputationError(f"{describe(0)} is not reached on the cycle: {_reason(first)}")
     for i, code in enumerate(np.asarray(placed.result)):
         if code != Result.OK:
-            reason = Result(int(code)).message
             hint = ""
             if code == Result.SECTION_MISSED:
                 hint = " Does it lie on an event of the cycle? Then move it a little."
-            elif code == Result.STEP_LIMIT:
-                hint = " Give them to the search for the cycle, or place more sections."
             raise ComputationError(
                 f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: "
-                f"{reason}.{hint}"
+                f"{_reason(int(code))}{hint}"
             )
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
@@ -92,6 +87,11 @@ def refuse_unsound(placed: PlacedSections, first: int) -> None:
                 f"{describe(i)} is crossed {counts[i]} times in one period; a section must be "
                 "crossed once. Restrict it to a chart, or choose another phase."
             )
+
+
+def _reason(code: int) -> str:
+    hint = " Give them to the search for the cycle, or place more sections."
+    return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
 
 
 def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
