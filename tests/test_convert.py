@@ -1,5 +1,7 @@
 """Other libraries get the same numbers, and give them back."""
 
+import pathlib
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -9,8 +11,11 @@ import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 from hybridjax.experiments.events import EventTimes
 
+from .test_readme import BLOCK, same_output
+
 
 convert = hj.convert
+PAGE = pathlib.Path(__file__).parents[1] / "docs" / "interop.md"
 N = 5
 
 
@@ -117,7 +122,6 @@ def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():
 
 
 def test_scipy(model):
-    f = np.linspace(0.01, 0.49, 7)
     system = convert.to_scipy(model, period=2.0)
     assert system.dt == 2.0
     lti = convert.to_lti(model)
@@ -206,7 +210,7 @@ def test_section_data(rhythm_data):
     dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
     np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
     np.testing.assert_array_equal(frame["time"], data.times[0])
-    np.testing.assert_array_equal(frame["section"][:3], data.records[0].first_section + np.arange(3))
+    np.testing.assert_array_equal(frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8)
     average = dataset.average_cycle.sel(signal="x").values
     np.testing.assert_array_equal(average, data.cycle_outputs[:, 0])
 
@@ -254,3 +258,13 @@ def test_what_is_refused(model, monkeypatch):
         monkeypatch.setitem(__import__("sys").modules, name, None)
         with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"):
             call(model)
+
+
+def test_the_session_of_the_page_prints_what_it_shows(capsys):
+    for name in ("control", "xarray", "pandas"):
+        pytest.importorskip(name)
+    blocks = BLOCK.findall(PAGE.read_text())
+    (code,) = (text for kind, text in blocks if kind == "python")
+    (shown,) = (text for kind, text in blocks if kind == "text")
+    exec(compile(code, PAGE.name, "exec"), {"__name__": "session"})
+    assert same_output(shown, capsys.readouterr().out)

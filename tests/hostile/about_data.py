@@ -319,7 +319,12 @@ def recordings(t):
         "read_recording",
         lambda paths, **k: hj.read_recording(paths, **k),
         dict(paths="nope.csv"),
-        {"paths": [*PATH, "nope.csv", "nope.docx"], "time": NEW_NAME, "units": UNITS, "signals": optional(NAMES)},
+        {
+            "paths": [*PATH, "nope.csv", "nope.docx"],
+            "time": NEW_NAME,
+            "units": UNITS,
+            "signals": NEW_NAMES,
+        },
     )
     pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
     tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
