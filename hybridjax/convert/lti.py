@@ -52,7 +52,7 @@ def to_lti(model: LDTP) -> LDTP:
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
     (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
-    first = d if is_traced(model.dims) else int(model.dims[0])
+    first = d if is_traced(model.dims) else int(np.asarray(model.dims)[0])
     return LDTP(
         A[None, :first, :first],
         B.reshape(1, d, N * nu)[:, :first],

@@ -76,8 +76,7 @@ def read_design(path: str | os.PathLike) -> dict[str, Float[np.ndarray, "S n"]]:
 
     **Raises:** `FileFormatError` if it is no such table, or has experiments of different lengths.
     """
-    (columns, *_) = read_tables(Path(path), Wanted("time"))
-    columns = columns.values
+    columns = read_tables(Path(path), Wanted("time"))[0].values
     needed = ("experiment", "cycle", "section", "phase")
     if not set(needed) <= set(columns):
         raise FileFormatError(f"'{path}' has no columns {', '.join(needed)}: no table by phase.")

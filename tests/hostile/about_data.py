@@ -55,6 +55,7 @@ def calls(t):
     yield from recordings(t)
     yield from testing(t)
     yield from files(t)
+    yield from conversions(t)
 
 
 def estimates(t):
@@ -223,6 +224,9 @@ def recordings(t):
     yield "Recording.join", hj.Recording.join, dict(recordings=[t.recording]), {
         "recordings": [None, 3, "x", [], [3], [t.recording, None], t.recording, Other()],
     }  # fmt: skip
+    yield "Recording.beside", hj.Recording.beside, dict(recordings=[t.recording]), {
+        "recordings": [None, 3, "x", [], [3], [t.recording] * 2, t.recording, Other()],
+    }  # fmt: skip
     rises, angle = hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v")
     yield "Recording.mark", t.recording.mark, dict(event="e", crossing=rises), {
         "event": NEW_NAME, "bandwidth": [None, "1", 1j, NAN, 0.0, -1.0, True, Other()],
@@ -315,7 +319,12 @@ def recordings(t):
         "read_recording",
         lambda paths, **k: hj.read_recording(paths, **k),
         dict(paths="nope.csv"),
-        {"paths": [*PATH, "nope.csv", "nope.docx"], "time": NEW_NAME, "units": UNITS},
+        {
+            "paths": [*PATH, "nope.csv", "nope.docx"],
+            "time": NEW_NAME,
+            "units": UNITS,
+            "signals": NEW_NAMES,
+        },
     )
     pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
     tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
@@ -364,4 +373,16 @@ def files(t):
     yield "load", hj.load, dict(path="thing.npz"), {"path": [*PATH, "thing.npz"]}
     yield "write_report", hj.write_report, dict(folder="report", found=t.found), {
         "folder": PATH, "found": instance(t.fit),
+    }  # fmt: skip
+
+
+def conversions(t):
+    other, period = [*instance(t.record), "x", [t.model]], {"period": POSITIVE}
+    yield "to_lti", hj.convert.to_lti, dict(model=t.model), {"model": other}
+    yield "to_scipy", hj.convert.to_scipy, dict(model=t.model), {"model": other} | period
+    yield "to_control", hj.convert.to_control, dict(thing=t.model), {"thing": other} | period
+    yield "to_xarray", hj.convert.to_xarray, dict(thing=t.model), {"thing": [None, 3, "x", Other()]}
+    yield "to_pandas", hj.convert.to_pandas, dict(thing=t.fit), {"thing": [None, 3, "x", t.model]}
+    yield "from_xarray", hj.convert.from_xarray, dict(dataset=hj.convert.to_xarray(t.model)), {
+        "dataset": [None, 3, "x", t.model, {}, Other()],
     }  # fmt: skip

@@ -51,6 +51,13 @@ def test_fold_and_flip_of_the_juggler(juggling):
         again = hj.find_limit_cycle(cycle.system, cycle)
         np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
+    pytest.importorskip("xarray")
+    pytest.importorskip("pandas")
+    dataset, frame = hj.convert.to_xarray(branch), hj.convert.to_pandas(branch)
+    np.testing.assert_array_equal(dataset["A"], branch.values)
+    np.testing.assert_array_equal(dataset["multipliers"], branch.multipliers)
+    assert list(frame[frame["kind"] != ""].index) == [x.index for x in branch.points]
+
 
 def test_neimark_sacker_of_the_juggler(juggling):
     """The product of the multipliers is the restitution's square: 1 where nothing is lost."""

@@ -47,6 +47,17 @@ def test_failures_are_reported_by_index(found):
     assert found.summary().startswith("4/5 found; #4: ")
 
 
+def test_other_libraries_get_them_all(found):
+    pytest.importorskip("xarray")
+    pytest.importorskip("pandas")
+    dataset, frame = hj.convert.to_xarray(found), hj.convert.to_pandas(found)
+    np.testing.assert_array_equal(dataset["k"], found.systems.k)
+    assert dataset["k"].dims == ("system",)
+    np.testing.assert_array_equal(dataset["multipliers"], found.multipliers)
+    np.testing.assert_array_equal(frame["multipliers.1"], found.multipliers[:, 1])
+    np.testing.assert_array_equal(frame["b"], found.systems.b)
+
+
 def test_a_list_of_systems_is_the_same(found, hopper_cycle):
     systems = [found[i].system for i in range(5)]
     again = hj.find_limit_cycles(systems, hopper_cycle)

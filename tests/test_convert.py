@@ -1,0 +1,270 @@
+"""Other libraries get the same numbers, and give them back."""
+
+import pathlib
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.experiments.data import Simulated
+from hybridjax.experiments.events import EventTimes
+
+from .test_readme import BLOCK, same_output
+
+
+convert = hj.convert
+PAGE = pathlib.Path(__file__).parents[1] / "docs" / "interop.md"
+N = 5
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A stable system whose dimension varies, with two inputs and an output."""
+    return _model([2, 3, 2, 1, 3])
+
+
+def _model(dims, nu=2):
+    rng = np.random.default_rng(0)
+    after = dims[1:] + dims[:1]
+    return hj.LDTP.from_blocks(
+        [0.6 * rng.normal(size=s) for s in zip(after, dims, strict=True)],
+        [rng.normal(size=(d, nu)) for d in after],
+        [rng.normal(size=(1, d)) for d in dims],
+        list(rng.normal(size=(N, 1, nu))),
+        inputs={"u": "N", "w": ""} if nu == 2 else "u",
+        outputs={"y": "m"},
+    )
+
+
+def same(a, b):
+    """Equal fields, bit by bit, also the static ones and units."""
+    assert type(a) is type(b)
+    leaves, structure = jax.tree_util.tree_flatten(a)
+    others, other = jax.tree_util.tree_flatten(b)
+    assert structure == other
+    for x, y in zip(leaves, others, strict=True):
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+        np.testing.assert_array_equal(x, y)
+    for names in ("inputs", "outputs", "input_names", "signals"):
+        assert repr(getattr(a, names, None)) == repr(getattr(b, names, None))
+
+
+def whole_operator(htf, f):
+    """From all harmonics of an input to all of an output: [f, m, k] is H_(m-k) at f + k."""
+    full = htf((f[:, None] + np.arange(N)).ravel())
+    H = np.asarray(full.H).reshape(N, len(f), N)
+    which = (np.arange(N)[:, None] - np.arange(N) - full.harmonics[0]) % N
+    blocks = H[which, :, np.arange(N)[None]]  # m, k, f
+    return np.moveaxis(blocks, 2, 0)
+
+
+def test_the_lifted_system_is_the_periodic_one(model):
+    """In time, sample by sample, and in frequency, harmonic by harmonic."""
+    lti = convert.to_lti(model)
+    assert lti.n_sections == 1 and lti.A.shape == (1, 2, 2)
+    assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]") and lti.inputs[2].unit == "N"
+    np.testing.assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
+    u = np.random.default_rng(1).normal(size=(4 * N, 2))
+    y = lti.simulate(u.reshape(4, -1))
+    np.testing.assert_allclose(y.reshape(-1, 1), model.simulate(u), rtol=0, atol=1e-13)
+    f, n = np.linspace(0.01, 0.49, 7), np.arange(N)
+    H = model.htf(f)
+    G = np.asarray(lti.htf(f).H[0]).reshape(len(f), N, 1, N, 2)
+    wave = lambda f: np.exp(2j * np.pi * np.outer(f, n) / N)  # noqa: E731
+    for m in H.harmonics:
+        found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
+        np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
+
+
+def test_lifting_can_be_compiled_and_differentiated(model):
+    def power(scale):
+        return (convert.to_lti(eqx.tree_at(lambda m: m.B, model, scale * model.B)).B ** 2).sum()
+
+    value, slope = eqx.filter_jit(jax.value_and_grad(power))(2.0)
+    np.testing.assert_allclose(value, slope, rtol=1e-12)  # 4 c and 2 * 2 c
+
+
+def test_python_control(model):
+    control = pytest.importorskip("control")
+    f = np.linspace(0.01, 0.49, 7)
+    system = convert.to_control(model, period=2.0)
+    assert system.dt == 2.0 and system.input_labels[2] == "u[1]"
+    expected = convert.to_lti(model).htf(f).H[0]
+    response = system(np.exp(2j * np.pi * f))
+    np.testing.assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
+    H = model.htf(f)
+    data = convert.to_control(H, period=2.0)
+    assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
+    np.testing.assert_array_equal(data.frdata[1], np.asarray(H[-1])[:, 0].T)
+    np.testing.assert_allclose(data.omega, np.pi * f)
+    assert isinstance(data, control.FrequencyResponseData)
+
+
+def test_the_norm_of_the_lifted_system_is_that_of_the_transfer_functions():
+    """The H-infinity norm of python-control, and the largest gain over all harmonics together."""
+    control = pytest.importorskip("control")
+    from scipy.optimize import minimize_scalar
+
+    model = _model([2] * N, nu=1)
+
+    def gain(f):
+        return np.linalg.svd(whole_operator(model.htf, np.atleast_1d(f)), compute_uv=False)[:, 0]
+
+    f = np.linspace(0, 1, 200)
+    best = f[int(np.argmax(gain(f)))]
+    found = minimize_scalar(
+        lambda f: -float(gain(f)[0]), bounds=(best - 0.01, best + 0.01), options={"xatol": 1e-10}
+    )
+    norm = control.norm(convert.to_control(model), p="inf", tol=1e-13)
+    assert norm == pytest.approx(-found.fun, rel=1e-10)
+
+
+def test_scipy(model):
+    system = convert.to_scipy(model, period=2.0)
+    assert system.dt == 2.0
+    lti = convert.to_lti(model)
+    np.testing.assert_array_equal(system.A, lti.A[0])
+    np.testing.assert_array_equal(system.D, lti.D[0])
+
+
+def experiments(model):
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(2, 2 * N, 2))
+    events = EventTimes(
+        rng.normal(size=(2, 3)), np.array([[0, 1, -1]] * 2), np.array([[0, 4, -1]] * 2),
+        np.array([0.5]), np.array([1]), np.array(1.0), N, ("land", "leave"),
+    )  # fmt: skip
+    return hj.ExperimentData(
+        u,
+        np.stack([model.simulate(x) for x in u]),
+        n_sections=N,
+        periods=1,
+        inputs=model.inputs,
+        outputs=model.outputs,
+        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), events),
+        cycle_outputs=rng.normal(size=(N, 1)),
+        label="clock",
+    )
+
+
+def recording():
+    t = np.arange(5) / 10
+    one = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
+    parts = [
+        hj.Recording(t, one, events={"e": [0.1, 0.3], "never": []}, units={"a": "N"}, name=name)
+        for name in ("first", "second")
+    ]
+    return hj.Recording.join(parts)
+
+
+MADE = {
+    "LDTP": lambda m: m,
+    "HTF": lambda m: m.htf(np.linspace(0.01, 0.4, 5)),
+    "ExperimentData": experiments,
+    "Recording": lambda m: recording(),
+    "Design": lambda m: hj.paper_design(seed=0),
+    "Record": lambda m: experiments(m).records[0],
+    "SeriesFit": lambda m: hj.fit_series(hj.Record(*series(m), n_sections=N), order=1),
+}
+
+
+def series(model):
+    u = np.random.default_rng(3).normal(size=(60 * N, 2))
+    return u, np.asarray(model.simulate(u))
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_there_and_back_with_xarray(model, kind):
+    xarray = pytest.importorskip("xarray")
+    thing = MADE[kind](model)
+    dataset = convert.to_xarray(thing)
+    assert isinstance(dataset, xarray.Dataset)
+    same(convert.from_xarray(dataset), thing)
+    same(convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing)
+
+
+def test_datasets_know_names_and_units(model):
+    pytest.importorskip("xarray")
+    H = model.htf(np.linspace(0.01, 0.4, 5))
+    dataset = convert.to_xarray(H)
+    one = dataset.H.sel(harmonic=-1, input="w", output="y").sel(f=0.4)
+    assert one.item() == complex(H[-1][-1, 0, 1])
+    assert dataset.input_unit.sel(input="u").item() == "N"
+    fewer = convert.from_xarray(dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2)))
+    assert fewer.harmonics == (-1, 0) and fewer.inputs == ("u",) and len(fewer.f) == 2
+    made = convert.to_xarray(recording())
+    assert made.a.attrs["units"] == "N" and "units" not in made.b.attrs
+    only = convert.from_xarray(made.drop_vars("b").isel(sample=made.trial.values == 1))
+    assert only.signals == ("a",) and [t.name for t in only.trials] == ["second"]
+    dims = {name: x.dims for name, x in convert.to_xarray(model).data_vars.items()}
+    assert dims["A"] == ("section", "next_state", "state")
+    assert dims["B"] == ("section", "next_state", "input")
+
+
+def test_section_data(rhythm_data):
+    pytest.importorskip("xarray")
+    pytest.importorskip("pandas")
+    data = rhythm_data
+    dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
+    np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
+    np.testing.assert_array_equal(frame["time"], data.times[0])
+    np.testing.assert_array_equal(frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8)
+    average = dataset.average_cycle.sel(signal="x").values
+    np.testing.assert_array_equal(average, data.cycle_outputs[:, 0])
+
+
+@pytest.fixture(scope="module")
+def rhythm_data():
+    t = np.linspace(0.0, 20.0, 2001)
+    signals = {"f": np.cos(3 * t), "x": np.cos(2 * np.pi * t), "v": -np.sin(2 * np.pi * t)}
+    crossing = hj.Crossing("v", "falling")
+    made = hj.Recording(t, signals, units={"x": "m"})
+    return hj.recordings.section_data(made, crossing, inputs="f", outputs="x", n_sections=8)
+
+
+def test_pandas(model):
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    frame = convert.to_pandas(recording())
+    first = frame[frame["trial"] == 0].drop(columns="trial")
+    again = hj.Recording.from_frame(first, units={"a": "N"})
+    np.testing.assert_array_equal(again.trials[0].values, recording().trials[0].values)
+    H = model.htf(np.linspace(0.01, 0.4, 5))
+    assert convert.to_pandas(H)["H"][-1, H.f[1].item(), "y", "w"] == complex(H[-1][1, 0, 1])
+    fit = MADE["SeriesFit"](model)
+    table = convert.to_pandas(fit)
+    np.testing.assert_array_equal(table["multiplier"], fit.multipliers)
+    np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
+    rational = hj.fit_rational(model.htf(np.linspace(0.01, 0.4, 20)), input="u")
+    table = convert.to_pandas(rational)
+    np.testing.assert_array_equal(table["pole"], rational.poles[0])
+
+
+def test_what_is_refused(model, monkeypatch):
+    pytest.importorskip("xarray")
+    with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
+        convert.from_xarray({"a": 1})
+    dataset = convert.to_xarray(model)
+    with pytest.raises(hj.DefinitionError, match="the dataset is no LDTP"):
+        convert.from_xarray(dataset.drop_vars("A"))
+    with pytest.raises(hj.DefinitionError, match="the dataset is no Recording"):
+        convert.from_xarray(convert.to_xarray(recording()).drop_vars("trial"))
+    clash = hj.Recording([0.0, 1.0], {"trial": [0.0, 1.0]})
+    with pytest.raises(hj.DefinitionError, match="'trial' is called like a coordinate"):
+        convert.to_xarray(clash)
+    for call, name in ((convert.to_control, "control"), (convert.to_xarray, "xarray")):
+        monkeypatch.setitem(__import__("sys").modules, name, None)
+        with pytest.raises(hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"):
+            call(model)
+
+
+def test_the_session_of_the_page_prints_what_it_shows(capsys):
+    for name in ("control", "xarray", "pandas"):
+        pytest.importorskip(name)
+    blocks = BLOCK.findall(PAGE.read_text())
+    (code,) = (text for kind, text in blocks if kind == "python")
+    (shown,) = (text for kind, text in blocks if kind == "text")
+    exec(compile(code, PAGE.name, "exec"), {"__name__": "session"})
+    assert same_output(shown, capsys.readouterr().out)
