@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,6 +37,10 @@ def ruled(slope):
 def table(last):
     values = np.array([1.0, 2.0, last])
     return lambda x: jnp.dot(values, x)
+
+
+scaled = jax.extend.core.Primitive("scaled")
+scaled.def_abstract_eval(lambda x, by: x)
 
 
 def branches(number):
@@ -68,6 +73,10 @@ DIFFERENT = {
         lambda x: jnp.outer(x, jnp.ones(3)),
         lambda x: jnp.outer(jnp.ones(3), x),
         THREE,
+    ),
+    "an array that an operation holds": (
+        *(lambda x, k=k: scaled.bind(x, by=(np.array(k),)) for k in (2.0, 3.0)),
+        NUMBER,
     ),
     "a type": (lambda x: x.astype(jnp.int32), lambda x: x.astype(jnp.int64), NUMBER),
 }

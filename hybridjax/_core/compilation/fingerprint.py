@@ -147,7 +147,7 @@ def _described(x: Any) -> Iterator[bytes]:
     elif isinstance(x, Program):
         yield b"Program"
         yield x.digest.encode()
-    elif isinstance(x, jax.Array | np.ndarray | np.generic):
+    elif _is_array(x):
         yield b"array"
         yield from _described((x.shape, _dtype(x.dtype)))
     elif isinstance(x, np.dtype):
@@ -204,6 +204,10 @@ def _dtype(dtype: Any) -> str:
     return dtype.str if dtype.kind != "V" else dtype.name
 
 
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray | np.generic)
+
+
 def _value(x: Any) -> Iterator[bytes]:
     """An array with its numbers."""
     if not isinstance(x, jax.Array | np.ndarray | np.generic | bool | int | float | complex):
@@ -246,6 +250,8 @@ def _jaxpr(jaxpr: jex.Jaxpr) -> Iterator[bytes]:
             if key not in _RULES.get(name, ()):
                 yield key.encode()
                 yield from _described(value)
+                arrays = filter(_is_array, jax.tree_util.tree_leaves(value))
+                yield from _sequence(map(_value, arrays))  # part of the program, with their numbers
             if key == "symbolic_zeros" and value:  # the rule may look at more than a derivative
                 raise IndescribableError(f"{name} with symbolic zeros")
         yield from bound(eqn.outvars)
