@@ -74,8 +74,8 @@ DIFFERENT = {
         lambda x: jnp.outer(jnp.ones(3), x),
         THREE,
     ),
-    "an array that an operation holds": (
-        *(lambda x, k=k: scaled.bind(x, by=(np.array(k),)) for k in (2.0, 3.0)),
+    "a number of NumPy's that an operation holds": (
+        *(lambda x, k=k: scaled.bind(x, by=np.float64(k)) for k in (2, 3)),
         NUMBER,
     ),
     "a type": (lambda x: x.astype(jnp.int32), lambda x: x.astype(jnp.int64), NUMBER),
