@@ -16,9 +16,8 @@ from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
 from ..multipliers.denominator import Denominator, multipliers_of
 from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
-from .cycle_blocks import gradient_covariance
 from .cycle_grid import CycleGrid
-from .output_error import Linearization, OutputErrorProblem, linearize
+from .output_error import Linearization, OutputErrorProblem, gradient_covariance, linearize
 from .robust import (
     Loss,
     efficiency,
