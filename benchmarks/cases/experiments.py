@@ -11,8 +11,6 @@ import sys
 
 from peers.contest import Contest, Seconds
 
-from hybridjax.experiments import campaign
-
 from .children import call
 from .problems import ALL, Problem, first_and_later, problem, program
 
@@ -26,7 +24,6 @@ PEERS = (
 
 
 def run(show, options) -> None:
-    campaign._LARGE = 0  # the programs that jobs find after a while
     names = ["c", "heyoka", "scipy"] + ["jaxonomy"] * (options.jaxonomy is not None)
     for model, family in ALL:
         seen = {}
@@ -99,7 +96,6 @@ def main(model: str, family: str, repeat: str, quick: str) -> None:
 
     hj.enable_loop_kernels()
     hj.enable_x64()
-    campaign._LARGE = 0
     found = {}
     _runs(problem(model, family, bool(int(quick))), "loops", found.__setitem__, int(repeat))
     print(json.dumps(found))

@@ -14,6 +14,7 @@ from job import Job, make_job
 from peers.contest import Seconds, measure
 
 import hybridjax as hj
+from hybridjax.experiments import campaign
 from hybridjax.experiments.campaign import prepare
 from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.options import Options
@@ -64,7 +65,8 @@ class Problem:
     def run(
         self, accuracy: float = 1e-9, workers: int = 1, precision: str = "double"
     ) -> hj.ExperimentData:
-        """All experiments, as a user runs them."""
+        """All experiments, as a user runs them, by the program that jobs find after a while."""
+        campaign._LARGE = 0
         return hj.run_experiments(
             self.cycle, self.placed, self.u, self.outputs,
             discard=0, accuracy=accuracy,
@@ -81,12 +83,12 @@ class Problem:
     def response(self, accuracy: float = 1e-9) -> tuple:
         """Arguments of `program`: what `run` gives to it."""
         options = Options(discard=0, accuracy=accuracy)
-        campaign = prepare(self.cycle, self.placed, self.u, self.outputs, options)
+        prepared = prepare(self.cycle, self.placed, self.u, self.outputs, options)
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
         start = jnp.repeat(start, len(self.u), axis=1)
-        z = tuple(campaign.outputs.items)
-        stepping = campaign.stepping
+        z = tuple(prepared.outputs.items)
+        stepping = prepared.stepping
         return self.placed, stepping.plan, start, jnp.asarray(self.u), z, stepping.settings
 
 
