@@ -195,10 +195,10 @@ def gradient_covariance(
 
     Errors of neighboring cycles may depend on each other and on the inputs, as those of distortion
     do. Numerators take what these cycles have in common, and no correction of single residuals puts
-    that back. Each block's errors are those of a prediction by a fit to the others (the jackknife that deletes
-    blocks: Künsch 1989; Bell and McCaffrey 2002), which are larger than the true ones. The sum of
-    the squares is therefore taken relative to what it is on average for white noise. Its freedom is
-    that by which the blocks scatter (Pan and Wall 2002), at most that of normal errors
+    that back. Each block's errors are those of a prediction by a fit to the others (the jackknife
+    that deletes blocks: Künsch 1989; Bell and McCaffrey 2002), which are larger than the true ones.
+    The sum of the squares is therefore taken relative to what it is on average for white noise. Its
+    freedom is that by which the blocks scatter (Pan and Wall 2002), at most that of normal errors
     (Satterthwaite 1946).
     """
     T, N, d = *problem.y.shape[1:3], len(c)
