@@ -1,7 +1,5 @@
 """Other libraries get the same numbers, and give them back."""
 
-import pathlib
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -11,11 +9,11 @@ import hybridjax as hj
 from hybridjax.experiments.data import Simulated
 from hybridjax.experiments.events import EventTimes
 
-from .test_readme import BLOCK, same_output
+from .sessions import blocks, same_output
 
 
 convert = hj.convert
-PAGE = pathlib.Path(__file__).parents[1] / "docs" / "interop.md"
+PAGE = "docs/interop.md"
 N = 5
 
 
@@ -263,8 +261,7 @@ def test_what_is_refused(model, monkeypatch):
 def test_the_session_of_the_page_prints_what_it_shows(capsys):
     for name in ("control", "xarray", "pandas"):
         pytest.importorskip(name)
-    blocks = BLOCK.findall(PAGE.read_text())
-    (code,) = (text for kind, text in blocks if kind == "python")
-    (shown,) = (text for kind, text in blocks if kind == "text")
-    exec(compile(code, PAGE.name, "exec"), {"__name__": "session"})
+    (code,) = (text for kind, text in blocks(PAGE) if kind == "python")
+    (shown,) = (text for kind, text in blocks(PAGE) if kind == "text")
+    exec(compile(code, PAGE, "exec"), {"__name__": "session"})
     assert same_output(shown, capsys.readouterr().out)

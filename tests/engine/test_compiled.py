@@ -1,6 +1,7 @@
 """What is compiled: users' functions, and programs with a name, but no single operations."""
 
 import contextlib
+import re
 
 import jax
 import numpy as np
@@ -17,10 +18,10 @@ SECTIONS, EXPERIMENTS, PERIODS = 7, 3, 5
 FAMILY = hj.KinematicPhase(
     SECTIONS, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
 )
-# Kernels, programs, and what JAX is asked about itself. Then the hopper's period, which is 2 pi
-# over a parameter, and arguments of the program that is compiled while the plan is made.
-NAMED = {"run", "_bind_program", "flow_batch", "settle_batch", "_constant", "<lambda>"}
-NAMED |= {"true_divide", "stage"}
+# Kernels, programs (those that are kept have names of their own), and what JAX is asked about
+# itself.
+# Then the hopper's period, which is 2 pi over a parameter.
+NAMED = {"run", "program", "_bind_program", "_constant", "<lambda>", "true_divide"}
 
 
 @contextlib.contextmanager
@@ -30,7 +31,7 @@ def compiled():
 
     def listen(event, *_, fun_name="", **__):
         if "backend_compile" in event:
-            names.add(fun_name.removeprefix("jit(").removesuffix(")"))
+            names.add(re.sub(r"^jit\(|_[0-9a-f]{32}|\)$", "", fun_name))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:

@@ -29,7 +29,7 @@ def records(**options):
         (lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS), "no experiment ran well"),
         (
             lambda: hj.ObservedSeries(records(), SECTIONS, std=-1.0),
-            "`std` must be an array of positive",
+            "`std` must be a positive number",
         ),
         (lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)), "each of 1 outputs"),
         (lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS), "does not move"),

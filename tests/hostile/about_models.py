@@ -91,7 +91,8 @@ def systems(t):
         "batch": optional(COUNT), "workers": optional(LIMITED), "precision": WORD,
     }  # fmt: skip
     yield "Settings", hj.Settings, dict(rtol=1e-9, atol=1e-9), {
-        "rtol": [*POSITIVE, Right(np.float32(1e-6)), Right(jnp.array(1e-6))], "atol": POSITIVE,
+        "rtol": optional([*POSITIVE, Right(np.float32(1e-6)), Right(jnp.array(1e-6))]),
+        "atol": optional(POSITIVE),
         "max_steps": LIMITED, "scale": ["x", 1.0, [1.0], [[NAN]], [[-1.0]], [[1j]], Other()],
     }  # fmt: skip
     yield "simulate", hj.simulate, dict(
