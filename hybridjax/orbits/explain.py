@@ -99,8 +99,8 @@ def _about_stiffness(cycle: LimitCycle, turn: Turn, expected: float) -> str:
     if fastest * expected / LEGS < _STIFF:
         return ""
     return (
-        f" The system is stiff: a mode decays within {1 / fastest:.2g} of a period of "
-        f"{expected:.3g}, and stability, not accuracy, limits the steps. Allow more of "
+        f" The system is stiff: a mode decays in a time of {1 / fastest:.2g}, in a period of "
+        f"{expected:.3g}, and steps are as short as that also where it is at rest. Allow more of "
         "them, e.g. `settings=Settings(max_steps=20_000)`."
     )
 
