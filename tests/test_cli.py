@@ -33,7 +33,8 @@ def test_help_does_not_import_jax(arguments):
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
     options = ["--quick", "--out", str(out), "--param", "M=2.0", "--formats", "png,svg"]
-    assert main(["reproduce", *options]) == 0
+    run = _python("-m", "hybridjax", "reproduce", *options)
+    assert run.returncode == 0, run.stderr
     return out
 
 

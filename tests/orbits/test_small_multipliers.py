@@ -10,7 +10,7 @@ import hybridjax as hj
 from ..toys import Field
 
 
-RATES = np.array([0.5, 45.0, 300.0])
+RATES = np.array([0.5, 45.0, 120.0])
 
 
 class Decaying(hj.HybridSystem):
