@@ -165,7 +165,7 @@ def test_energy_is_conserved_in_running():
 
 
 # What `find_limit_cycle` says of the models that have no cycle that it could find by itself.
-SAYS_WHAT_TO_GIVE = {"BouncingBall": "pass `guess=Guess", "SLIPRunner": "conserved={'energy': 1"}
+SAYS_WHAT_TO_GIVE = {"BouncingBall": "pass `guess=Guess", "SLIPRunner": "conserved={'energy': 17"}
 
 
 @pytest.mark.parametrize(
