@@ -166,7 +166,7 @@ def protocols(monkeypatch):
     """What `reproduce` would be asked for; it does nothing, and converges."""
     asked = []
 
-    def reproduce(out, protocol, formats):
+    def reproduce(out, protocol, formats, helper):
         assert formats == ("png",)
         asked.append(protocol)
         return {"families": {"isochron": {"converged": protocol.seed == 0}}}
@@ -225,6 +225,17 @@ def test_an_interruption_in_a_callback_is_not_lost(tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new")])
     assert error.value.code == 130 and capsys.readouterr().err == "hybridjax: interrupted.\n"
+
+
+def test_the_main_job_imports_what_it_needs():
+    """And nothing else that takes long."""
+    heavy = "diffrax", "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
+    code = (
+        "import sys, hybridjax.apps.reproduce\n"
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    run = _python("-c", code)
+    assert (run.returncode, run.stdout) == (0, "[]\n"), run.stderr
 
 
 def test_version():

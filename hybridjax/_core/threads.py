@@ -1,14 +1,14 @@
 """Compiled calls, and large ones of NumPy, on several cores."""
 
-import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any
 
 import jax
 
+from .cores import core_count
 from .device import on_cpu
 from .precision import require_x64
 
@@ -17,7 +17,7 @@ def thread_count(workers: int | None) -> int:
     """How many threads to use: by default all cores on CPU, and one on an accelerator."""
     if workers is not None:
         return workers
-    return _cores() if on_cpu() else 1
+    return core_count() if on_cpu() else 1
 
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any], workers: int) -> Iterator[Any]:
@@ -38,26 +38,9 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     OPENBLAS_NUM_THREADS is 1.
     """
     alone = os.environ.get("OPENBLAS_NUM_THREADS") == "1"
-    with ThreadPoolExecutor(_cores() if alone else 1) as pool:
+    with ThreadPoolExecutor(core_count() if alone else 1) as pool:
         running = [pool.submit(copy_context().run, work, item) for item in items]
         return [one.result() for one in running]
-
-
-@contextlib.contextmanager
-def meanwhile(work: Callable[[], Any]) -> Iterator[Future]:
-    """A context during which `work` is done in a thread of its own, under the caller's
-    configuration of JAX. It ends when both have ended, and raises what `work` raised."""
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(_configured(work))
-        yield running
-        running.result()
-
-
-def _cores() -> int:
-    """That this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _configured(work):

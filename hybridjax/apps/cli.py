@@ -205,6 +205,9 @@ def _reproduce(options) -> int:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # The matrices are small: more BLAS threads than one only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from .helper import Helper
+
+    helper = Helper("hybridjax.apps.reproduce", "hybridjax.apps.paper_figures")
     from .reproduce import Protocol, reproduce
 
     sizes = {
@@ -223,6 +226,7 @@ def _reproduce(options) -> int:
             **sizes,
         ),
         options.formats,
+        helper,
     )
     return _status(all(family["converged"] for family in summary["families"].values()))
 

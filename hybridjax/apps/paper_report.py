@@ -32,7 +32,7 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         errors = family.estimate.harmonic_errors(family.ldtp.htf(family.estimate.f))
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
         summary["families"][name] = {
-            "experiments": family.data.summary(),
+            "experiments": family.experiments,
             "converged": bool(
                 family.structured.result == Result.OK
                 and np.all(family.rational.result == Result.OK)

@@ -3,14 +3,12 @@
 Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
 """
 
-import copy
 import dataclasses
 import json
 import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +18,8 @@ from .._core.compilation.compilation_cache import enable_compilation_cache
 from .._core.files.figure_formats import Format
 from .._core.files.results_folder import results_folder
 from .._core.precision import enable_x64
-from .._core.threads import in_threads, meanwhile, thread_count
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError
-from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
 from ..experiments.run import run_experiments
@@ -42,6 +38,7 @@ from ..sections.abstract import AbstractSections
 from ..sections.clock import ClockPhase
 from ..sections.crossing import Crossing
 from ..sections.kinematic import KinematicPhase
+from .helper import Helper
 from .paper_report import OUTPUTS, summarize, table
 
 
@@ -59,22 +56,14 @@ class Protocol:
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-class Exact(NamedTuple):
-    """What is known of one family of sections without experiments."""
-
-    placed: PlacedSections
-    ldtp: LDTP
-    exact: HTF
-
-
-@dataclasses.dataclass(frozen=True)
-class Family:
+class Family(NamedTuple):
     """Everything that was found with one family of sections."""
 
     placed: PlacedSections
     ldtp: LDTP
     exact: HTF
-    data: ExperimentData
+    experiments: str
+    """What became of them."""
     estimate: HTF
     rational: RationalFit
     rational_exact: RationalFit
@@ -82,32 +71,30 @@ class Family:
 
 
 class _Clock:
-    """Prints what is being done, and keeps how long it took."""
+    """Prints what is being done, since `begin` (the same in all processes), and keeps how long it
+    took."""
 
-    def __init__(self):
-        self.begin = self.last = time.perf_counter()
+    def __init__(self, begin: float):
+        self.begin, self.last = begin, time.time()
         self.seconds: dict[str, float] = {}
 
     def done(self, what: str, text: str) -> None:
-        now = time.perf_counter()
+        now = time.time()
         self.seconds[what] = now - self.last
         print(f"[{now - self.begin:6.1f} s] {text}", flush=True)
         self.last = now
 
-    def beside(self) -> "_Clock":
-        """For what is done at the same time."""
-        other = copy.copy(self)  # with the same `seconds`
-        other.last = time.perf_counter()
-        return other
 
-
-def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format]) -> dict:
+def reproduce(
+    out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format], helper: Helper
+) -> dict:
     """Run the protocol and write figures, `summary.json` and `results.npz` into the folder `out`.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
 
-    **Arguments:** `formats` of the figures, as in `hj.plot.save`.
+    **Arguments:** `formats` of the figures, as in `hj.plot.save`; `helper`, which does its part and
+    is ended.
 
     **Returns:** what `summary.json` holds.
 
@@ -115,8 +102,9 @@ def reproduce(out: str | os.PathLike, protocol: Protocol, formats: Sequence[Form
     written, or one in which another file has the name of a result; `ComputationError` if a step
     fails.
     """
-    with results_folder(Path(out), "reproduce", _names(protocol.families, formats)) as folder:
-        return _reproduce(folder, protocol, formats)
+    names = _names(protocol.families, formats)
+    with results_folder(Path(out), "reproduce", names) as folder, helper:
+        return _reproduce(folder, protocol, formats, helper)
 
 
 def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
@@ -127,46 +115,42 @@ def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
     return ["summary.json", "results.npz", *files]
 
 
-def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
-    enable_x64()
-    enable_compilation_cache()
-    clock = _Clock()
+def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], helper: Helper) -> dict:
+    _set_up()
+    clock = _Clock(time.time())
     hopper = _hopper(protocol.parameters)
     design = _design(protocol)
     clock.done("design", f"design: {design.experiments} experiments, {len(design.f)} frequencies")
     cycle = _find(hopper)
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
     clock.done("cycle", f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
-    exact = {}
-    for name in protocol.families:
-        exact[name] = _exact(cycle, _sections(name, protocol.n_sections), design)
-        clock.done(f"exact_{name}", f"{name}: sections, exact A, B, C, D and HTF")
 
-    def identify(name):
-        return _identify(name, exact[name], design, protocol, clock.beside())
-
-    def identify_all():
-        workers = min(len(exact), thread_count(None))
-        return dict(zip(exact, in_threads(identify, exact, workers), strict=True))
-
-    # The families' programs compile side by side; meanwhile matplotlib is imported, and draws.
-    with meanwhile(identify_all) as identified:
-        figures = _figures()
-        orbit, perturbed = cycle.trajectory(), _perturbed(cycle)
-        placed = {name: known.placed for name, known in exact.items()}
-        for name in figures.save(out, formats, figures.cycles(placed, perturbed)):
-            clock.done(name, name)
-    clock = clock.beside()
-    families = identified.result()
+    # One family is identified here, another one beside; then those figures are drawn beside that
+    # take longer.
+    first, *others = protocol.families
+    for name in others:
+        helper.begin(_identify, name, cycle, design, protocol, clock.begin)
+    families = {}
+    families[first], seconds = _identify(first, cycle, design, protocol, clock.begin)
+    orbit, perturbed = cycle.trajectory(), _perturbed(cycle)
+    for name in others:
+        families[name], more = helper.result()
+        seconds |= more
+    helper.begin(_draw, "comparisons", (cycle, families), out, formats, clock.begin)
+    placed = {name: family.placed for name, family in families.items()}
+    seconds |= _draw("cycles", (placed, perturbed), out, formats, clock.begin)
     summary = summarize(protocol, cycle, families)
     _write_results(out / "results.npz", protocol, cycle, orbit, families)
-    clock.done("results", "results.npz")
-    for name in figures.save(out, formats, figures.comparisons(cycle, families)):
-        clock.done(name, name)
-    summary["seconds"] = {**clock.seconds, "total": time.perf_counter() - clock.begin}
+    seconds = clock.seconds | seconds | helper.result()
+    summary["seconds"] = {**seconds, "total": time.time() - clock.begin}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))
     return summary
+
+
+def _set_up() -> None:
+    enable_x64()
+    enable_compilation_cache()
 
 
 def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
@@ -215,15 +199,18 @@ def _sections(name: str, count: int) -> AbstractSections:
     )
 
 
-def _exact(cycle: LimitCycle, sections: AbstractSections, design: Design) -> Exact:
-    placed = place_sections(cycle, sections)
+def _identify(
+    name: str, cycle: LimitCycle, design: Design, protocol: Protocol, begin: float
+) -> tuple[Family, dict[str, float]]:
+    """All of one family of sections, and how long it took."""
+    _set_up()
+    clock = _Clock(begin)
+    placed = place_sections(cycle, _sections(name, protocol.n_sections))
     ldtp = linearize(cycle, placed, OUTPUTS)
-    return Exact(placed, ldtp, ldtp.htf(design.frequencies))
-
-
-def _identify(name: str, known: Exact, design: Design, protocol: Protocol, clock: _Clock) -> Family:
-    cycle, discard = known.placed.cycle, protocol.cycles - protocol.keep
-    data = run_experiments(cycle, known.placed, design, OUTPUTS, discard=discard)
+    exact = ldtp.htf(design.frequencies)
+    clock.done(f"exact_{name}", f"{name}: sections, exact A, B, C, D and HTF")
+    discard = protocol.cycles - protocol.keep
+    data = run_experiments(cycle, placed, design, OUTPUTS, discard=discard)
     clock.done(f"experiments_{name}", f"{name}: experiments, {data.summary()}")
     if not data.ok.any():
         raise ComputationError(
@@ -231,16 +218,29 @@ def _identify(name: str, known: Exact, design: Design, protocol: Protocol, clock
             "--amplitude."
         )
     estimate = estimate_htf(data)
-    family = Family(
-        *known,
-        data,
-        estimate,
-        fit_rational(estimate),
-        fit_rational(known.exact),
-        fit_multipliers(estimate, known.ldtp),
-    )
+    rational, rational_exact = fit_rational(estimate), fit_rational(exact)
+    structured = fit_multipliers(estimate, ldtp)
     clock.done(f"fits_{name}", f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
-    return family
+    found = Family(
+        placed, ldtp, exact, data.summary(), estimate, rational, rational_exact, structured
+    )
+    return found, clock.seconds
+
+
+def _draw(
+    what: str, things: tuple, out: Path, formats: Sequence[Format], begin: float
+) -> dict[str, float]:
+    """Some of the figures, and how long they took."""
+    import matplotlib  # here, since it is heavy
+
+    matplotlib.use("Agg")  # files only: no window is opened, and none is needed
+    from . import paper_figures
+
+    _set_up()
+    clock = _Clock(begin)
+    for name in paper_figures.save(out, formats, getattr(paper_figures, what)(*things)):
+        clock.done(name, name)
+    return clock.seconds
 
 
 def _perturbed(cycle: LimitCycle) -> Trajectory:
@@ -311,13 +311,3 @@ def _on_grid(estimate: HTF, f) -> np.ndarray:
     H = np.full((len(estimate.harmonics), len(f), *estimate.H.shape[2:]), np.nan, complex)
     H[:, np.isin(np.asarray(f), np.asarray(estimate.f))] = np.asarray(estimate.H)
     return H
-
-
-def _figures() -> ModuleType:
-    """The module that draws, imported when it is needed: matplotlib is heavy."""
-    import matplotlib
-
-    matplotlib.use("Agg")  # files only: no window is opened, and none is needed
-    from . import paper_figures
-
-    return paper_figures

@@ -7,9 +7,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Float, Int
 
 from .._core.compilation.compile import host_first, quick_jit
@@ -25,8 +23,6 @@ _ATOL, _RTOL = 1e-12, 1e-11
 MAX_STEPS = 32
 # Steps of Levenberg and Marquardt before it is given up.
 _DAMPED_STEPS = 64
-# Along a direction in which J - I is singular, neither Newton nor a derivative moves.
-_SOLVER = lx.SVD(rcond=SINGULAR)
 
 
 class Solution(NamedTuple):
@@ -105,10 +101,12 @@ def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.
 
 @eqx.filter_custom_jvp
 def _root(map, damped, max_steps):
+    import optimistix as optx  # (a fifth of a second, here as below)
+
     if damped:
         solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
     else:
-        solver = optx.Newton(rtol=_RTOL, atol=_ATOL, linear_solver=_SOLVER)
+        solver = optx.Newton(rtol=_RTOL, atol=_ATOL, linear_solver=_linear_solver())
     solution = optx.root_find(
         _residual, solver, map.anchor.q[:, 0] / map.sizes, map,
         has_aux=True, max_steps=max_steps, throw=False,
@@ -120,16 +118,26 @@ def _root(map, damped, max_steps):
 def _root_jvp(primals, tangents):
     """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
     where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""
+    import lineax as lx
+
     map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
     q, turn, steps = root(*primals)
     fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
     t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
     _, by_parameters = eqx.filter_jvp(lambda map: map.turn(q).residual, (map,), (t_map,))
     jacobian = map.turn_with_jacobian(q).jacobian * sizes / sizes[:, None]
-    jacobian = lx.MatrixLinearOperator(jacobian)
-    t_q = -lx.linear_solve(jacobian, by_parameters / sizes, _SOLVER, throw=False).value * sizes
+    jacobian, by_parameters = lx.MatrixLinearOperator(jacobian), by_parameters / sizes
+    found = lx.linear_solve(jacobian, by_parameters, _linear_solver(), throw=False)
+    t_q = -found.value * sizes
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
     return (q, turn, steps), (t_q, *nothing)
+
+
+def _linear_solver():
+    """Along a direction in which J - I is singular, neither Newton nor a derivative moves."""
+    import lineax as lx
+
+    return lx.SVD(rcond=SINGULAR)
 
 
 def _residual(x, map: ReturnMap):

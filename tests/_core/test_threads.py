@@ -11,7 +11,7 @@ from hybridjax._core import threads
 @pytest.mark.parametrize(("blas", "cores"), [("1", 2), ("2", 1), (None, 1)])
 def test_cores_are_left_to_blas_unless_it_has_one_thread(monkeypatch, blas, cores):
     """In order, under the caller's treatment of overflow."""
-    monkeypatch.setattr(threads, "_cores", lambda: 2)
+    monkeypatch.setattr(threads, "core_count", lambda: 2)
     if blas is None:
         monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     else:

@@ -1,6 +1,6 @@
 """The Runge-Kutta method: the only place that knows which one is used.
 
-To use another explicit pair, replace the tableau in `tableau.py` (a `diffrax.ButcherTableau`), and
+To use another explicit pair, replace the tableau in `tableau.py` (in the form of diffrax's), and
 the order of its error estimate where the step control relies on it: in the lengths of the next step
 (`search/outcome.py: _next_step`, an eighth root) and of the first (`search/stride.py`, a seventh).
 

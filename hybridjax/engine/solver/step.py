@@ -24,7 +24,7 @@ _WRITTEN_OUT = 128
 # Shifts by which rounding errors of the field are seen, in those of states and of time: both signs,
 # odd ones and even ones. Doubled, the errors seen are at most doubled.
 _SHIFTS = np.array([-3.1, 1.9, -0.8, 4.4])
-_STAGES = VERNER76.num_stages
+_STAGES = len(VERNER76.b_sol)
 _A = np.zeros((_STAGES, _STAGES))
 for _k, _row in enumerate(VERNER76.a_lower):
     _A[_k + 1, : _k + 1] = _row

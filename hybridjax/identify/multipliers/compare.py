@@ -6,7 +6,6 @@ from typing import Annotated
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import linear_sum_assignment
 
 from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Complexes
@@ -65,11 +64,24 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     found, known = np.asarray(estimated).ravel(), np.asarray(true).ravel()
     if found.size == 0 or known.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
-    here, there = linear_sum_assignment(np.abs(found[:, None] - known))
+    here, there = _paired(np.abs(found[:, None] - known))
     order = np.lexsort((-known[there].imag, -np.abs(known[there])))
     return MultiplierComparison(
         true=known[there][order].astype(complex), estimated=found[here][order].astype(complex)
     )
+
+
+def _paired(distance: Float[np.ndarray, "n m"]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and their columns, as many as there can be, with the smallest sum of distances."""
+    n, m = distance.shape
+    if n < m:
+        return _paired(distance.T)[::-1]
+    nearest = distance.argmin(axis=0)
+    if len(np.unique(nearest)) == m:  # no smaller sum is possible
+        return nearest, np.arange(m)
+    from scipy.optimize import linear_sum_assignment  # (a third of a second)
+
+    return linear_sum_assignment(distance)
 
 
 def compare_by_output(

@@ -33,10 +33,12 @@ def gauss_newton(
     linearize: Callable[[Coefficients], tuple[np.ndarray, np.ndarray]],
     start: Coefficients,
     max_steps: int,
+    settled_gain: float = 0.0,
 ) -> Minimum:
     """Minimize a sum of squares, halving steps that do not lower it.
 
     **Arguments:** `linearize(c)` gives the residuals (n,) and their Jacobian (n, d), of full rank.
+    `settled_gain`: an expected decrease of the sum that does not matter.
     """
     c = start
     residual, jacobian = linearize(c)
@@ -45,7 +47,7 @@ def gauss_newton(
         step = np.linalg.lstsq(jacobian, -residual)[0]
         gain = ((jacobian @ step) ** 2).sum()
         small = np.linalg.norm(step) <= _SETTLED_STEP * (1 + np.linalg.norm(c))
-        if gain <= _SETTLED_GAIN * cost or small:
+        if gain <= max(_SETTLED_GAIN * cost, settled_gain) or small:
             return Minimum(c, True)
         for k in range(_MAX_HALVINGS):
             trial = c + step / 2**k

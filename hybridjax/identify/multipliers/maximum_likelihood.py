@@ -3,7 +3,6 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 from .covariance import Covariance, sandwich
@@ -41,9 +40,9 @@ def total_least_squares(groups: list[HTFGroup], order: int) -> Coefficients:
     """
     c = np.zeros(order)
     for _ in range(_MAX_REWEIGHTINGS):
-        columns, noise = delayed_responses(groups, c)
-        _, vectors = scipy.linalg.eigh(columns.T @ columns, noise)
-        null = vectors[:, 0]
+        responses = delayed_responses(groups, c)
+        vectors, _, _ = np.linalg.svd(responses.whitened())
+        null = np.linalg.solve(responses.noise_root().T, vectors[:, -1])
         if abs(null[0]) < _NO_LEADING_COEFFICIENT * np.abs(null).max():
             break
         c, last = null[1:] / null[0], c

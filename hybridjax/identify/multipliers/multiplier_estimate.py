@@ -3,7 +3,6 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from scipy import special
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import PeriodCount, Probability
@@ -122,6 +121,8 @@ class MultiplierEstimate(eqx.Module):
 
     def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""
+        from scipy import special  # (a fifth of a second)
+
         if np.isinf(self.covariance_freedom):
             return 2 * special.gammaincinv(degrees / 2, level)
         rest = np.maximum(self.covariance_freedom - degrees + 1, 1.0)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float, Int
 
 from ..._core.boundary.checked import checked
@@ -172,11 +171,7 @@ class NoiseRatios(NamedTuple):
 
 def noise_ratios(groups: list[HTFGroup], c: Float[np.ndarray, " d"]) -> NoiseRatios:
     """Generalized singular values of what numerators leave, weighted as for the denominator c."""
-    columns, noise = delayed_responses(groups, c)
-    # Singular values of the columns, whitened: their Gram matrix would lose half of the digits.
-    white = scipy.linalg.solve_triangular(
-        np.linalg.cholesky(noise), np.linalg.qr(columns, mode="r").T, lower=True
-    )
+    white = delayed_responses(groups, c).whitened()
     values = np.linalg.svd(white, compute_uv=False)[::-1] ** 2
     # Each is a weighted mean of squares of so many independent numbers.
     total, square = 0.0, 0.0

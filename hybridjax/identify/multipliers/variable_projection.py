@@ -11,7 +11,6 @@ Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\vareps
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Complex, Float, Inexact, Int
 
 from ...linear.htf import HTF
@@ -141,6 +140,15 @@ class DelayedResponses(NamedTuple):
     noise_gram: Float[np.ndarray, "d1 d1"]
     """The part of their Gram matrix that is expected from errors of variance 1."""
 
+    def noise_root(self) -> Float[np.ndarray, "d1 d1"]:
+        """Cholesky's factor of `noise_gram`."""
+        return np.linalg.cholesky(self.noise_gram)
+
+    def whitened(self) -> Float[np.ndarray, "d1 r"]:
+        """A root of the columns' Gram matrix (which would itself lose half of the digits), in units
+        of what is expected from errors alone."""
+        return np.linalg.solve(self.noise_root(), np.linalg.qr(self.columns, mode="r").T)
+
 
 def delayed_responses(groups: list[HTFGroup], c: Float[np.ndarray, " d"]) -> DelayedResponses:
     """Of all groups together. The coefficients of chi combine the columns to errors alone."""
@@ -158,8 +166,10 @@ def _delayed(group: HTFGroup, c: Float[np.ndarray, " d"]) -> DelayedResponses:
     leverage = (np.abs(q) ** 2).sum(axis=1)
     leverage = leverage.reshape(2, -1).sum(axis=0) if group.real else 2 * leverage
     left = (2 - leverage) / np.abs(chi(group.period_delay, c)) ** 2
-    by_delay = [float((left * (group.period_delay**j).real).sum()) for j in range(len(c) + 1)]
-    return DelayedResponses(np.stack(columns, axis=1), scipy.linalg.toeplitz(by_delay) * group.size)
+    delays = np.arange(len(c) + 1)
+    by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
+    noise_gram = by_delay[np.abs(delays[:, None] - delays)] * group.size
+    return DelayedResponses(np.stack(columns, axis=1), noise_gram)
 
 
 def numerators_of(group: HTFGroup, c: Float[np.ndarray, " d"]) -> Inexact[np.ndarray, "R K"]:

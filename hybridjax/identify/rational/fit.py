@@ -1,17 +1,14 @@
 """The paper's parametric fit: one rational function of z for one harmonic (Sec. VI-C3)."""
 
+from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
-from ..._core.compilation.compile import quick_jit
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError
@@ -22,17 +19,15 @@ from ..multipliers.compare import (
     channel_index,
     compare_by_output,
 )
+from ..multipliers.gauss_newton import gauss_newton
 
 
 # Steps of the iteration of Sanathanan and Koerner from which fits are started. Doubled: twice the
 # time, as a rule for the same result.
 _STARTS = (0, 1, 4, 29)
-# Relative and absolute accuracy of the denominator, in coordinates in which the residual changes by
-# about as much. Doubled: half a step fewer.
+# Part of the residual, relative to H, that a step may still explain at the end. Doubled: half a
+# step fewer.
 _ACCURACY = 1e-8
-# Relative length, in the residual, of directions of the denominator that are taken to count for
-# something. Doubled: longer steps along such directions.
-_FLOOR = 1e-8
 # Relative difference of costs that are equal. Doubled: none but rounding.
 _EQUAL_COST = 1e-9
 # |H| relative to its rms that counts as zero. Doubled: none but rounding.
@@ -128,8 +123,8 @@ def fit_rational(
 ) -> RationalFit:
     """Fit a rational function of z with real coefficients to one harmonic.
 
-    The residual is the true one, `W (H - B/A)`, minimized by Levenberg-Marquardt over the
-    denominator only: for a given denominator the best numerator is a linear problem that is
+    The residual is the true one, `W (H - B/A)`, minimized by Gauss and Newton's method over
+    the denominator only: for a given denominator the best numerator is a linear problem that is
     solved inside (variable projection). It starts from several solutions of the linearized
     problem (Levy 1959; Sanathanan and Koerner 1963) and the best result is kept.
 
@@ -159,8 +154,8 @@ def fit_rational(
             f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
             f"{len(H)} frequencies."
         )
-    w = jnp.exp(-2j * jnp.pi * htf.f / htf.n_sections)
-    delay = w if form == "delayed" else jnp.ones_like(w)
+    w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
+    powers = w ** (int(form == "delayed") + np.arange(zeros + 1)), w ** (1 + np.arange(poles))
     fits = []
     for row in rows:
         h = H[:, row]
@@ -171,19 +166,20 @@ def fit_rational(
         if rms == 0 or (weighting == "relative" and np.abs(h).min() < _ZERO * rms):
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
-        h = jnp.asarray(h / rms)
-        tried = _fit(w, delay, h, jnp.asarray(weight), poles, zeros, max_steps)
-        cost = np.where(np.isfinite(tried.cost), tried.cost, np.inf)
+        problem = _Problem(*powers, h / rms, weight / np.sqrt(len(h)))
+        with np.errstate(all="ignore"):
+            tried = [_refined(problem, start, max_steps) for start in _starts(problem)]
+        cost = np.array([one.cost if np.isfinite(one.cost) else np.inf for one in tried])
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
         lowest = cost <= cost.min() * (1 + _EQUAL_COST)
-        best = int(np.argmax(lowest * (1 + np.asarray(tried.converged))))
+        best = tried[int(np.argmax(lowest * [1 + one.converged for one in tried]))]
         fits.append(
             (
-                np.asarray(tried.numerator[best]) * rms,
-                np.concatenate([[1.0], tried.denominator[best]]),
-                float(cost[best]),
-                Result.OK if tried.converged[best] else Result.NOT_CONVERGED,
+                best.numerator * rms,
+                np.concatenate([[1.0], best.denominator]),
+                best.cost,
+                Result.OK if best.converged else Result.NOT_CONVERGED,
             )
         )
     numerator, denominator, residual, result = (
@@ -216,75 +212,73 @@ def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
 
 
-class _Trials(NamedTuple):
-    """The fits from S starts."""
+class _Problem(NamedTuple):
+    """The weighted residual W (H - B/A) of F lines."""
 
-    denominator: Float[Array, "S p"]
+    powers_b: Complex[np.ndarray, "F q1"]
+    """Of z, by which the coefficients of B are multiplied,"""
+    powers_a: Complex[np.ndarray, "F p"]
+    """and those of A after its leading 1."""
+    h: Complex[np.ndarray, " F"]
+    weight: Float[np.ndarray, " F"]
+
+    def project(self, a: Float[np.ndarray, " p"]) -> "_Projection":
+        bottom = 1 + self.powers_a @ a
+        by_numerator = (self.weight / bottom)[:, None] * self.powers_b
+        q, triangle = np.linalg.qr(_real(by_numerator))
+        target = _real((self.weight * self.h)[:, None])[:, 0]
+        b = np.linalg.solve(triangle, q.T @ target)
+        residual = target - q @ (q.T @ target)
+        # What moves with the denominator: B/A, and the space of all B/A (Golub and Pereyra 1973).
+        slope = -self.powers_a / bottom[:, None]
+        moved = _real((by_numerator @ b)[:, None] * slope)
+        turned = np.stack([_real(x[:, None] * by_numerator).T @ residual for x in slope.T], axis=1)
+        jacobian = q @ (q.T @ moved) - moved - q @ np.linalg.solve(triangle.T, turned)
+        return _Projection(b, residual, jacobian)
+
+
+class _Projection(NamedTuple):
+    """What is best for a denominator."""
+
+    numerator: Float[np.ndarray, " q1"]
+    residual: Float[np.ndarray, " rows"]
+    jacobian: Float[np.ndarray, "rows p"]
+    """Of the residual, by the denominator's coefficients."""
+
+
+class _Trial(NamedTuple):
+    """The fit from one start."""
+
+    denominator: Float[np.ndarray, " p"]
     """Without its leading 1."""
-    numerator: Float[Array, "S q1"]
-    cost: Float[Array, " S"]
+    numerator: Float[np.ndarray, " q1"]
+    cost: float
     """Root mean square of the weighted residual."""
-    converged: Bool[Array, " S"]
+    converged: bool
 
 
-@quick_jit
-def _fit(
-    w: Complex[Array, " F"],
-    delay: Complex[Array, " F"],
-    h: Complex[Array, " F"],
-    weight: Float[Array, " F"],
-    poles: int,
-    zeros: int,
-    max_steps: int,
-) -> _Trials:
-    powers_b = delay[:, None] * w[:, None] ** jnp.arange(zeros + 1)
-    powers_a = w[:, None] ** (1 + jnp.arange(poles))
-    weight = weight[:, None] / jnp.sqrt(h.size)
-
-    def numerator(a):
-        """The best numerator for a denominator, and the residual that it leaves."""
-        columns = _real(weight * powers_b / (1 + powers_a @ a)[:, None])
-        target = _real(weight * h[:, None])[:, 0]
-        q, r = jnp.linalg.qr(columns)
-        b = jax.scipy.linalg.solve_triangular(r, q.T @ target)
-        return b, target - columns @ b
-
-    def linearized(a, _):
-        """One step of Sanathanan and Koerner: the old denominator as a weight."""
-        scale = weight / jnp.abs(1 + powers_a @ a)[:, None]
-        columns = _real(scale * jnp.concatenate([h[:, None] * powers_a, -powers_b], axis=1))
-        size = jnp.linalg.norm(columns, axis=0)
-        solution = jnp.linalg.lstsq(columns / size, -_real(scale * h[:, None])[:, 0])[0] / size
-        return solution[:poles], solution[:poles]
-
-    _, path = jax.lax.scan(linearized, jnp.zeros(poles), length=1 + max(_STARTS))
-    starts = path[jnp.array(_STARTS)]
-    solver = optx.LevenbergMarquardt(rtol=_ACCURACY, atol=_ACCURACY)
-
-    def refine(start):
-        # Coordinates in which the Jacobian at the start is orthonormal: those of `a` are so
-        # nearly dependent for poles close to z = 1 that damping would stall.
-        jacobian = jax.jacfwd(lambda a: numerator(a)[1])(start)
-        floor = _FLOOR * (jnp.linalg.norm(jacobian) + _FLOOR) * jnp.eye(poles)
-        scale = jnp.linalg.qr(jnp.concatenate([jacobian, floor]), mode="r")
-
-        def place(s):
-            return start + jax.scipy.linalg.solve_triangular(scale, s)
-
-        found = optx.least_squares(
-            lambda s, _: numerator(place(s))[1],
-            solver,
-            jnp.zeros(poles),
-            max_steps=max_steps,
-            throw=False,
-        )
-        a = place(found.value)
-        b, residual = numerator(a)
-        good = found.result == optx.RESULTS.successful
-        return _Trials(a, b, jnp.linalg.norm(residual), good)
-
-    return jax.lax.map(refine, starts)
+def _starts(problem: _Problem) -> Iterator[Float[np.ndarray, " p"]]:
+    """Steps of Sanathanan and Koerner: the old denominator as a weight."""
+    h, p = problem.h[:, None], problem.powers_a.shape[1]
+    a = np.zeros(p)
+    for step in range(1 + max(_STARTS)):
+        scale = (problem.weight / np.abs(1 + problem.powers_a @ a))[:, None]
+        columns = _real(scale * np.concatenate([h * problem.powers_a, -problem.powers_b], axis=1))
+        size = np.linalg.norm(columns, axis=0)
+        a = (np.linalg.lstsq(columns / size, -_real(scale * h)[:, 0])[0] / size)[:p]
+        if step in _STARTS:
+            yield a
 
 
-def _real(z: Complex[Array, "F n"]) -> Float[Array, "rows n"]:
-    return jnp.concatenate([z.real, z.imag])
+def _refined(problem: _Problem, start: Float[np.ndarray, " p"], max_steps: int) -> _Trial:
+    def linearize(a):
+        found = problem.project(a)
+        return found.residual, found.jacobian
+
+    a, converged = gauss_newton(linearize, start, max_steps, settled_gain=_ACCURACY**2)
+    found = problem.project(a)
+    return _Trial(a, found.numerator, float(np.linalg.norm(found.residual)), converged)
+
+
+def _real(z: Complex[np.ndarray, "F n"]) -> Float[np.ndarray, "rows n"]:
+    return np.concatenate([z.real, z.imag])
