@@ -9,7 +9,8 @@ Printed: period, largest value of the first state, logarithm of the multiplier, 
 seconds of the processor for it.
 
 The hopper on a compliant ground by mpmath: linear in each chart, hence matrix exponentials, and
-Newton's method with them for the times of the events. Printed: the state at t = 0.5, multipliers.
+Newton's method with them for the times of the events. Printed: the state at t = 0.5, multipliers,
+times from there to both events, residual.
 """
 
 import argparse
@@ -125,8 +126,8 @@ def compliant_hopper():
 
     def turn(q):
         z = mp.matrix([*q, 1, 0, -1])  # t = 0.5: sin = 0, cos = -1
-        t1, z1, P1 = until(contact, z, lift, mp.mpf("0.2"))
-        t2, z2, P2 = until(flight, z1, touch, mp.mpf("0.5"))
+        t1, z1, P1 = until(contact, z, lift, mp.mpf("0.0163"))
+        t2, z2, P2 = until(flight, z1, touch, mp.mpf("0.8347"))
         P3 = mp.expm(contact * (1 - t1 - t2))
         jumps = []
         for before, after, row, x in ((contact, flight, lift, z1), (flight, contact, touch, z2)):
@@ -140,7 +141,7 @@ def compliant_hopper():
         residual = end[:4] - q
         q -= mp.lu_solve(P[:4, :4] - mp.eye(4), residual)
     values = sorted(mp.eig(P[:4, :4])[0], key=lambda x: -abs(x))
-    return q, values, times, mp.norm(residual)
+    return [mp.nstr(x, 20) for x in (*q, *values, *times, mp.norm(residual))]
 
 
 if __name__ == "__main__":
@@ -149,8 +150,7 @@ if __name__ == "__main__":
     parser.add_argument("--only", default="")
     options = parser.parse_args()
     if options.only in "compliant hopper":
-        q, values, times, residual = compliant_hopper()
-        print("compliant hopper", *(mp.nstr(x, 20) for x in (*q, *values, *times, residual)))
+        print("compliant hopper", *compliant_hopper(), flush=True)
     for name, case in CASES.items():
         if options.only in name:
             print(name, *(repr(float(x)) for x in cycle(*case, options.rtol)), flush=True)

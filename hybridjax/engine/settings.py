@@ -95,7 +95,14 @@ class Settings(eqx.Module):
         return Settings(rtol, atol, self.max_steps, self.scale)
 
     def system(self, system: HybridSystem) -> HybridSystem:
-        """The system, integrated by the solver that is asked for."""
+        """The system, integrated by the solver that is asked for.
+
+        **Raises:** `DefinitionError` for "auto".
+        """
+        if self.solver == "auto":
+            raise DefinitionError(
+                '`solver="auto"` is for `find_limit_cycle`: name one here, such as `hj.Radau()`.'
+            )
         return system if self.solver is None else integrated(system, self.solver)
 
 

@@ -148,8 +148,6 @@ def simulate(
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings
-    if settings.solver == "auto":
-        raise DefinitionError('`solver="auto"` is for limit cycles: name one, e.g. `hj.Radau()`.')
     system = settings.system(system)
     check_system(system)
     s = Structure(system)

@@ -23,6 +23,7 @@ from .fine_factors import fine_factors, weakest
 from .liouville import log_determinant
 from .return_map import ReturnMap
 from .scale import sizes_of
+from .stiffness import stiff_charts
 
 
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
@@ -210,6 +211,16 @@ class LimitCycle(eqx.Module):
             f"  events       {events}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"
+            + self._stiffness()
+        )
+
+    def _stiffness(self) -> str:
+        """What limits explicit steps, if a chart is stiff."""
+        stiff = stiff_charts(Structure(self.system), to_host(self.legs), float(self.period))
+        return "".join(
+            f"\n  stiff        chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps "
+            'of an explicit method; `Settings(solver="auto")` takes an implicit one'
+            for name, rate in stiff.items()
         )
 
 

@@ -252,6 +252,8 @@ def check_system(system: HybridSystem) -> None:
         raise DefinitionError(f"{type(system).__name__} has no charts.")
     _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
     s = Structure(system)
+    for name in system.solver.names if isinstance(system.solver, ByChart) else ():
+        s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         for unknown in set(chart.inputs or ()) - set(system.inputs):
             raise DefinitionError(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from ...systems.solver import Method
 from .step import LaneField, Step
@@ -26,7 +26,7 @@ _ITERATIONS = 12
 # less than this part of what it moved by before. Nearer to 1, they chase rounding errors.
 _ROUNDINGS, _SHRINKS = 4.0, 0.5
 # Columns up to which an elimination is written out. Twice as many compile for twice as long.
-_WRITTEN_OUT = 12
+_WRITTEN_OUT = 4
 
 
 class _Decoupled(NamedTuple):
@@ -152,11 +152,11 @@ def _shifted(J, g):
     return jnp.eye(len(J))[..., None] - g * J
 
 
-def _apply(matrix: Float[Array, "n m L"], x: Float[Array, "m L"]) -> Float[Array, "n L"]:
+def _apply(matrix: Inexact[Array, "n m #L"], x: Inexact[Array, "m L"]) -> Inexact[Array, "n L"]:
     return jnp.sum(matrix * x, axis=1)
 
 
-def inverse(matrix: Float[Array, "n n L"]) -> Float[Array, "n n L"]:
+def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
     """Inverses of many small matrices, by Gauss and Jordan's elimination with pivots."""
     n = len(matrix)
     rows = np.arange(n)[:, None]
