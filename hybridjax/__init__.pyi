@@ -72,6 +72,7 @@ from .sections.kinematic import KinematicPhase as KinematicPhase
 from .sections.section_list import SectionList as SectionList
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
+from .systems.solver import Radau as Radau
 from .systems.system import (
     Guess as Guess,
     HybridSystem as HybridSystem,

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from ..systems.structure import Structure
 from . import kernels
 from .lanes import Lanes
-from .solver.tableau import VERNER76
+from .solver.tableau import method_of
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
 from .target import Target
 from .watch import ChartFlow, slopes
@@ -87,6 +87,16 @@ def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
     moves = _moves(lanes, tape)
     found, f, n = _linear_moves(s, moves, target), _fields(s, moves), 1 + s.d
     return [Link(*x) for x in zip(moves.chart.tolist(), f.T, found.by[:, :, :n], strict=True)]
+
+
+def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
+    """The divergence of the field, integrated over the moves of one lane, up to their ends."""
+    moves, total = _moves(lanes, tape), 0.0
+    for a in np.unique(moves.chart):
+        here = moves.chart == a
+        t, q, h = moves.t[here], moves.q[: s.dims[a], here], moves.h[here]
+        total += kernels.divergence(s, int(a), t, q, np.zeros((s.nu, 1)), h).sum()
+    return total
 
 
 def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
@@ -189,12 +199,16 @@ def _step(s: Structure, a: int, t, q, u, h):
     the start, and the field (n, M) at the end."""
     n, M = q.shape
     m = 2 + n + s.nu
-    stages = len(VERNER76.b_sol) + 1
+    method = method_of(s, a)
+    if method.implicit:
+        found = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
+        return found[:, :, 0].T, found[:, :, 2:], found[:, :, 1].T
+    stages = len(method.b) + 1
     K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
-    rows = [np.zeros(0), *VERNER76.a_lower, VERNER76.b_sol]
-    for i, (row, c) in enumerate(zip(rows, [0.0, *VERNER76.c, 1.0], strict=True)):
+    rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]
+    for i, (row, c) in enumerate(zip(rows, [*method.c, 1.0], strict=True)):
         slope = (row @ K.reshape(stages, -1)[:i]).reshape(n, M)
         dslope = (row @ dK.reshape(stages, -1)[:i]).reshape(M, n, m)
         state, dstate = q + h * slope, straight + h[:, None, None] * dslope

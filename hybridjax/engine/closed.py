@@ -16,6 +16,7 @@ from jaxtyping import Array
 from .._core.compilation.fingerprint import Program
 from ..systems.chart import Chart
 from ..systems.output import Output
+from ..systems.solver import Method
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled, Transition
@@ -36,6 +37,7 @@ class _Event(NamedTuple):
 class _Chart(NamedTuple):
     name: str
     states: tuple[str, ...]
+    solver: Method | None
     field: Program
 
 
@@ -100,6 +102,10 @@ class _ClosedChart(Chart):
     def states(self) -> tuple[str, ...]:
         return self.closed.states
 
+    @property
+    def solver(self) -> Method | None:
+        return self.closed.solver
+
     def field(self, t, q, u):
         return self.closed.field(self.numbers, t, q, u)
 
@@ -143,7 +149,7 @@ def close(
 
     def chart(a: int) -> _Chart:
         field = program(lambda s, z, levels, *x: s.field(a, *x), *at(a))
-        return _Chart(s.names[a], tuple(map(str, s.charts[a].states)), field)
+        return _Chart(s.names[a], tuple(map(str, s.charts[a].states)), s.method(a), field)
 
     def event(g: int, x: Transition) -> _Event:
         point, by_clock = at(s.chart_index(x.source)), isinstance(x.guard, Scheduled)

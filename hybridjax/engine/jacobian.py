@@ -11,8 +11,8 @@ from .._core.executor import Array, namespace, on_host
 from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .chain import chain
-from .lanes import Lanes
-from .move import constant, record, retrace
+from .lanes import Lanes, constant
+from .move import record, retrace
 from .search.search import Moved
 from .settings import Settings
 from .tape import Tape

@@ -11,9 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..systems.output import Output
+from ..systems.solver import Radau, as_method
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .solver.step import Step, rk_step
+from .solver import take_step
+from .solver.implicit import integrated_divergence
+from .solver.step import Step
+from .solver.tableau import method_of
 from .target import AbstractLevels
 
 
@@ -45,6 +49,45 @@ def step(
 ) -> Step:
     """A step in chart a, without derivatives."""
     return Step(*s.kernel(_step, a)(t, q, u, h, some=some))
+
+
+def step_along(
+    s: Structure,
+    a: int,
+    t: Float[np.ndarray, " #L"],
+    q: Float[np.ndarray, "n L"],
+    u: Float[np.ndarray, "nu #L"],
+    h: Float[np.ndarray, " #L"],
+    along: Float[np.ndarray, "n L"],
+) -> tuple[Step, Float[np.ndarray, "n L"], Float[np.ndarray, "n L"]]:
+    """A step in chart a, and the derivatives of its end and of its error along a direction."""
+    found = s.kernel(_step_along, a)(t, q, u, h, along)
+    return Step(*found[:4]), found[4], found[5]
+
+
+def linear_step(
+    s: Structure,
+    a: int,
+    t: Float[np.ndarray, " L"],
+    q: Float[np.ndarray, "n L"],
+    u: Float[np.ndarray, "nu L"],
+    h: Float[np.ndarray, " L"],
+) -> Float[np.ndarray, "n c L"]:
+    """The end of a step in chart a, the field there, and the derivatives of the end by time,
+    states, inputs and length of the step."""
+    return s.kernel(_linear_step, a, lanes=_POINTS)(t, q, u, h)
+
+
+def divergence(
+    s: Structure,
+    a: int,
+    t: Float[np.ndarray, " L"],
+    q: Float[np.ndarray, "n L"],
+    u: Float[np.ndarray, "nu #L"],
+    h: Float[np.ndarray, " L"],
+) -> Float[np.ndarray, " L"]:
+    """The divergence of the field of chart a, integrated over steps."""
+    return s.kernel(_divergence, a, lanes=_MANY_POINTS)(t, q, u, h)
 
 
 def watched(
@@ -125,8 +168,50 @@ def _field(a: int, system: HybridSystem, t, q, u):
 
 
 def _step(a: int, system: HybridSystem, t, q, u, h):
-    field = Structure(system).by_lane(lambda s, t, q, u: s.field(a, t, q, u))
-    return jnp.stack(rk_step(lambda t, q: field(t, q, u), t, q, h))
+    return jnp.stack(take_step(*_method_and_field(a, system, u), t, q, h))
+
+
+def _step_along(a: int, system: HybridSystem, t, q, u, h, along):
+    method, field = _method_and_field(a, system, u)
+    step = lambda q: take_step(method, field, t, q, h, still=field)  # noqa: E731
+    value, tangent = jax.jvp(step, (q,), (along,))
+    return jnp.stack([*value, tangent.q, tangent.error])
+
+
+def _linear_step(a: int, system: HybridSystem, t, q, u, h):
+    def end(t, q, u, h):
+        method, field = _method_and_field(a, system, u)
+        still = _method_and_field(a, system, jax.lax.stop_gradient(u))[1]
+        step = take_step(method, field, t, q, h, still=still)
+        return step.q, step.f1
+
+    n, L = q.shape
+    shapes = [x.shape[:-1] for x in (t, q, u, h)]
+    split = np.cumsum([1, n, len(u)])
+
+    def push(direction):
+        parts = jnp.split(direction, split)
+        tangents = [
+            jnp.broadcast_to(x.reshape(*shape, 1), (*shape, L))
+            for x, shape in zip(parts, shapes, strict=True)
+        ]
+        (value, f), (tangent, _) = jax.jvp(end, (t, q, u, h), tuple(tangents))
+        return value, f, tangent
+
+    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(jnp.eye(split[-1] + 1))
+    return jnp.concatenate([value[:, None], f[:, None], columns], axis=1)
+
+
+def _divergence(a: int, system: HybridSystem, t, q, u, h):
+    method, field = _method_and_field(a, system, u)
+    method = method if method.implicit else as_method(Radau())
+    return integrated_divergence(method, field, t, q, h)
+
+
+def _method_and_field(a: int, system: HybridSystem, u):
+    s = Structure(system)
+    field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u))
+    return method_of(s, a), lambda t, q: field(t, q, u)
 
 
 def _watched(a: int, system: HybridSystem, levels: AbstractLevels | None, t, q, u, index):

@@ -57,6 +57,13 @@ def only(mask: Bool[Array, " L"], x: Array) -> Array:
     return xp.where(mask, x, lane(x, xp.argmax(mask)))
 
 
+def constant(tree):
+    """The same numbers without derivatives."""
+    return jax.tree_util.tree_map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree
+    )
+
+
 def needed(mask: Bool[Array, " L"], tree):
     """`tree` itself, without derivatives if `mask` has no lanes.
 

@@ -12,7 +12,7 @@ from .._core.lanes.per_lane import shared
 from .._core.lanes.vmap_as_lanes import vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
-from .lanes import Lanes
+from .lanes import Lanes, constant
 from .replay import replay
 from .search.search import Moved, Options, Recorded, search
 from .search.stride import Stride, initial_step, stride
@@ -84,13 +84,6 @@ def _begin(s: Structure, lanes, u, target, settings, setout, result, options) ->
     if on_host(lanes.t):
         return search(s, lanes, u, target, setout, result, settings, options)
     return _move(s.source, lanes, u, target, constant(setout), result, settings, options)
-
-
-def constant(tree):
-    """The same numbers without derivatives."""
-    return jax.tree_util.tree_map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree
-    )
 
 
 @eqx.filter_jit

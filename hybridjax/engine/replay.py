@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .events import apply_resets, scheduled_time
-from .lanes import Lanes, for_each_chart, needed, only
-from .solver.step import Step, rk_step
+from .lanes import Lanes, constant, for_each_chart, needed, only
+from .solver import take_step
+from .solver.step import Step
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
 from .target import Target
 from .watch import ChartFlow
@@ -91,11 +92,12 @@ def _advance(
         goal = dataclasses.replace(target, levels=levels, index=only(here, target.index))
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
         flow = ChartFlow(Structure(own), a, u0, goal)
+        still = ChartFlow(Structure(constant(own)), a, constant(u0), goal)
         crossing = jnp.where(here, which, -1)
         # (A branch of its own, lest XLA masks the states again in every stage.)
         step = jax.lax.cond(
             here.any(),
-            lambda: rk_step(flow.field, t0, q0, h0, unroll),
+            lambda: take_step(flow.method, flow.field, t0, q0, h0, unroll, still.field),
             lambda: Step(q0, q0, q0, q0),
         )
         q1, t1 = step.q, t0 + h0

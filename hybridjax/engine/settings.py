@@ -1,7 +1,8 @@
 """Accuracy and effort of the flow, and every accuracy that the package takes by default."""
 
 import functools as ft
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -14,6 +15,8 @@ from .._core.executor import Array, namespace
 from .._core.precision import at_precision, real
 from .._core.text import fields
 from ..errors import DefinitionError
+from ..systems.solver import Solver, solvers
+from ..systems.system import HybridSystem, integrated
 from .solver.step import Step
 
 
@@ -65,6 +68,10 @@ class Settings(eqx.Module):
     """Sizes that states usually have, by chart, padded to the dimension of the largest with
     anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
     enough for derivatives."""
+    solver: Any = eqx.field(static=True)
+    """How charts are integrated, if not as the system says: a Runge-Kutta method of diffrax with an
+    error estimate, `hj.Radau()`, or several of them by the names of charts; or "auto", for
+    `find_limit_cycle`: an implicit one where the cycle turns out to be stiff."""
 
     def __repr__(self):
         return fields(self)
@@ -77,14 +84,26 @@ class Settings(eqx.Module):
         atol: PositiveScalar | None = None,
         max_steps: StepCount = 256,
         scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
+        solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = map(_kept, (rtol, atol, scale))
-        self.max_steps = max_steps
+        self.max_steps, self.solver = max_steps, solvers(solver)
 
     def filled(self, accuracy: float) -> "Settings":
         """With this accuracy where none is given."""
         rtol, atol = (accuracy if x is None else x for x in (self.rtol, self.atol))
         return Settings(rtol, atol, self.max_steps, self.scale)
+
+    def system(self, system: HybridSystem) -> HybridSystem:
+        """The system, integrated by the solver that is asked for.
+
+        **Raises:** `DefinitionError` for "auto".
+        """
+        if self.solver == "auto":
+            raise DefinitionError(
+                '`solver="auto"` is for `find_limit_cycle`: name one here, such as `hj.Radau()`.'
+            )
+        return system if self.solver is None else integrated(system, self.solver)
 
 
 def _kept(x: Array | float | None) -> Array | None:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, namespace, put
+from .._core.executor import Array, namespace, on_host, put
 from .lanes import Lanes
 
 
@@ -44,5 +44,9 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
-    """The tape with its row i filled in. (Outside of any branch, where it is done in place.)"""
+    """The tape with its row i filled in: in place on the host, and by XLA outside of branches."""
+    if on_host(tape.h):
+        for x, y in zip(tape, row, strict=True):
+            x[i] = y
+        return tape
     return Tape(*(put(x, i, y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))

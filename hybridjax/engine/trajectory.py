@@ -147,6 +147,8 @@ def simulate(
     and the step limit, if `throw`.
     """
     require_x64(system, settings)
+    settings = Settings() if settings is None else settings
+    system = settings.system(system)
     check_system(system)
     s = Structure(system)
     a = s.chart_index(chart)
@@ -156,7 +158,7 @@ def simulate(
             f"chart '{chart}' has the states {', '.join(s.charts[a].states)}, so the start needs "
             f"shape ({s.dims[a]},); it has {start.state.shape}."
         )
-    settings = (Settings() if settings is None else settings).filled(SIMULATION)
+    settings = settings.filled(SIMULATION)
     u = _constant_input(s, input)[:, None]
     if callable(input):
         system = Driven(system, input)

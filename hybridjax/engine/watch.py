@@ -11,10 +11,13 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import Array, namespace, on_host, put
 from .._core.lanes.per_lane import shared
+from ..systems.solver import Method
 from ..systems.structure import Structure
 from . import kernels
 from .lanes import for_each_chart, only
-from .solver.step import LaneField, Step, rk_step, short_step
+from .solver import take_step
+from .solver.step import LaneField, Step, short_step
+from .solver.tableau import method_of
 from .target import Target
 
 
@@ -63,6 +66,10 @@ class ChartFlow(NamedTuple):
     """On the host, the lanes that are needed; all, if that is not said."""
 
     @property
+    def method(self) -> Method:
+        return method_of(self.s, self.a)
+
+    @property
     def field(self) -> LaneField:
         return chart_field(self.s, self.a, self.u, self.some)
 
@@ -84,10 +91,25 @@ class ChartFlow(NamedTuple):
         h: Float[Array, " #L"],
         unroll: bool = False,
     ) -> Step:
-        """A step from (t, q) over h (see `rk_step`)."""
+        """A step from (t, q) over h (see `take_step`)."""
         if on_host(q):
             return kernels.step(self.s, self.a, t, q, self.u, h, self.some)
-        return rk_step(self.field, t, q, h, unroll)
+        return take_step(self.method, self.field, t, q, h, unroll)
+
+    def step_along(
+        self,
+        t: Float[Array, " #L"],
+        q: Float[Array, "n L"],
+        h: Float[Array, " #L"],
+        along: Float[Array, "n L"],
+    ) -> tuple[Step, Float[Array, "n L"], Float[Array, "n L"]]:
+        """A step, and the derivatives of its end and of its error along a direction of states."""
+        if on_host(q):
+            return kernels.step_along(self.s, self.a, t, q, self.u, h, along)
+        field = self.field
+        step = lambda q: take_step(self.method, field, t, q, h, still=field)  # noqa: E731
+        value, tangent = jax.jvp(step, (q,), (along,))
+        return value, tangent.q, tangent.error
 
     def watch(
         self, t: Float[Array, " #L"], q: Float[Array, "n L"], f: Float[Array, "n L"]

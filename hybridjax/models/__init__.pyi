@@ -2,7 +2,9 @@ from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
 from .buck import BuckConverter as BuckConverter
 from .compass import CompassGait as CompassGait
+from .compliant import CompliantHopper as CompliantHopper
 from .duffing import Duffing as Duffing
+from .fitzhugh import FitzHughNagumo as FitzHughNagumo
 from .flap import RotorFlap as RotorFlap
 from .hopf import HopfOscillator as HopfOscillator
 from .hopper import VerticalHopper as VerticalHopper

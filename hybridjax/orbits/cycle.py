@@ -20,8 +20,10 @@ from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .fine_factors import fine_factors, weakest
+from .liouville import log_determinant
 from .return_map import ReturnMap
 from .scale import sizes_of
+from .stiffness import stiff_charts
 
 
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
@@ -30,6 +32,8 @@ _RANK = 1e-9
 # A piece of the turn contracts too much if its weakest direction keeps less than this: of 16
 # digits, so many are lost. Doubled, one more turn is computed a little more often.
 _CONTRACTS = 1e-6
+# Multipliers below this are lost in the errors of implicit steps. Doubled, so are larger ones.
+_LEAST_OF_IMPLICIT = 1e-10
 
 
 @checked_methods
@@ -101,7 +105,8 @@ class LimitCycle(eqx.Module):
         Computed from the factors without forming their product, so that small ones are right
         too; where one of the pieces contracts so much that it drowns in rounding, from single
         steps of one more turn. Zeros that stem from resets and sections are counted by rank and
-        left out; 0 stands for what is too small for a number, below 1e-308. Each conserved quantity
+        left out; 0 stands for what is too small for a number, below 1e-308, or with an implicit
+        method for what its steps forget, below 1e-10. Each conserved quantity
         that the cycle was chosen by stands for a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
@@ -109,12 +114,42 @@ class LimitCycle(eqx.Module):
         # (Of an autonomous flow, the weakest direction is its own, which was taken out.)
         besides = 0 if self.clocked else 1
         went_round = np.isfinite(self.residual)
-        if went_round and min(weakest(block, besides) for block in blocks) < _CONTRACTS:
+        strong = went_round and min(weakest(block, besides) for block in blocks) < _CONTRACTS
+        if strong:
             blocks = fine_factors(self.return_map)
         values = product_eigenvalues(blocks, rtol=_RANK)
+        if strong and self._implicit:
+            values = self._resolved(values)
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
+        return values
+
+    @property
+    def _implicit(self) -> bool:
+        """Whether an implicit method goes through a chart, which forgets what decays fast."""
+        methods = [Structure(self.system).method(a) for a in range(len(self.system.charts()))]
+        return any(method is not None and method.implicit for method in methods)
+
+    @remembered
+    def log_multipliers(self) -> Float[np.ndarray, " r"]:
+        """Natural logarithms of the moduli of `multipliers`, also of one that is too small for a
+        number if the cycle has no events: by Liouville's formula, the sum of all is the divergence
+        of the field, integrated over one turn. Otherwise it is minus infinity."""
+        with np.errstate(divide="ignore"):
+            logs = np.log(np.abs(self.multipliers))
+        if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:
+            logs[-1] = log_determinant(self.return_map) - np.sum(logs[:-1])
+        return logs
+
+    def _resolved(self, values: Complex[np.ndarray, " r"]) -> Complex[np.ndarray, " r"]:
+        """The multipliers that implicit steps resolve; 0 for the others. If only one is not, and
+        there are no events, it follows from the product of all."""
+        lost = np.abs(values) < _LEAST_OF_IMPLICIT
+        values = np.where(lost, 0.0, values)
+        if lost.sum() == 1 and not self.event_sequence:
+            others = np.prod(values[~lost]).real
+            values[lost] = np.exp(log_determinant(self.return_map)) / others
         return values
 
     def _blocks(self) -> list[np.ndarray]:
@@ -165,7 +200,8 @@ class LimitCycle(eqx.Module):
             f"{name} = {number(x, 9, unit)}"
             for (name, x), unit in zip(self.state.items(), units, strict=True)
         )
-        multipliers = ", ".join(_format(z) for z in self.multipliers) or "none but zero"
+        least = "1e-10" if self._implicit else "1e-308"
+        multipliers = ", ".join(_format(z, least) for z in self.multipliers) or "none but zero"
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
         return (
@@ -175,6 +211,16 @@ class LimitCycle(eqx.Module):
             f"  events       {events}\n"
             f"  multipliers  {multipliers}\n"
             f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"
+            + self._stiffness()
+        )
+
+    def _stiffness(self) -> str:
+        """What limits explicit steps, if a chart is stiff."""
+        stiff = stiff_charts(Structure(self.system), to_host(self.legs), float(self.period))
+        return "".join(
+            f"\n  stiff        chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps "
+            'of an explicit method; `Settings(solver="auto")` takes an implicit one'
+            for name, rate in stiff.items()
         )
 
 
@@ -186,7 +232,7 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
         )
 
 
-def _format(z: complex) -> str:
+def _format(z: complex, least: str) -> str:
     if z == 0:
-        return "below 1e-308"
+        return f"below {least}"
     return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"

@@ -11,6 +11,7 @@ from ..systems.structure import Structure
 from .conserved import conserved_outputs
 from .cycle import LimitCycle
 from .return_map import LEGS, Turn
+from .stiffness import fastest, points
 
 
 # Events coincide if no more than this part of the period lies between them. Doubled, so do events
@@ -89,19 +90,18 @@ def _about_stops(cycle: LimitCycle, turn: Turn, expected: float) -> str:
 
 def _about_stiffness(cycle: LimitCycle, turn: Turn, expected: float) -> str:
     """Which mode asks for so many steps, if one does."""
-    s, fastest = Structure(cycle.system), 0.0
+    s, rate = Structure(cycle.system), 0.0
     if turn.result != Result.STEP_LIMIT:
         return ""
-    for a, t, q in _points(s, turn):
-        derivative = kernels.field(s, a, t, q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q)]
-        rates = np.linalg.eigvals(np.moveaxis(derivative, -1, 0)).real
-        fastest = max(fastest, -float(rates.min()))
-    if fastest * expected / LEGS < _STIFF:
+    for a, t, q in points(s, turn.legs):
+        rate = max(rate, float(fastest(s, a, t, q).max()))
+    if rate * expected / LEGS < _STIFF:
         return ""
     return (
-        f" The system is stiff: a mode decays in a time of {1 / fastest:.2g}, in a period of "
-        f"{expected:.3g}, and steps are as short as that also where it is at rest. Allow more of "
-        "them, e.g. `settings=Settings(max_steps=20_000)`."
+        f" The system is stiff: a mode decays in a time of {1 / rate:.2g}, in a period of "
+        f"{expected:.3g}, and steps of explicit methods are as short as that also where it is at "
+        'rest. Use an implicit one, e.g. `settings=Settings(solver="auto")`, or allow more steps, '
+        "e.g. `settings=Settings(max_steps=20_000)`."
     )
 
 
@@ -111,7 +111,7 @@ def _about_guards(cycle: LimitCycle, turn: Turn) -> str:
     if events_of(turn) or not s.transitions:
         return ""
     seen: dict[int, list[float]] = {}
-    for a, t, q in _points(s, turn):
+    for a, t, q in points(s, turn.legs):
         if guards := s.guards(a):
             u, index = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
             rows = kernels.watched(s, a, None, t, q, u, index)[:, 0]
@@ -124,12 +124,3 @@ def _about_guards(cycle: LimitCycle, turn: Turn) -> str:
         for g, values in seen.items()
     )
     return f" No event happened: {told}. Check its direction, and the guess." if told else ""
-
-
-def _points(s: Structure, turn: Turn):
-    """Charts, times and states at the beginnings of the pieces, as far as the flow came."""
-    t, chart, q = map(np.asarray, (turn.legs.t, turn.legs.chart, turn.legs.q))
-    for a in np.unique(chart):
-        here = (chart == a) & np.isfinite(q).all(axis=0)
-        if here.any():
-            yield int(a), t[here], q[: s.dims[a], here]

@@ -20,8 +20,9 @@ from ..engine.target import until
 from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
 from ..sections.crossing import AtEvent, Crossing
+from ..systems.solver import Radau
 from ..systems.structure import Structure, check_system
-from ..systems.system import Guess, HybridSystem
+from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
 from .conserved import check_conserved
 from .cycle import LimitCycle
@@ -30,6 +31,7 @@ from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
+from .stiffness import stiff_charts
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the
@@ -90,8 +92,9 @@ def find_limit_cycle(
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
         do not depend on units (under a JAX transformation, on the guess).
-    - `settings`: accuracy of the flow, 1e-12 by default, and how many steps it may take, which
-        `linearize` takes over.
+    - `settings`: accuracy of the flow, 1e-12 by default, how many steps it may take, which
+        `linearize` takes over, and its `solver`; "auto" takes an implicit one in those charts that
+        are stiff on the cycle.
     - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
 
     **Raises:** `DefinitionError` for bad arguments, and for functions that depend on time otherwise
@@ -104,12 +107,20 @@ def find_limit_cycle(
     followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
     cycle that was not found mean nothing, and are NaN as a rule.
     """
+    settings = Settings() if settings is None else settings
+    if settings.solver == "auto":
+        options = {
+            "section": section, "multiplicity": multiplicity, "conserved": conserved,
+            "scale": scale, "throw": throw,
+        }  # fmt: skip
+        return _find_by_itself(system, guess, settle, max_period, settings, options)
+    system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system, guess, section, settings)
         check_system(system)
     s = Structure(system)
-    settings = (Settings() if settings is None else settings).filled(LIMIT_CYCLE)
+    settings = settings.filled(LIMIT_CYCLE)
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     check_section(s, section)
@@ -163,6 +174,21 @@ def find_limit_cycle(
     if throw and code != Result.OK:
         raise ComputationError(explain(cycle, solution.turn, float(map.expected)))
     return cycle
+
+
+def _find_by_itself(system, guess, settle, max_period, settings, options) -> LimitCycle:
+    """The cycle with an implicit method in those charts that are stiff on it."""
+    settings = dataclasses.replace(settings, solver=None)
+    everywhere = integrated(system, Radau())
+    cycle = find_limit_cycle(
+        everywhere, guess, settle=settle, max_period=max_period, settings=settings, **options
+    )
+    s = Structure(integrated(system, None))
+    stiff = stiff_charts(s, to_host(cycle.legs), float(cycle.period))
+    if cycle.result != Result.OK or len(stiff) == len(s.names):
+        return cycle
+    fitting = integrated(system, dict.fromkeys(stiff, Radau()))
+    return find_limit_cycle(fitting, cycle, settings=settings, **options)
 
 
 def _in_sizes(

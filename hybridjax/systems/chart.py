@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.signal import signals
 from .._core.text import listed
+from .solver import Method, Solver
 
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ class Chart(eqx.Module):
     - `units`: their units, in the same order, for figures and prints; none, or one for each.
     - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
         stand in `u` (the map g_a of the paper: the others are thrown away). `None` means all.
+    - `solver`: how the chart is integrated: a Runge-Kutta method of diffrax with an error estimate,
+        or `hj.Radau()`. `None` means the explicit pair of order 7, which is best where nothing is
+        stiff. A `solver` of the system goes before it.
     - `absent`: values of states that this chart does not carry although outputs and sections may
         ask for them there, e.g. `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """
@@ -49,6 +53,7 @@ class Chart(eqx.Module):
     units: ClassVar[tuple[str, ...]] = ()
     inputs: ClassVar[tuple[str, ...] | None] = None
     absent: ClassVar[Mapping[str, float]] = {}
+    solver: ClassVar[Solver | Method | None] = None
 
     @abc.abstractmethod
     def field(self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]) -> Any:

@@ -20,6 +20,7 @@ from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output
+from .solver import ByChart, Method, as_method
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
 
@@ -97,6 +98,18 @@ class Structure:
         if name not in names:
             raise DefinitionError(f"there is no event '{name}'; events are {_list(names)}.")
         return names.index(name)
+
+    def method(self, a: int) -> Method | None:
+        """The method by which chart a is integrated, as the system says or the chart; `None` for
+        the default.
+
+        **Raises:** `DefinitionError` for a solver that is none with an error estimate.
+        """
+        system = self.system.system if isinstance(self.system, Driven) else self.system
+        solver = type(system).solver if system.solver is None else system.solver
+        solver = solver.get(self.names[a]) if isinstance(solver, ByChart) else solver
+        solver = self.charts[a].solver if solver is None else solver
+        return None if solver is None else as_method(solver)
 
     def chart_input(self, a: int, t: ArrayLike, u: jax.Array) -> jax.Array:
         """g_a(û): the inputs that chart a uses."""
@@ -239,6 +252,8 @@ def check_system(system: HybridSystem) -> None:
         raise DefinitionError(f"{type(system).__name__} has no charts.")
     _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
     s = Structure(system)
+    for name in system.solver.names if isinstance(system.solver, ByChart) else ():
+        s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         for unknown in set(chart.inputs or ()) - set(system.inputs):
             raise DefinitionError(
@@ -248,6 +263,7 @@ def check_system(system: HybridSystem) -> None:
         if len(set(chart.states)) < len(chart.states):
             raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
         _check_units(f"chart '{name}'", "states", chart.states, chart.units)
+        s.method(a)
         shape = _shape(f"field of chart '{name}'", lambda t, q, u, a=a: s.field(a, t, q, u), s, a)
         if shape != (s.dims[a],):
             raise DefinitionError(

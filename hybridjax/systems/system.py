@@ -1,6 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
+import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -15,6 +16,7 @@ from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
+from .solver import ByChart, Solver, solvers
 from .transition import Transition
 
 
@@ -85,12 +87,18 @@ class HybridSystem(Definition):
     `charts` (and where there are events, `transitions`) are written by every system; `period`,
     `outputs` and `guess` where they apply. The class attribute `inputs` names the exogenous
     inputs û; `inputs = ()` for a system without. `input_units` gives their units in the same order
-    (none, or one for each), and `time_unit` that of time.
+    (none, or one for each), and `time_unit` that of time. `solver`, a keyword of every constructor,
+    says how charts are integrated: all of them, or some by name (`{"stance": hj.Radau()}`); it goes
+    before what the charts say themselves (`Chart.solver`).
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("u",)
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
+
+    solver: Solver | ByChart | None = eqx.field(
+        static=True, default=None, kw_only=True, converter=solvers
+    )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)
@@ -123,9 +131,18 @@ class HybridSystem(Definition):
     def __repr__(self):
         rows = []
         for field in dataclasses.fields(self):
+            if field.name == "solver" and self.solver is None:
+                continue
             unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
             rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
         return type(self).__name__ + columns(rows)
+
+
+def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
+    """The same system, integrated by this solver, or by solvers by the names of charts."""
+    other = copy.copy(system)
+    object.__setattr__(other, "solver", solvers(solver))
+    return other
 
 
 class Driven(HybridSystem):

@@ -10,8 +10,8 @@ from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..events import width
 from ..hermite import NEAR, control_points, root_near_end
-from ..lanes import for_each_chart, only
-from ..settings import size, tolerance
+from ..lanes import Lanes, for_each_chart, only
+from ..settings import Settings, size, tolerance
 from ..solver.step import Step, rounding_error
 from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
 from .aim import Aim
@@ -36,8 +36,8 @@ _LAST_CORRECTION_OF_SPAN = 1e-14, 5e-6
 # From the end of a step that is at most this part of the one in which the zero was seen, the cubic
 # between its ends is a worse guess of the zero than Newton's. Twice as much: hardly a difference.
 _SHORT_STEP = 1e-3
-# The error of a derivative is seen by a step that starts aside, by this part of the state's size in
-# a direction that no system is made for. Twice as much: less rounding, more of second derivatives.
+# The error of a derivative is seen by a step that starts aside, by this part of the state's size.
+# Twice as much: less rounding, more of second derivatives.
 _ASIDE = 1e-4
 
 
@@ -60,6 +60,8 @@ class Attempt(NamedTuple):
 
     Step control looks at the states only; where those are simple, a guard may still turn many
     times within a step."""
+    along: Float[Array, "d L"] | None
+    """See `State`."""
     calm: Bool[Array, " L"]
     """No watched function comes near to a zero, save the one that the lane lands on."""
 
@@ -89,12 +91,14 @@ def attempt(
 
     With `in_step`, all lanes are thought to go equally far from the same time, to no zero; then
     what depends on time only is computed once. With `tangents`, errors are also those of a
-    derivative: where the state rests, it has none of its own.
+    derivative: where the state rests, it has none of its own. An explicit step is asked for that of
+    a deviation that begins with the step; an implicit one for that of a deviation that began with
+    the flow or at the last event, and may have died out since, as it does where a chart is stiff.
     """
     lanes, ready, L = state.lanes, state.ready, state.lanes.t.shape[0]
     xp = namespace(lanes.t)
     zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
-    empty = Attempt(lanes.q, nothing(s, lanes.t), zero, zero, no, no, no, yes)
+    empty = Attempt(lanes.q, nothing(s, lanes.t), zero, zero, no, no, no, state.along, yes)
 
     def work(a, here, out):
         n = s.dims[a]
@@ -105,11 +109,17 @@ def attempt(
             t, tau = t[:1], aim.step[xp.argmax(here)][None]
         # (A branch of its own, lest XLA masks the states again in every stage.)
         some = here.any()
-        step = cond(
-            some,
-            lambda: flow.step(t, q, tau, unroll),
-            lambda: Step(q, q, q, q),
-        )
+        follows, along = tangents is not False and flow.method.implicit, out.along
+        if follows:
+            before = only(here, along[:n])
+            step, deviation, change = cond(
+                some & tangents,
+                lambda: flow.step_along(t, q, tau, before),
+                lambda: (flow.step(t, q, tau, unroll), before, xp.zeros_like(q)),
+            )
+            along = put(along, slice(n), xp.where(here, deviation, along[:n]))
+        else:
+            step = cond(some, lambda: flow.step(t, q, tau, unroll), lambda: Step(q, q, q, q))
         rounding = xp.zeros_like(q)
         if task.settings.scale is None:
             rounding = cond(
@@ -120,22 +130,29 @@ def attempt(
         allowed = tolerance(task.settings, a, q, tau, step, rounding)
         error = xp.max(xp.abs(step.error) / allowed, axis=0, initial=0.0)
         if tangents is not False:
-            aside = _ASIDE * size(task.settings, a, q, step.q)
-            direction = np.cos(1.0 + np.arange(n))[:, None]
-            near = cond(
-                some & tangents,
-                lambda: flow.step(t, q + aside * direction, tau, unroll).error,
-                lambda: step.error,
-            )
-            change = xp.abs(near - step.error) / (task.settings.rtol * aside)
-            change = xp.max(change, axis=0, initial=0.0)
+            own = size(task.settings, a, q, step.q)
+            if follows:
+                own = own * xp.maximum(1.0, xp.max(xp.abs(deviation) / own, axis=0))
+            else:
+                own = _ASIDE * own
+                near = cond(
+                    some & tangents,
+                    lambda: flow.step(t, q + own * _aside(n), tau, unroll).error,
+                    lambda: step.error,
+                )
+                change = near - step.error
+            change = xp.max(xp.abs(change) / (task.settings.rtol * own), axis=0, initial=0.0)
             error = xp.maximum(error, xp.where(xp.isfinite(change), change, 0.0))
+        gain = flow.method.gain
+        if gain != 1:
+            error = error**gain * task.settings.rtol ** (gain - 1)
         finite = xp.isfinite(step.q).all(axis=0) & ~xp.isnan(error)
         error = xp.where(finite, error, xp.inf)
         rows = flow.rows
         if not rows:
             end = xp.where(here, step.q, out.q[:n])
-            return out._replace(q=put(out.q, slice(n), end), error=xp.where(here, error, out.error))
+            error = xp.where(here, error, out.error)
+            return out._replace(q=put(out.q, slice(n), end), error=error, along=along)
 
         before, which = take(state.seen, rows), xp.where(here, aim.which, -1)
         home, moved = _Home(step.q, step.f1, zero, no, zero), tau
@@ -177,10 +194,28 @@ def attempt(
             xp.where(here, home.lands, out.lands),
             xp.where(here, slow, out.slow),
             xp.where(here, bent, out.bent),
+            along,
             xp.where(here, (far | own).all(axis=0) & ~bent & ~slow, out.calm),
         )
 
     return for_each_chart(s, lanes.chart, state.active, work, empty)
+
+
+def deviation(s: Structure, lanes: Lanes, settings: Settings) -> Float[Array, "d L"]:
+    """A deviation of every lane, as large as its states."""
+
+    def work(a, here, out):
+        n = s.dims[a]
+        own = size(settings, a, only(here, lanes.q[:n])) * _aside(n)
+        return put(out, slice(n), xp.where(here, own, out[:n]))
+
+    xp = namespace(lanes.q)
+    return for_each_chart(s, lanes.chart, xp.ones(len(lanes.t), bool), work, xp.zeros_like(lanes.q))
+
+
+def _aside(n: int) -> Float[np.ndarray, "n 1"]:
+    """A direction of n states that no system is made for."""
+    return np.cos(1.0 + np.arange(n))[:, None]
 
 
 def _go_home(

@@ -14,10 +14,11 @@ from ...systems.structure import Structure
 from ..events import apply_resets, enabled, keep_pace, rearm, width
 from ..hermite import CubicCrossing, first_crossing
 from ..lanes import Lanes
+from ..solver.tableau import method_of
 from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
 from ..watch import Watch, pick, watch
 from .aim import Aim, Way
-from .attempt import SLOW, Attempt
+from .attempt import SLOW, Attempt, deviation
 from .state import Approach, State, Task
 
 
@@ -44,7 +45,9 @@ _LEVEL_CLEAR = 1e-10, 1e-6
 _CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
 
 
-def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[State, Tape]:
+def calmly(
+    s: Structure, state: State, aim: Aim, way: Way, new: Attempt, task: Task
+) -> tuple[State, Tape]:
     """Nothing happened to any lane, except perhaps that it arrived. Also returns the row for the
     tape."""
     lanes, active, slack = state.lanes, state.active, task.stride.slack
@@ -55,7 +58,8 @@ def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[
     arrived = level | on_time
     pace = put(lanes.pace, 0, lanes.pace[0] + moved)
     lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
-    h = xp.where(active, _next_step(state.h, aim.step, new.error / slack), state.h)
+    h = _next_step(state.h, aim.step, _length(s, lanes, new.error / slack))
+    h = xp.where(active, h, state.h)
     late = active & ~arrived & (t >= task.target.limit)
     code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
     code = xp.where(active, code, IDLE).astype(xp.int32)
@@ -66,6 +70,7 @@ def calmly(state: State, aim: Aim, way: Way, new: Attempt, task: Task) -> tuple[
         state.aimed,
         state.approach,
         h,
+        new.along,
         state.error + xp.where(active, new.error, 0.0),
         update_result(state.result, late, task.target.missed),
         state.arrived | arrived,
@@ -150,7 +155,7 @@ def eventfully(
         xp.where(crosses, fastest, approach.rate),
         xp.where(crosses, 0, approach.tries + 1),
     )
-    adapted = _next_step(state.h, aim.step, new.error / slack)
+    adapted = _next_step(state.h, aim.step, _length(s, lanes, new.error / slack))
     too_long = active & ~state.approach.on & ~near
     h = xp.where(plain | too_long, adapted, state.h)
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
@@ -171,7 +176,12 @@ def eventfully(
     row = Tape(moved, code.astype(xp.int32), t, new.q, after.q, after.chart)
     error = state.error + xp.where(accept, new.error, 0.0)
     arrived = state.arrived | arrived
-    return State(after, seen, aimed, approach, h, error, result, arrived, state.i + 1), row
+    along = new.along
+    if along is not None:
+        anew = cond((fired >= 0).any(), lambda: deviation(s, after, task.settings), lambda: along)
+        along = xp.where(fired >= 0, anew, xp.where(accept, along, state.along))
+    end = State(after, seen, aimed, approach, h, along, error, result, arrived, state.i + 1)
+    return end, row
 
 
 def _crossing(
@@ -195,17 +205,23 @@ def _crossing(
     return cond(some.any(), look, nothing)
 
 
-def _next_step(
-    h: Float[Array, " L"], step: Float[Array, " L"], error: Float[Array, " L"]
-) -> Float[Array, " L"]:
-    """The step after one of length `step` with this error, where h was allowed.
+def _length(s: Structure, lanes: Lanes, error: Float[Array, " L"]) -> Float[Array, " L"]:
+    """The length of a step with this error, as a multiple of the one with an error of 1."""
+    xp, orders = namespace(error), [method_of(s, a).order for a in range(len(s.charts))]
+    if set(orders) == {8.0}:  # cheaper than a power
+        return xp.sqrt(xp.sqrt(xp.sqrt(error)))
+    return error ** xp.asarray(1 / np.array(orders))[lanes.chart]
 
-    The estimate is of order 7; three square roots are cheaper than that power, and nearly it.
-    """
-    xp = namespace(error)
-    factor = xp.clip(_CAUTION / xp.sqrt(xp.sqrt(xp.sqrt(error))), _SHRINK, _GROW)
-    factor = xp.where(xp.isfinite(error), factor, _SHRINK_BLINDLY)
-    return xp.where((step < h) & (error <= 1), xp.maximum(h, step * factor), step * factor)
+
+def _next_step(
+    h: Float[Array, " L"], step: Float[Array, " L"], length: Float[Array, " L"]
+) -> Float[Array, " L"]:
+    """The step after one of length `step`, which is so many times as long as it might be, where h
+    was allowed."""
+    xp = namespace(length)
+    factor = xp.clip(_CAUTION / length, _SHRINK, _GROW)
+    factor = xp.where(xp.isfinite(length), factor, _SHRINK_BLINDLY)
+    return xp.where((step < h) & (length <= 1), xp.maximum(h, step * factor), step * factor)
 
 
 def _reset(

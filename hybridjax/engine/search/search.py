@@ -19,11 +19,12 @@ from ..event_log import EventLog, blank_log, log_events
 from ..events import arm
 from ..lanes import Lanes
 from ..settings import Settings
+from ..solver.tableau import method_of
 from ..tape import Tape, blank_tape, write_row
 from ..target import Target
 from ..watch import watch
 from .aim import take_aim
-from .attempt import attempt
+from .attempt import attempt, deviation
 from .outcome import aims, calmly, eventfully
 from .state import Approach, State, Task
 from .stride import Stride
@@ -85,6 +86,8 @@ def search(
     result = update_result(result, ~finite, Result.BAD_INPUT)
     task = Task(u, target, target.limit - lanes.t, stride, settings)
     seen = watch(s, lanes.t, lanes.chart, lanes.q, u, target, result == Result.OK)
+    implicit = any(method_of(s, a).implicit for a in range(len(s.charts)))
+    carries = implicit and options.tangents is not False
     none, zero = xp.zeros(L, xp.int32), xp.zeros(L)
     begin = State(
         arm(s, lanes, seen, task.span) if options.new_input else lanes,
@@ -92,6 +95,7 @@ def search(
         aims(seen, task.span),
         Approach(xp.zeros(L, bool), none, zero, zero, zero, none),
         stride.h,
+        deviation(s, lanes, settings) if carries else None,
         xp.zeros(L),
         result,
         xp.zeros(L, bool),
@@ -119,7 +123,7 @@ def search(
         i, (calm, aim, way, new) = state.i, attempted(state)
         state, row = cond(
             (calm | ~state.active).all(),
-            lambda: calmly(state, aim, way, new, task),
+            lambda: calmly(s, state, aim, way, new, task),
             lambda: eventfully(s, state, aim, way, new, task),
         )
         tape = None if tape is None else write_row(tape, i, row)
@@ -142,7 +146,7 @@ def search(
         home = home & _alike(lanes.t, begin.active) & _alike(aim.step, begin.active)
 
     def in_one_step():
-        end, row = calmly(begin, aim, way, new, task)
+        end, row = calmly(s, begin, aim, way, new, task)
         tape = None if blank is None else write_row(blank, begin.i, row)
         return Recorded(Moved(end.lanes, end.h, end.error, end.result, no_events), tape)
 

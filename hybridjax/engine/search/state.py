@@ -51,6 +51,9 @@ class State(NamedTuple):
     approach: Approach
     h: Float[Array, " L"]
     """The next step, if nothing comes in between."""
+    along: Float[Array, "d L"] | None
+    """What has become of a deviation since the last event, in charts with implicit methods; `None`
+    where derivatives do not matter."""
     error: Float[Array, " L"]
     """Sum of the error estimates of the steps so far, relative to the tolerance."""
     result: Int[Array, " L"]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.executor import Array, for_each_row, namespace
-from .tableau import VERNER76
+from ...systems.solver import Method
 
 
 LaneField = Callable[[Array, Array], Array]
@@ -24,11 +24,6 @@ _WRITTEN_OUT = 128
 # Shifts by which rounding errors of the field are seen, in those of states and of time: both signs,
 # odd ones and even ones. Doubled, the errors seen are at most doubled.
 _SHIFTS = np.array([-3.1, 1.9, -0.8, 4.4])
-_STAGES = len(VERNER76.b_sol)
-_A = np.zeros((_STAGES, _STAGES))
-for _k, _row in enumerate(VERNER76.a_lower):
-    _A[_k + 1, : _k + 1] = _row
-_C = np.concatenate([[0.0], VERNER76.c])
 
 
 class Step(NamedTuple):
@@ -44,41 +39,44 @@ class Step(NamedTuple):
     """Embedded estimate of the local error."""
 
 
-def rk_step(
+def explicit_step(
+    method: Method,
     field: LaneField,
     t: Float[Array, " #L"],
     q: Float[Array, "n L"],
     h: Float[Array, " #L"],
     unroll: bool = False,
 ) -> Step:
-    """One step of Verner's 7(6) pair from (t, q) over h. Both t and h may be the same for all
+    """One step of an explicit method from (t, q) over h. Both t and h may be the same for all
     lanes, as arrays of one.
 
     With `unroll`, or for many lanes, the stages are written out: faster, and slower to compile.
     """
     unroll = unroll or q.shape[1] >= _WRITTEN_OUT
-    K = (_written_out if unroll else _in_a_loop)(field, t, q, h)
+    K = (_written_out if unroll else _in_a_loop)(method, field, t, q, h)
+    weights = np.array(method.b), np.array(method.error)
     if unroll:
-        end, error = (_combine(w, K) for w in (VERNER76.b_sol, VERNER76.b_error))
+        end, error = (_combine(w, K) for w in weights)
     else:
-        end, error = (jnp.tensordot(w, K, 1) for w in (VERNER76.b_sol, VERNER76.b_error))
+        end, error = (jnp.tensordot(w, K, 1) for w in weights)
     end = q + h * end
     return Step(end, K[0], field(t + h, end), h * error)
 
 
-def _in_a_loop(field, t, q, h) -> Float[Array, "stages n L"]:
+def _in_a_loop(method, field, t, q, h) -> Float[Array, "stages n L"]:
     def stage(K, xs):
         row, c, k = xs
         return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
 
-    begin = jnp.zeros((_STAGES, *q.shape), q.dtype)
-    tableau = jnp.asarray(_A, q.dtype), jnp.asarray(_C, q.dtype), jnp.arange(_STAGES)
+    stages = len(method.c)
+    begin = jnp.zeros((stages, *q.shape), q.dtype)
+    tableau = jnp.asarray(method.a, q.dtype), jnp.asarray(method.c, q.dtype), jnp.arange(stages)
     return jax.lax.scan(stage, begin, tableau)[0]
 
 
-def _written_out(field, t, q, h) -> list[Float[Array, "n L"]]:
+def _written_out(method, field, t, q, h) -> list[Float[Array, "n L"]]:
     K: list[jax.Array] = []
-    for row, c in zip(_A, _C, strict=True):
+    for row, c in zip(method.a, method.c, strict=True):
         K.append(field(t + c * h, q + h * _combine(row, K)))
     return K
 

@@ -142,7 +142,7 @@ def find_limit_cycles(
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
     - `scale`: sizes of states by name, by default those of the guess.
-    - `settings`: accuracy of the flow; by default 1e-9 per step.
+    - `settings`: accuracy of the flow; by default 1e-9 per step; and its `solver`.
     - `execution`: how it is run: systems per compiled call (`batch`, by default 250), threads
         (`workers`). Always in double precision.
 
@@ -156,10 +156,12 @@ def find_limit_cycles(
         raise DefinitionError("limit cycles are found in double precision only.")
     systems = _stacked(systems)
     require_x64(systems)
+    settings = Settings() if settings is None else settings
+    systems = settings.system(systems)
     arrays, rest = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
-    settings = (Settings() if settings is None else settings).filled(SWEEP)
+    settings = settings.filled(SWEEP)
     s = Structure(guess.system)
     known = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))

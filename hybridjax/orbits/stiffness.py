@@ -1,0 +1,46 @@
+"""Charts of a cycle whose fastest mode, not the motion, sets the steps of explicit methods."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from ..engine import kernels
+from ..engine.lanes import Lanes
+from ..systems.structure import Structure
+
+
+# A chart is stiff if its fastest mode decays to more than this power of e in one turn: an explicit
+# method, stable for about 4 of them in a step, then takes hundreds of steps wherever the motion is
+# slow. Doubled, charts are called stiff from twice as many steps on.
+_STIFF = 1000.0
+
+
+def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
+    """The charts with explicit methods that are stiff on a cycle, each with the rate of its fastest
+    mode. `legs`: states at equal distances in time, of a turn in this period."""
+    found, step = {}, period / len(np.ravel(legs.t))
+    for a, t, q in points(s, legs):
+        rates = fastest(s, a, t, q)
+        method = s.method(a)
+        if step * rates.sum() > _STIFF and not (method and method.implicit):
+            found[s.names[a]] = float(rates.max())
+    return found
+
+
+def fastest(
+    s: Structure, a: int, t: Float[np.ndarray, " P"], q: Float[np.ndarray, "n P"]
+) -> Float[np.ndarray, " P"]:
+    """The rates at which the fastest modes of chart a decay; 0 where none does."""
+    derivative = kernels.field(s, a, t, q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q)]
+    rates = -np.linalg.eigvals(np.moveaxis(derivative, -1, 0)).real
+    return np.maximum(rates.max(axis=1, initial=0.0), 0.0)
+
+
+def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Charts, times and states at the beginnings of the pieces of a turn, as far as it came."""
+    t, chart, q = map(np.asarray, (legs.t, legs.chart, legs.q))
+    for a in np.unique(chart):
+        here = (chart == a) & np.isfinite(q).all(axis=0)
+        if here.any():
+            yield int(a), t[here], q[: s.dims[a], here]

@@ -1,0 +1,173 @@
+"""How a chart is integrated: Runge-Kutta methods, of diffrax or of this package."""
+
+import functools as ft
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import DefinitionError
+
+
+if TYPE_CHECKING:
+    import diffrax
+
+Row = tuple[float, ...]
+
+
+class Method(NamedTuple):
+    """A Runge-Kutta method whose first stage is explicit: with increments w_i = h f(t + c_i h, y_i)
+    at y_i = q + sum_j a_ij w_j, a step ends at q + sum_i b_i w_i."""
+
+    name: str
+    a: tuple[Row, ...]
+    b: Row
+    c: Row
+    error: Row
+    """Weights of the increments in the estimate of the error."""
+    order: float
+    """The error by which steps are controlled grows as this power of the step."""
+    gain: float = 1.0
+    """The error is this power of the estimate."""
+    filter: float = 0.0
+    """The estimate is multiplied by (1 - h g J)^-1, with this g."""
+
+    @property
+    def implicit(self) -> bool:
+        return bool(np.any(np.triu(np.array(self.a))))
+
+
+class Radau(eqx.Module):
+    """The implicit Radau IIA method of order 2 `stages` - 1, for stiff charts at high accuracy.
+
+    E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, 2nd ed. (1996), sections
+    IV.5 and IV.8: collocation at the Radau points, L-stable and stiffly accurate. The error
+    estimate has order `stages`, and is turned into one of the step as there (their tolerances are
+    powers of those asked for).
+
+    **Arguments:** `stages`, 3, 5 or 7.
+    """
+
+    stages: int = eqx.field(static=True, default=5)
+
+    def __check_init__(self):
+        if self.stages not in (3, 5, 7):
+            raise DefinitionError(f"Radau: `stages` must be 3, 5 or 7, not {self.stages!r}.")
+
+
+class ByChart(NamedTuple):
+    """Solvers of some charts, by name."""
+
+    names: tuple[str, ...]
+    solvers: tuple[Any, ...]
+
+    def get(self, name: str) -> Any:
+        return dict(zip(*self, strict=True)).get(name)
+
+
+def solvers(given: Any) -> Any:
+    """A solver as it is, and solvers by the names of charts in a form that can be compared."""
+    return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
+
+
+if TYPE_CHECKING:
+    Solver = diffrax.AbstractSolver | Radau
+else:  # diffrax takes a third of a second to import; `as_method` looks at what is given.
+    Solver = Any
+
+
+@ft.lru_cache
+def as_method(solver: Any) -> Method:
+    """The Runge-Kutta method of a solver.
+
+    **Raises:** `DefinitionError` for what is none with an error estimate.
+    """
+    if isinstance(solver, Method):
+        return solver
+    if isinstance(solver, Radau):
+        return _radau(solver.stages)
+    import diffrax
+
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise DefinitionError(
+            f"a solver must be one of diffrax, such as `diffrax.Kvaerno5()`, or `hj.Radau()`, not "
+            f"{solver!r}."
+        )
+    name = type(solver).__name__
+    if solver.term_structure not in (diffrax.AbstractTerm, diffrax.ODETerm):
+        raise DefinitionError(
+            f"{name} wants a field in several terms; a chart has one field. Take a Runge-Kutta "
+            "method such as `diffrax.Kvaerno5()` or `hj.Radau()`."
+        )
+    if isinstance(solver, diffrax.ImplicitEuler):
+        return Method(name, ((0.0, 0.0), (0.0, 1.0)), (0.0, 1.0), (0.0, 1.0), (-0.5, 0.5), 2.0)
+    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise DefinitionError(
+            f"{name} has no error estimate, by which steps are made as long as the accuracy "
+            "allows: take one that has, such as `diffrax.Tsit5()` or `hj.Radau()`."
+        )
+    tableau = getattr(solver, "tableau", None)
+    if not isinstance(tableau, diffrax.ButcherTableau):
+        raise DefinitionError(
+            f"{name} is no Runge-Kutta method with a tableau: take one that is, such as "
+            "`diffrax.Tsit5()` or `hj.Radau()`."
+        )
+    return _from_tableau(name, tableau, float(solver.order(None)))  # pyright: ignore
+
+
+def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) -> Method:
+    a = np.zeros((tableau.num_stages, tableau.num_stages))
+    for k, row in enumerate(tableau.a_lower):
+        a[k + 1, : k + 1] = row
+    if tableau.a_diagonal is not None:
+        a += np.diag(tableau.a_diagonal)
+    if a[0, 0] != 0 or tableau.c1 != 0:
+        raise DefinitionError(
+            f"the first stage of {name} is implicit: take a method of which it is explicit, such "
+            "as `diffrax.Kvaerno5()`, or `hj.Radau()`."
+        )
+    c = (0.0, *tableau.c)
+    return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
+
+
+def _method(name: str, a, b, c, error, order: float, **rest: float) -> Method:
+    rows = tuple(tuple(map(float, row)) for row in a)
+    return Method(name, rows, *(tuple(map(float, x)) for x in (b, c, error)), order, **rest)
+
+
+def _radau(s: int) -> Method:
+    legendre = np.polynomial.legendre
+    c = legendre.legroots([*[0] * (s - 1), -1, 1])
+    for _ in range(3):  # Newton's steps to full precision
+        value, slope = (legendre.legval(c, x) for x in _with_derivative([*[0] * (s - 1), -1, 1]))
+        c = c - value / slope
+    c = (1 + np.sort(c)) / 2
+    c[-1] = 1.0
+    a = np.array([_integrals(c, end) for end in c])
+    eigenvalues = np.linalg.eigvals(a)
+    gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
+    # The quadrature formula of order s that has the weight gamma at the start of the step.
+    powers = np.vander(c, s, increasing=True).T
+    moments = 1 / np.arange(1, s + 1) - gamma * (np.arange(s) == 0)
+    error = np.concatenate([[gamma], np.linalg.solve(powers, moments) - a[-1]])
+    full = np.zeros((s + 1, s + 1))
+    full[1:, 1:] = a
+    return _method(
+        f"Radau({s})", full, full[-1], np.concatenate([[0.0], c]), error, 2.0 * s,
+        gain=2 * s / (s + 1), filter=gamma,
+    )  # fmt: skip
+
+
+def _with_derivative(series):
+    return series, np.polynomial.legendre.legder(series)
+
+
+def _integrals(c: Float[np.ndarray, " s"], end: float) -> Float[np.ndarray, " s"]:
+    """Integrals from 0 to `end` of the Lagrange polynomials at the points c."""
+    x, weights = np.polynomial.legendre.leggauss(len(c))
+    x = end * (1 + x) / 2
+    others = ~np.eye(len(c), dtype=bool)
+    values = [np.prod((x[:, None] - c[o]) / (c[j] - c[o]), axis=1) for j, o in enumerate(others)]
+    return end / 2 * np.array(values) @ weights

@@ -1,0 +1,181 @@
+"""Solvers other than the default, against closed forms: tableaus, steps, cycles, derivatives."""
+
+import functools as ft
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import hybridjax as hj
+from hybridjax._core.executor import to_host
+from hybridjax.engine.solver import take_step
+from hybridjax.engine.solver.implicit import inverse
+from hybridjax.orbits.stiffness import stiff_charts
+from hybridjax.systems.solver import as_method
+from hybridjax.systems.structure import Structure
+
+from ..toys import Field
+
+
+STIFF = np.array([[0.0, 1.0], [-1e3, -3e3]])
+FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
+
+
+class Damped(hj.HybridSystem):
+    """y'' = -1e3 y - 3e3 y' + a sin 2 pi t: one mode decays in 3 s, one in 0.3 ms."""
+
+    a: hj.Parameter = hj.parameter(20.0)
+
+    def charts(self):
+        def field(t, q, u):
+            return q[1], -1e3 * q[0] - 3e3 * q[1] + self.a * jnp.sin(2 * jnp.pi * t) + u[0]
+
+        return {"a": Field(("y", "v"), field)}
+
+    def period(self):
+        return 1.0
+
+    def guess(self):
+        return hj.Guess("a", (0.0, 0.0))
+
+
+def exact(a=20.0):
+    """The state of the cycle at t = 0."""
+    w = 2j * np.pi
+    y = a / (w**2 + 3e3 * w + 1e3)
+    return np.array([y.imag, (w * y).imag])
+
+
+@pytest.mark.parametrize("stages", [3, 5, 7])
+def test_radau_is_a_collocation_method(stages):
+    method = as_method(hj.Radau(stages))
+    a, b, c, error = (np.array(x) for x in (method.a, method.b, method.c, method.error))
+    for k in range(1, stages + 1):
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, atol=1e-14)
+        assert abs(error @ c ** (k - 1)) < 1e-13
+    for k in range(1, 2 * stages):
+        assert abs(b @ c ** (k - 1) - 1 / k) < 1e-14
+    assert abs(error @ c**stages) > 1e-5
+
+
+@pytest.mark.parametrize(
+    "solver, reason",
+    [
+        (diffrax.Euler(), "Euler has no error estimate"),
+        (diffrax.SemiImplicitEuler(), "wants a field in several terms"),
+        (diffrax.KenCarp4(), "wants a field in several terms"),
+        (diffrax.ReversibleHeun(), "no Runge-Kutta method with a tableau"),
+    ],
+)
+def test_solvers_that_do_not_fit(solver, reason):
+    with pytest.raises(hj.DefinitionError, match=reason):
+        hj.find_limit_cycle(Damped(), settings=hj.Settings(solver=solver))
+
+
+def test_wrong_solvers_are_refused_where_they_are_given():
+    with pytest.raises(hj.DefinitionError, match="solver"):
+        hj.Settings(solver="Radau")
+    with pytest.raises(hj.DefinitionError, match="stages"):
+        hj.Radau(4)
+    with pytest.raises(hj.DefinitionError, match="there is no chart 'b'"):
+        hj.find_limit_cycle(Damped(), settings=hj.Settings(solver={"b": hj.Radau()}))
+    with pytest.raises(hj.DefinitionError, match="a solver must be"):
+        hj.find_limit_cycle(Damped(solver=3))
+
+
+def test_inverses_of_many_matrices():
+    matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
+    matrix[0, 0] = 0.0  # pivots are needed
+    found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
+    np.testing.assert_allclose(found, np.linalg.inv(np.moveaxis(matrix, -1, 0)), atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [hj.Radau(3), diffrax.Kvaerno3()], ids=str)
+def test_derivatives_of_implicit_steps(solver):
+    """First and second, by the implicit function theorem, against differences of long steps."""
+    method, h = as_method(solver), jnp.array([0.1])
+
+    def end(x):
+        def field(t, q, x=x):
+            return jnp.stack([-50.0 * (q[0] - jnp.sin(q[1] + x)), q[0] * q[1] + x])
+
+        still = ft.partial(field, x=jax.lax.stop_gradient(x))
+        q = jnp.stack([0.3 + x, jnp.cos(x)])[:, None]
+        return take_step(method, field, jnp.zeros(1), q, h, still=still).q[:, 0]
+
+    d = 1e-2
+    lowest, low, middle, high, highest = jax.jit(jax.vmap(end))(d * jnp.arange(-2.0, 3.0))
+    first = jax.jit(jax.jacfwd(end))(0.0)
+    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
+    by_differences = (lowest - 8 * low + 8 * high - highest) / (12 * d)
+    np.testing.assert_allclose(first, by_differences, rtol=1e-6)
+    twice = (16 * (low + high) - 30 * middle - lowest - highest) / (12 * d**2)
+    np.testing.assert_allclose(second, twice, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def damped():
+    return hj.find_limit_cycle(Damped(solver=hj.Radau()))
+
+
+def test_a_stiff_cycle_with_default_settings(damped):
+    np.testing.assert_allclose(list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
+    np.testing.assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
+
+
+def test_linearization_of_a_stiff_system(damped):
+    model = hj.linearize(damped, hj.ClockPhase(4), outputs="y")
+    exactly = expm(np.block([[STIFF, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) / 4)
+    A, B = model.A[0], model.B[0]
+    size = np.array([damped.scale["y"], damped.scale["v"]])
+    ratio = size / size[:, None]
+    np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
+    np.testing.assert_allclose(B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8)
+
+
+def test_stiffness_is_told_and_cured_by_itself(damped):
+    explicit, implicit = Structure(Damped()), Structure(damped.system)
+    assert stiff_charts(explicit, to_host(damped.legs), 1.0) == pytest.approx({"a": -FAST})
+    assert not stiff_charts(implicit, to_host(damped.legs), 1.0) and "stiff" not in repr(damped)
+    itself = hj.find_limit_cycle(Damped(), settings=hj.Settings(solver="auto"))
+    assert Damped(solver=hj.Radau()).solver == itself.system.solver
+    np.testing.assert_array_equal(itself.anchor.q, damped.anchor.q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Kvaerno5()], ids=str)
+def test_solvers_of_diffrax_give_the_same_cycle(solver):
+    cycle = hj.find_limit_cycle(
+        hj.models.VerticalHopper(), settings=hj.Settings(solver=solver, max_steps=4000)
+    )
+    default = hj.find_limit_cycle(hj.models.VerticalHopper())
+    np.testing.assert_allclose(cycle.multipliers, default.multipliers, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_stiff_cycle(damped):
+    """Followed in both modes, and twice; the cycle is linear in the parameter."""
+
+    def state(a):
+        return hj.find_limit_cycle(Damped(a, solver=hj.Radau()), damped).anchor.q[:, 0]
+
+    size = np.array(list(damped.scale.values()))
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = jax.jit(derivative(state))(20.0)
+        np.testing.assert_allclose(found / size, exact(1.0) / size, rtol=1e-9, atol=1e-12)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(state)))(20.0)
+    np.testing.assert_allclose(twice / size, 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_experiments_with_a_stiff_system(damped):
+    sections = hj.ClockPhase(8)
+    design = hj.multisine(8, 8, amplitude=1e-3, lines="odd")
+    data = hj.run_experiments(damped, sections, design, outputs="y", start="steady")
+    estimate = hj.estimate_htf(data, harmonics=(0,))
+    found = hj.linearize(damped, sections, outputs="y").htf(estimate.f, harmonics=(0,))
+    assert np.max(estimate.error(found)) < 1e-6
