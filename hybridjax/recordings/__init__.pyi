@@ -25,3 +25,7 @@ from .phase.tracker import PhaseTracker as PhaseTracker
 from .phase.winding import Phase as Phase, Winding as Winding
 from .recording import Trial as Trial
 from .sampling import section_data as section_data
+from .variability.natural import (
+    NaturalMultipliers as NaturalMultipliers,
+    natural_multipliers as natural_multipliers,
+)

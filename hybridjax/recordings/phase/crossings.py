@@ -23,8 +23,8 @@ _DOUBLED = 0.5
 # An event was missed in an interval of more than so many periods. Doubled: an interval with one
 # event missed is taken for a long cycle.
 _MISSED = 1.5
-# Intervals of a trial from which its own period is taken, and how irregular it is; else all trials'.
-# Doubled: long trials are judged by the others' period.
+# Intervals of a trial from which its own period is taken, and how irregular it is; else those of
+# all trials are. Doubled: long trials are judged by the others' period.
 _OWN = 20
 # Parts of a period by which lengths of intervals must differ from all others', that they count as
 # those of another kind: long ones, and short ones. Doubled: in irregular rhythms missed, or
