@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, NewNames, SectionCount
+from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
 from .._core.boundary.scalars import Number
 from .._core.text import listed
 from ..errors import DefinitionError
@@ -26,7 +26,8 @@ class Record(eqx.Module):
     **Fields**, on the host:
 
     - `u` (n, nu): inputs, held from sample i to i + 1. NaN where not known: the record is then
-      cut there, and the state after it is unknown.
+      cut there, and the state after it is unknown. Without any (nu = 0) nothing can be fitted to
+      inputs.
     - `y` (n, ny): outputs minus those on the limit cycle, sampled before `u[i]` acts. NaN where a
       sample is missing or bad.
     - `n_sections`: N. `first_section`: the section of sample 0. `inputs`, `outputs`: names, or
@@ -54,14 +55,14 @@ class Record(eqx.Module):
         *,
         n_sections: SectionCount,
         first_section: Index = 0,
-        inputs: NewNames | None = None,
+        inputs: NewOptionalNames | None = None,
         outputs: NewNames | None = None,
         lead: Index = 0,
         drift: Drift | None = None,
     ):
         """**Raises:** `DefinitionError` for shapes that do not fit together."""
         self.u, self.y = np.array(u), np.array(y)
-        if len(self.u) != len(self.y) or 0 in self.u.shape + self.y.shape:
+        if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
             raise DefinitionError(
                 "u must have the shape (samples, inputs) and y (samples, outputs), not "
                 f"{self.u.shape} and {self.y.shape}."
@@ -130,6 +131,11 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     records = [record for part in parts for record in part.records]
     if not records:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
+    if not all(r.inputs for r in records):
+        raise DefinitionError(
+            "`data` holds no input: name the signals that acted, or use what needs none "
+            "(`hj.recordings.natural_multipliers`)."
+        )
     kinds = {(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records}
     if len(kinds) > 1:
         a, b = sorted(kinds, key=str)[:2]

@@ -20,6 +20,7 @@ from .recorded import (
     impulse_responses as impulse_responses,
     multiplier_regions as multiplier_regions,
     phase as phase,
+    phase_response as phase_response,
     section_data as section_data,
 )
 from .signals import experiment as experiment

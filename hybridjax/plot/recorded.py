@@ -9,6 +9,7 @@ from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import Multipliers
 from ..identify.series.series_fit import SeriesFit
+from ..recordings.beats.response import PhaseResponse, curve_unit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.phase.winding import Phase
@@ -129,6 +130,33 @@ def impulse_responses(
         axes[0, 1].legend(loc="upper right")
         for panel in axes[-1]:
             panel.set_xlabel("time since the push (cycles)")
+        letters(axes)
+    return Plot(axes)
+
+
+@checked
+def phase_response(
+    found: PhaseResponse,
+    *,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
+    """Left: the curve with its 95 % band, and its mean. Right: the share of the variance that is
+    forecast of intervals left out, by the number of harmonics."""
+    with panels(ax, 1, 2, width=PAGE, height=2.4, width_ratios=(3, 2)) as axes:
+        curve, orders = axes[0]
+        low, high = found.interval(found.phase)
+        curve.fill_between(found.phase, low, high, color=CYCLE[0], alpha=0.25, lw=0)
+        curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
+        curve.axhline(0, color="black", lw=0.4)
+        name = f"response to {label_of(found.input, labels)}"
+        curve.set(
+            xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
+        )
+        orders.plot(found.left_out, "o-", color=COLORS["gray"])
+        orders.plot(found.harmonics, found.left_out[found.harmonics], "o", color=CYCLE[0])
+        orders.set(xlabel="harmonics", ylabel="$R^2$ of intervals left out")
+        orders.xaxis.get_major_locator().set_params(integer=True)
         letters(axes)
     return Plot(axes)
 

@@ -1,4 +1,9 @@
 from .advice import Advice as Advice, advise as advise, plain_regression as plain_regression
+from .beats.cross_validation import (
+    IntervalForecast as IntervalForecast,
+    forecast_intervals as forecast_intervals,
+)
+from .beats.response import PhaseResponse as PhaseResponse, phase_response as phase_response
 from .data import SectionData as SectionData
 from .design_tables import (
     add_command as add_command,
@@ -20,3 +25,7 @@ from .phase.tracker import PhaseTracker as PhaseTracker
 from .phase.winding import Phase as Phase, Winding as Winding
 from .recording import Trial as Trial
 from .sampling import section_data as section_data
+from .variability.natural import (
+    NaturalMultipliers as NaturalMultipliers,
+    natural_multipliers as natural_multipliers,
+)

@@ -5,7 +5,7 @@ from typing import Literal
 import equinox as eqx
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Order, SectionCount, SignalNames
+from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..identify.series.fit import fit_series
@@ -53,7 +53,7 @@ def identify_recording(
     phase: Phase | PhaseDefinition,
     *,
     inputs: SignalNames,
-    outputs: SignalNames,
+    outputs: OptionalNames,
     order: Order | None = None,
     n_sections: SectionCount | None = None,
     bandwidth: Bandwidth | None = None,

@@ -24,6 +24,8 @@ _WHOLE_BAND = 0.9
 _SPECTRUM_REACH = 2.5
 # Standard deviations after which the push is cut off. Doubled: nothing changes but a part in 1000.
 _PUSH_REACH = 3
+# Cycles for which responses are followed unless the call says it. Doubled: for twice as long.
+_CYCLES = 3.0
 
 
 class ImpulseResponses(eqx.Module):
@@ -65,7 +67,7 @@ ResponseCycles = Annotated[float, Number("a number above 0, up to 10000", above=
 def impulse_responses(
     fit: SeriesFit,
     data: SectionData,
-    cycles: ResponseCycles = 3,
+    cycles: ResponseCycles | None = None,
     *,
     width: Positive | None = None,
 ) -> ImpulseResponses:
@@ -74,7 +76,8 @@ def impulse_responses(
     **Arguments:**
 
     - `fit` of the `data`, whose period gives the area of an input that is held for one section.
-    - `cycles`: how long responses are followed.
+    - `cycles`: how long responses are followed: by default three, or for wider pushes twice as long
+      as it takes until half of one has acted.
     - `width`: standard deviation of the push (Gaussian), in cycles. By default so wide that it has
       no frequencies beyond the band in which the inputs had power, since what the system
       does with these cannot be known. 0: the push is held for one section.
@@ -88,10 +91,12 @@ def impulse_responses(
                 f"{getattr(data, name)}."
             )
     N, R = fit.numerators.shape[:2]
-    lags = round(cycles * N) + 1
     if width is None:
         edge = min(input_band(data))
         width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
+    if cycles is None:
+        cycles = max(_CYCLES, 2 * _PUSH_REACH * width)
+    lags = round(cycles * N) + 1
     if lags < 2:
         raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
     reach = int(np.ceil(_PUSH_REACH * width * N))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import SectionCount, SignalNames
+from .._core.boundary.kinds import OptionalNames, SectionCount
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
@@ -36,8 +36,8 @@ def section_data(
     recording: Recording,
     phase: Phase | PhaseDefinition,
     *,
-    inputs: SignalNames,
-    outputs: SignalNames,
+    inputs: OptionalNames,
+    outputs: OptionalNames,
     n_sections: SectionCount | None = None,
     bandwidth: Bandwidth | None = None,
     sampled: Literal["mean", "middle"] = "mean",
@@ -54,7 +54,9 @@ def section_data(
     **Arguments:**
 
     - `phase`: what `estimate_phase` found, or what it should find.
-    - `inputs`, `outputs`: names of signals.
+    - `inputs`, `outputs`: names of signals. Without outputs, `()`, the times of the events are all
+      that is known: `timing` is then "duration". Without inputs, `()`, the data are for
+      `natural_multipliers`.
     - `n_sections`: N, equally spaced in phase; by default the family's of a `KinematicPhase`, and
       32 for other phases.
     - `bandwidth`: in Hz, of the smoothing splines through the outputs (see `spline`); by default N
@@ -81,6 +83,8 @@ def section_data(
     _refuse_constant(recording, inputs, outputs)
     if drift is not None:
         check_drift(drift)
+    if not outputs and timing is None:
+        timing = "duration"
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if len(phase.stretches) != len(recording.trials):
@@ -238,8 +242,11 @@ class _Sampler:
 
         unseen = np.diff(winding.gaps, axis=1)[:, 0] > (section if max_gap is None else max_gap)
         seen = ~inside(winding.gaps[unseen], t[:-1], t[:-1])
-        u = np.stack([self._input(x, t, holes(x)) for x in self.inputs], axis=1)
-        y = np.stack([curve(t[:-1]) for curve in self.curves], axis=1)
+        u, y = np.zeros((len(k) - 1, len(self.inputs))), np.zeros((len(k) - 1, len(self.outputs)))
+        for i, x in enumerate(self.inputs):
+            u[:, i] = self._input(x, t, holes(x))
+        for i, curve in enumerate(self.curves):
+            y[:, i] = curve(t[:-1])
         for i, x in enumerate(self.outputs):
             y[inside(holes(x), t[:-1], t[:-1]) | ~seen, i] = np.nan
         return _Part(k[:-1], t[:-1], seen, u, y)

@@ -1,3 +1,4 @@
+from .beats import simulate_beats as simulate_beats
 from .dirt import Dirt as Dirt, spoil as spoil
 from .mishaps.catalog import (
     EVENT_MISHAPS as EVENT_MISHAPS,

@@ -49,6 +49,9 @@ Vector = Annotated[Numbers, Reals("n")]
 # Words.
 SignalNames = Annotated[str | Sequence[str], Names()]
 """One name, or several distinct ones; handed on as a tuple."""
+OptionalNames = Annotated[str | Sequence[str], Names(empty=True)]
+"""The same, or none: `()`."""
+NewOptionalNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True, empty=True)]
 NewNames = Annotated[str | Sequence[str] | Mapping[str, str], Names(units=True)]
 """Names that are given to something; or units by name, as in `{"yM": "m", "force": "N"}`."""
 Path = str | os.PathLike[str]

@@ -37,6 +37,8 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
                 "if it ran at another speed it is another system; identify it alone."
             )
             found.append(Finding("another period", "warned", text))
+    if not outputs:
+        return found
     mean = np.array(
         [
             [_average(t, recording.column(name), parts) for name in outputs]

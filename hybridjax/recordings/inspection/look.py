@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import SignalNames
+from ..._core.boundary.kinds import OptionalNames, SignalNames
 from ...errors import DefinitionError
 from ..data import SectionData
 from ..phase.winding import Phase
@@ -27,7 +27,7 @@ _SWING, _TAIL = 0.25, 0.1
 
 
 @checked
-def inspect(recording: Recording, *, inputs: SignalNames, outputs: SignalNames) -> Inspection:
+def inspect(recording: Recording, *, inputs: SignalNames, outputs: OptionalNames) -> Inspection:
     """Look for what is wrong with a recording, before anything is computed from it.
 
     Numbers that stand for "no value", frozen, clipped and overflowing signals; signals, trials and

@@ -34,9 +34,11 @@ def estimate_phase(
           in between. The signal should cross the level once in each cycle in this direction, and
           fast: at mid-stance, at the apex.
         - `AtEvent`: grows by one from each recorded event to the next, linearly in between. Events
-          that follow the one before by less than half of the median period are taken for doubled
-          and left out; where an interval is longer than 1.5 median periods one was missed, and
-          these cycles are left out. A crossing in a gap counts as missed. Since this phase, and
+          that follow the one before by less than half of the trial's median period are taken for
+          doubled and left out; where an interval is longer than 1.5 median periods one was missed,
+          and these cycles are left out. In irregular rhythms, whose intervals are of all lengths,
+          these limits are where the lengths end: at the first gap in their distribution. A
+          crossing in a gap counts as missed. Since this phase, and
           that of a `Crossing`, depends on the event that comes next, so do the outputs sampled at
           it.
         - a function of the times (n,) and the signals by name, that returns an angle (n,) in rad,

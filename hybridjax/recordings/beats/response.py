@@ -1,0 +1,290 @@
+"""The phase response curve of a rhythm, from the times of its events under a known input."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import stats
+
+from ..._core.arguments import Numbers
+from ..._core.boundary.arrays import Reals
+from ..._core.boundary.checked import checked, checked_methods
+from ..._core.boundary.kinds import Probability
+from ..._core.boundary.scalars import Whole
+from ..._core.progress import say, working
+from ..._core.results import Result
+from ..._core.signal import Signal, unit_of, with_unit
+from ..._core.text import p_value
+from ...errors import DefinitionError
+from ...sections.crossing import AtEvent, Crossing
+from ..phase.estimation import estimate_phase
+from ..phase.winding import Phase
+from ..recording import Recording
+from .estimation import Accuracy, CurveFit, accuracy_of, fit_curve
+from .intervals import Intervals, intervals_of
+from .phase_model import basis
+
+
+# Harmonics of a curve, at most. Doubled: curves with finer detail, where jitter allows any.
+_MOST = 8
+# Standard errors by which forecasts of intervals left out must gain from one more harmonic.
+# Doubled: curves are smoother.
+_GAIN = 2.0
+# Phases at which a curve is given. Doubled: smoother figures.
+_POINTS = 200
+# Half of the 95 % band, relative to the mean of the curve, that is wide. Doubled: less is said.
+_WIDE = 0.5
+# Correlation of what is left of neighboring intervals that is said. Doubled: less is.
+_MEMORY = 0.2
+# Share of intervals that are miscounted, and said. Doubled: less is said.
+_MISCOUNTED = 0.01
+# Level of the test for a flat curve. Doubled: more curves have a shape by chance.
+_LEVEL = 0.01
+
+Harmonics = Annotated[int, Whole(0, 50)]
+Curve = Annotated[Numbers, Reals("n")]
+
+
+@checked_methods
+class PhaseResponse(eqx.Module):
+    r"""The curve Z of the phase model $\dot\varphi = w + Z(\varphi)\,I(t)$, with its accuracy.
+
+    Z is in cycles per second and unit of the input; $\varphi$ is 0 at an event, and the next one
+    happens where it is 1.
+
+    **Fields:**
+
+    - `coefficients` (2 K + 1,): of 1, cos, sin, cos of twice the angle, ...; `covariance`, and the
+      degrees of `freedom` with which it was estimated.
+    - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors.
+    - `rates` (trials,): w, in cycles per second. `trials`: their names.
+    - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
+    - `left_out` (orders,): for 0, 1, ... harmonics the share of the variance of durations within
+      trials (R2) that is forecast of blocks of intervals that the curve was not fitted to, by
+      fits to the others to first order. The first is that of a flat curve.
+    - `r2`: the same share for all intervals that count, in the fit itself.
+    - `intervals`: how many there are; `miscounted`: how many of them miss the model by half a
+      cycle or more (an event was missed, or one was none), and do not count.
+    - `memory`: correlation of what is left of neighboring intervals.
+    - `result`: whether the fit came to its end.
+    """
+
+    coefficients: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    freedom: float = eqx.field(static=True)
+    phase: Float[np.ndarray, " P"]
+    values: Float[np.ndarray, " P"]
+    errors: Float[np.ndarray, " P"]
+    rates: Float[np.ndarray, " trials"]
+    trials: tuple[str, ...] = eqx.field(static=True)
+    jitter: float = eqx.field(static=True)
+    left_out: Float[np.ndarray, " orders"]
+    r2: float = eqx.field(static=True)
+    intervals: int = eqx.field(static=True)
+    miscounted: int = eqx.field(static=True)
+    memory: float = eqx.field(static=True)
+    input: str = eqx.field(static=True)
+    result: Result = eqx.field(static=True)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the data cannot tell, in plain words."""
+        return tuple(_about(self))
+
+    @property
+    def harmonics(self) -> int:
+        """K."""
+        return len(self.coefficients) // 2
+
+    def __call__(self, phase: Curve) -> Float[np.ndarray, " n"]:
+        """The curve at some phases, in cycles."""
+        return basis(np.asarray(phase, float), self.harmonics) @ self.coefficients
+
+    def interval(
+        self, phase: Curve, level: Probability = 0.95
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Lower and upper bounds that hold the curve at each phase with this probability."""
+        waves = basis(np.asarray(phase, float), self.harmonics)
+        error = np.sqrt(np.einsum("ni,ij,nj->n", waves, self.covariance, waves))
+        reach = float(stats.t.ppf((1 + level) / 2, self.freedom)) * error
+        middle = waves @ self.coefficients
+        return middle - reach, middle + reach
+
+    def __repr__(self) -> str:
+        mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
+        unit = with_unit("Z", curve_unit(self.input))
+        lines = [
+            f"PhaseResponse({self.harmonics} harmonics, {self.intervals} intervals of "
+            f"{len(self.trials)} trials, {self.miscounted} of them miscounted)",
+            f"  mean {unit}  {mean:.4g} +- {error:.2g}; from {self.values.min():.4g} to "
+            f"{self.values.max():.4g}",
+            f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
+            f"{100 * self.jitter:.2g} % of a cycle",
+            f"  R2 left out  {self.left_out[self.harmonics]:.3f}; of a flat curve "
+            f"{self.left_out[0]:.3f}",
+        ]
+        return "\n".join([*lines, *(f"  {text}" for text in self.warnings)])
+
+
+def curve_unit(name: str) -> str:
+    """Of a phase response to this input."""
+    return f"cycles / ({unit_of(name)} s)" if unit_of(name) else "cycles / s / input"
+
+
+@checked
+@working("phase_response")
+def phase_response(
+    recording: Recording,
+    phase: Phase | AtEvent | Crossing,
+    *,
+    input: str,
+    harmonics: Harmonics | None = None,
+) -> PhaseResponse:
+    r"""The phase response curve of spikes, heartbeats, taps or steps under a known input.
+
+    The phase model is integrated from each event until its phase is 1, and the durations that this
+    gives are fitted to those measured by least squares, over the curve (a Fourier series) and the
+    rate of each trial. The end of an interval depends on the input, so that a regression of
+    measured intervals on the input at a linear phase is biased; this is not. The averaging of the
+    curve by the jitter of the rhythm is undone: see `docs/mathematics.md`.
+
+    **Arguments:**
+
+    - `phase`: the event at which each cycle begins, or a `Phase` that was found from events or
+      crossings.
+    - `input`: the name of the signal that acted; linear between its samples. It must not depend on
+      the rhythm (no feedback).
+    - `harmonics`: K. By default they are added as long as forecasts of blocks of intervals that
+      were left out gain from it by two standard errors, and not beyond 1/(2 pi jitter): the spread
+      of the phase at the end of a cycle hides what is finer.
+
+    Standard errors are those of blocks of intervals, whose errors may depend on each other: trials
+    if there are thirty or more, else parts of them.
+
+    **Raises:** `DefinitionError` for an input that is missing or constant, a phase that is an
+    angle, and too few intervals.
+    """
+    intervals = intervals_of(recording, phase_of(recording, phase), input)
+    total = len(intervals.start)
+    most = _MOST if harmonics is None else harmonics
+    if total < 2 * (2 * (harmonics or 0) + 1 + intervals.trials):
+        raise DefinitionError(
+            f"{total} intervals are too few for {harmonics or 0} harmonics and the rates of "
+            f"{intervals.trials} trials: record more."
+        )
+    fits: list[tuple[CurveFit, Accuracy]] = []
+    chosen = 0
+    for k in range(most + 1):
+        say(f"{k} harmonics")
+        fit = fit_curve(intervals, k, fits[-1][0] if fits else None)
+        fits.append((fit, accuracy_of(intervals, fit)))
+        if harmonics is not None or k == 0:
+            chosen = k
+            continue
+        if _gains(fits[chosen][1], fits[k][1]):
+            chosen = k
+        if k > chosen + 1 or k >= _resolved(fit.jitter):
+            break
+    fit, accuracy = fits[chosen]
+    x = np.arange(_POINTS) / _POINTS
+    waves = basis(x, chosen)
+    matrix = accuracy.covariance.matrix
+    return PhaseResponse(
+        coefficients=fit.coefficients,
+        covariance=matrix,
+        freedom=max(accuracy.covariance.freedom, 1.0),
+        phase=x,
+        values=waves @ fit.coefficients,
+        errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
+        rates=fit.rates,
+        trials=intervals.names,
+        jitter=fit.jitter,
+        left_out=np.array([share(intervals, f.used, a.left_out.sum()) for f, a in fits]),
+        r2=share(intervals, fit.used, (fit.residual[fit.used] ** 2).sum()),
+        intervals=total,
+        miscounted=int((~fit.used).sum()),
+        memory=_memory(intervals, fit),
+        input=Signal(input, recording.unit(input)),
+        result=Result.OK if fit.converged else Result.NOT_CONVERGED,
+    )
+
+
+def phase_of(recording: Recording, phase: Phase | AtEvent | Crossing) -> Phase:
+    """The phase, or that of these events."""
+    return phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
+
+
+def share(intervals: Intervals, used: Bool[np.ndarray, " L"], left: int | float) -> float:
+    """Of the variance of durations within trials, what is explained where so much is left."""
+    count = np.maximum(intervals.sums(1.0 * used), 1)
+    mean = intervals.sums(intervals.duration * used) / count
+    whole = ((intervals.duration - mean[intervals.trial])[used] ** 2).sum()
+    return float(1 - left / whole) if whole > 0 else 0.0
+
+
+def _resolved(jitter: float) -> int:
+    """The highest harmonic that the spread of the phase leaves to be seen at the end of a cycle."""
+    return max(1, round(1 / (2 * np.pi * max(jitter, 1e-6))))
+
+
+def _gains(before: Accuracy, after: Accuracy) -> bool:
+    """Whether what was left out is forecast better beyond doubt."""
+    gain = before.left_out - after.left_out
+    return bool(gain.sum() > _GAIN * np.sqrt(len(gain)) * gain.std(ddof=1))
+
+
+def _memory(intervals: Intervals, fit: CurveFit) -> float:
+    """Correlation of what is left of intervals that follow each other."""
+    missed, end = fit.residual * fit.forecast.rate, intervals.start + intervals.duration
+    next_to = fit.used[1:] & fit.used[:-1] & (np.diff(intervals.trial) == 0)
+    next_to &= np.abs(intervals.start[1:] - end[:-1]) < 1e-6 * intervals.duration[1:]
+    if next_to.sum() < 3:
+        return 0.0
+    return float(np.corrcoef(missed[1:][next_to], missed[:-1][next_to])[0, 1])
+
+
+def _about(r: PhaseResponse) -> Iterator[str]:
+    """What the data cannot tell."""
+    K, mean = r.harmonics, abs(r.coefficients[0])
+    if K:
+        a, C = r.coefficients[1:], r.covariance[1:, 1:]
+        p = float(stats.f.sf(a @ np.linalg.lstsq(C, a)[0] / len(a), len(a), r.freedom))
+    if not K or p > _LEVEL:
+        test = f" ({p_value(p)} for a flat one)" if K else ""
+        yield (
+            f"Shape: nothing is seen of it{test}; R2 of intervals left out is {r.left_out[0]:.3f} "
+            "with the mean alone."
+        )
+    else:
+        gain = r.left_out[K] - r.left_out[0]
+        yield (
+            f"Shape: it adds {gain:.3f} to the R2 of intervals left out; a flat curve has "
+            f"{r.left_out[0]:.3f} of {r.left_out[K]:.3f}."
+        )
+    low, high = r.interval(r.phase)
+    half = (high - low) / 2
+    if half.max() > _WIDE * mean:
+        worst = int(np.argmax(half))
+        yield (
+            f"Wide: at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
+            f"either side, {100 * half[worst] / max(mean, 1e-300):.0f} % of the mean."
+        )
+    yield (
+        f"Resolution: the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than "
+        f"harmonic {_resolved(r.jitter)} at the end of a cycle."
+    )
+    if abs(r.memory) > _MEMORY:
+        yield (
+            f"Memory: what is left of neighboring intervals is correlated by {r.memory:.2f}: one "
+            "number, the phase, is not all of the state. Standard errors allow for it."
+        )
+    if r.miscounted > _MISCOUNTED * r.intervals:
+        yield (
+            f"Miscounted: {r.miscounted} of {r.intervals} intervals "
+            f"({100 * r.miscounted / r.intervals:.1f} %) miss the model by half a cycle or "
+            "more, as if an event had been missed; they do not count."
+        )
+    if r.result != Result.OK:
+        yield f"The fit did not end: {Result(r.result).message}."

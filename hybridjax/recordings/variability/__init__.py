@@ -1,0 +1,1 @@
+"""Multipliers from natural variability: nothing is known of what disturbs the rhythm."""

@@ -1,0 +1,183 @@
+"""Multipliers from natural variability, with intervals by a block bootstrap."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..._core.boundary.checked import checked, checked_methods
+from ..._core.boundary.kinds import Probability, Seed
+from ..._core.boundary.scalars import Whole
+from ..._core.progress import working
+from ..data import SectionData
+from .moments import Moments, moments_of
+
+
+# Draws of the bootstrap. Doubled: ends of intervals scatter 0.7 times as much.
+_DRAWS = 1000
+# Cycles of a block: the third root of their number, and not less than this. Doubled: longer memory
+# of what disturbs the rhythm is allowed for, by fewer blocks.
+_SHORTEST_BLOCK = 4
+# Share of the states' variance that instruments must explain, below which they are weak. Doubled:
+# more is said.
+_WEAK = 0.5
+# Cycles for each multiplier, below which there are few. Doubled: more is said.
+_FEW = 50
+
+MultiplierCount = Annotated[int, Whole(1, 12)]
+
+
+@checked_methods
+class NaturalMultipliers(eqx.Module):
+    """Multipliers of a rhythm that nobody perturbed.
+
+    **Fields:**
+
+    - `multipliers` (d,): by instruments, without the bias that measurement noise makes.
+    - `plain` (d,): by least squares on the return map, as is usual; with that bias.
+    - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles.
+    - `strength`: the share of the states' variance that the instruments explain.
+    - `cycles`: how many were used, that are followed by another one. `block`: cycles of a block.
+    """
+
+    multipliers: Complex[np.ndarray, " d"]
+    plain: Complex[np.ndarray, " d"]
+    draws: Complex[np.ndarray, "B d"]
+    plain_draws: Complex[np.ndarray, "B d"]
+    strength: float = eqx.field(static=True)
+    cycles: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)
+
+    def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
+        """Bounds that hold the modulus of each multiplier with this probability, in the order of
+        moduli: percentiles of the bootstrap."""
+        return _interval(self.draws, level)
+
+    def plain_interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
+        """The same for least squares."""
+        return _interval(self.plain_draws, level)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the data cannot tell, in plain words."""
+        return tuple(_about(self))
+
+    def __repr__(self) -> str:
+        lines = [
+            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
+            f"{self.block} cycles)"
+        ]
+        both = (
+            ("by instruments", self.multipliers, self.interval()),
+            ("least squares", self.plain, self.plain_interval()),
+        )
+        for name, values, intervals in both:
+            for z, (low, high) in zip(values, intervals, strict=True):
+                text = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+                bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
+                lines.append(f"  {name:15s} {text:>15s}   {bounds}")
+        return "\n".join([*lines, *(f"  {text}" for text in self.warnings)])
+
+
+@checked
+@working("natural_multipliers")
+def natural_multipliers(
+    data: SectionData, order: MultiplierCount = 1, *, seed: Seed = 0
+) -> NaturalMultipliers:
+    r"""Floquet multipliers from variability alone: output-only identification.
+
+    The return map of every section is estimated from how deviations go on into the next cycle, as
+    in the Floquet analysis of gait (Hurmuzlu and Basdogan 1994). What disturbs the rhythm is not
+    known, and taken as independent from cycle to cycle. The state at a section is made of all
+    outputs there and at the section before, in the `order` combinations that vary most. All
+    sections have the same multipliers: the coefficients of their characteristic polynomials are
+    averaged.
+
+    Measurement noise biases a plain regression towards zero (Dingwell and Cusumano 2000 say why to
+    be careful with so few cycles and so much noise). Here the states at earlier sections of the
+    same cycle serve as instruments: noise that is not correlated over three sections or more has no
+    effect on them.
+
+    **Arguments:**
+
+    - `data`: of `section_data(..., inputs=())`; the average cycle of each trial is subtracted.
+    - `order`: the number of multipliers. Directions that are not among those that vary most act as
+      disturbances: believe what does not change with the order.
+    - `seed`: of the bootstrap, which draws blocks of successive cycles with replacement (Künsch
+      1989), within each record.
+
+    **Raises:** `DefinitionError` for too few cycles or signals.
+    """
+    moments = moments_of(data, order)
+    K = len(moments.records)
+    every = np.ones(K)
+    block = max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
+    rng = np.random.default_rng(seed)
+    draws, plain = np.zeros((2, _DRAWS, order), complex)
+    for b in range(_DRAWS):
+        weights = _resampled(moments, block, rng)
+        draws[b] = _multipliers(moments.by_instruments(weights))
+        plain[b] = _multipliers(moments.plain(weights))
+    return NaturalMultipliers(
+        multipliers=_multipliers(moments.by_instruments(every)),
+        plain=_multipliers(moments.plain(every)),
+        draws=draws,
+        plain_draws=plain,
+        strength=moments.strength(),
+        cycles=K,
+        block=block,
+    )
+
+
+def _multipliers(maps: Float[np.ndarray, "N d d"]) -> Complex[np.ndarray, " d"]:
+    """By the mean characteristic polynomial, the largest first."""
+    z = np.roots(np.mean([np.poly(J).real for J in maps], axis=0)).astype(complex)
+    z = np.concatenate([z, np.zeros(maps.shape[1] - len(z))])  # (`roots` drops zeros at the end)
+    return z[np.argsort(-np.abs(z), kind="stable")]
+
+
+def _resampled(moments: Moments, block: int, rng: np.random.Generator) -> Float[np.ndarray, " K"]:
+    """How often each cycle was drawn: whole blocks, as many cycles as there are in each record."""
+    weights = np.zeros(len(moments.records))
+    for record in np.unique(moments.records):
+        own = np.flatnonzero(moments.records == record)
+        length = min(block, len(own))
+        starts = rng.integers(0, len(own) - length + 1, -(-len(own) // length))
+        drawn = (starts[:, None] + np.arange(length)).ravel()[: len(own)]
+        np.add.at(weights, own[drawn], 1.0)
+    return weights
+
+
+def _interval(draws: Complex[np.ndarray, "B d"], level: float) -> Float[np.ndarray, "d 2"]:
+    tail = (1 - level) / 2
+    return np.quantile(np.abs(draws), [tail, 1 - tail], axis=0).T
+
+
+def _about(found: NaturalMultipliers) -> Iterator[str]:
+    """What the data cannot tell."""
+    d, (low, high) = len(found.multipliers), found.interval()[0]
+    yield (
+        f"Width: 95 % of resamplings put the largest modulus between {low:.2f} and {high:.2f}, "
+        f"from {found.cycles} cycles; four times as many would halve that."
+    )
+    if found.cycles < _FEW * d:
+        bias = (1 + 3 * abs(found.multipliers[0])) / found.cycles
+        yield (
+            f"Few cycles: {found.cycles} for {d} multipliers. A regression of so few returns is "
+            f"biased towards zero, by about {bias:.2f} for the largest (Kendall 1954); this is not "
+            "corrected."
+        )
+    if found.strength < _WEAK:
+        yield (
+            f"Weak instruments: earlier sections explain {100 * found.strength:.0f} % of the "
+            "states' variance only; the rest is noise, or too fast to be seen there."
+        )
+    if high >= 1:
+        yield f"Stability: the interval of the largest modulus reaches {high:.2f}, beyond 1."
+    shift = abs(found.multipliers[0]) - abs(found.plain[0])
+    yield (
+        f"Noise: least squares gives {abs(found.plain[0]):.3f} for the largest modulus, "
+        f"{abs(shift):.3f} {'less' if shift > 0 else 'more'}."
+    )
