@@ -1,6 +1,6 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
-python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size]
+python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [bag]
 [coverage] [short] [losses]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
@@ -420,6 +420,63 @@ def size(trials=10, minutes=10, rate=1000):
         print(f"{wall:.0f} s, {cpu:.0f} CPU s, largest memory {used.ru_maxrss / 2**20:.2f} GiB")
 
 
+def bag(sizes=(0.25, 2.0), minutes=10, rate=100):
+    print(f"\nMCAP files of images: {minutes} minutes of forces at {rate} Hz are read out of each")
+    for gigabytes in sizes:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "bag"
+            making = multiprocessing.get_context("spawn").Process(
+                target=write_bag, args=(path, gigabytes, minutes, rate)
+            )
+            making.start()
+            making.join()
+            code = "import sys, hybridjax as hj; hj.read_recording(sys.argv[1], signals='plate')"
+            (file,) = path.glob("*.mcap")
+            reading = subprocess.Popen(
+                [sys.executable, "-c", code, str(file)], stdout=subprocess.DEVNULL
+            )
+            _, status, used = os.wait4(reading.pid, 0)
+            if status:
+                raise RuntimeError("the file was not read.")
+            cpu = used.ru_utime + used.ru_stime
+            print(
+                f"{file.stat().st_size / 1e9:.2f} GB: {cpu:.1f} CPU s, largest memory "
+                f"{used.ru_maxrss / 2**20:.2f} GiB",
+                flush=True,
+            )
+
+
+def write_bag(path, gigabytes, minutes, rate):
+    from rosbags import rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = store.types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+    samples, images = minutes * 60 * rate, int(1000 * gigabytes)  # of a megabyte
+    rng = np.random.default_rng(0)
+    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    with writer:
+        plate, camera = (
+            (writer.add_connection(topic, kind, typestore=store), kind)
+            for topic, kind in (
+                ("/plate", "geometry_msgs/msg/WrenchStamped"),
+                ("/camera", "std_msgs/msg/UInt8MultiArray"),
+            )
+        )
+        for k in range(samples):
+            t = int(k * 1e9 / rate)
+            stamp = kinds["builtin_interfaces/msg/Time"](t // 10**9, t % 10**9)
+            header = kinds["std_msgs/msg/Header"](stamp, "")
+            wrench = kinds["geometry_msgs/msg/Wrench"](vector(k, 0, 0), vector(0, 0, 0))
+            message = kinds[plate[1]](header, wrench)
+            writer.write(plate[0], t, store.serialize_cdr(message, plate[1]))
+            if k * images // samples != (k + 1) * images // samples:
+                image = kinds[camera[1]](layout, rng.integers(0, 256, 10**6, np.uint8))
+                writer.write(camera[0], t, store.serialize_cdr(image, camera[1]))
+
+
 def write_trials(files, minutes, rate):
     hj.enable_x64()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
@@ -436,8 +493,8 @@ def write_trials(files, minutes, rate):
 
 
 ALL = (
-    "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "coverage", "short",
-    "losses",
+    "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage",
+    "short", "losses",
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from .._core.signal import Signal
 from ..errors import DefinitionError
+from ..experiments.record import Record
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .modules import REST
@@ -105,8 +107,44 @@ def from_section_data(data: SectionData) -> Any:
         "phase": np.arange(N) / N,
         "signal": list(map(str, data.signals)),
     }
+    rest = {
+        "kind": "SectionData",
+        "inputs": list(map(str, data.inputs)),
+        "spikes": data.spikes,
+        "records": [{"drift": r.drift, "lead": r.lead} for r in records],
+    }
     attributes = {"n_sections": N, "period": data.period, "bandwidth": data.bandwidth}
-    return package("xarray").Dataset(variables, coordinates, attributes)
+    return package("xarray").Dataset(variables, coordinates, attributes | {REST: json.dumps(rest)})
+
+
+def to_section_data(dataset: Any, rest: Mapping[str, Any]) -> SectionData:
+    """The data of a dataset of `from_section_data`; records may have been selected.
+
+    **Raises:** `DefinitionError` if it is none.
+    """
+    records, times, trials = [], [], []
+    try:
+        signals = [str(x) for x in dataset["signal"].values]
+        units = [dataset[name].attrs.get("units", "") for name in signals]
+        names = [Signal(*pair) for pair in zip(signals, units, strict=True)]
+        values = np.stack([dataset[name].values for name in signals], axis=1)
+        nu, N = len(rest["inputs"]), int(dataset.attrs["n_sections"])
+        about = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
+        for k in np.unique(dataset["record"].values):
+            here = dataset["record"].values == k
+            first = int(dataset["section"].values[here][0])
+            u, y = values[here, :nu], values[here, nu:]
+            records.append(Record(u, y, first_section=first, **about, **rest["records"][k]))
+            times.append(dataset["time"].values[here])
+            trials.append(int(dataset["trial"].values[here][0]))
+        cycle = dataset["average_cycle"].transpose("phase", "signal").values
+        return SectionData(
+            tuple(records), tuple(times), tuple(trials), cycle[:, :nu], cycle[:, nu:],
+            float(dataset.attrs["period"]), float(dataset.attrs["bandwidth"]),
+            tuple(rest["spikes"]),
+        )  # fmt: skip
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise DefinitionError(f"the dataset is no SectionData: {error}") from error
 
 
 def _refuse_reserved(names: tuple[str, ...]) -> None:

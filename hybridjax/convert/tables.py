@@ -53,7 +53,7 @@ def to_pandas(thing: Tabular) -> Any:
         ).to_dataframe()
     row = next(iter(dataset.data_vars.values())).dims[0]
     columns = {}
-    for name, x in (dataset.coords | dataset.data_vars).items():
+    for name, x in {**dataset.coords, **dataset.data_vars}.items():
         if x.dims == (row,):
             columns[name] = x.values
         elif x.dims[0] == row:

@@ -13,7 +13,7 @@ from ..orbits.sweep.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .families import from_branch, from_limit_cycles
-from .measured import from_recording, from_section_data, to_recording
+from .measured import from_recording, from_section_data, to_recording, to_section_data
 from .modules import REST, from_module, to_module
 
 
@@ -44,9 +44,13 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
 
 
 @checked
-def from_xarray(dataset: Any) -> Saved | Recording:
-    """What `to_xarray` made a dataset of, bit by bit: one of those that `hj.save` writes, or a
-    `Recording`. Harmonics, frequencies, experiments, samples and signals may have been selected.
+def from_xarray(dataset: Any) -> Saved | Recording | SectionData:
+    """What `to_xarray` made a dataset of, bit by bit: one of those that `hj.save` writes, a
+    `Recording`, or `SectionData`. Harmonics, frequencies, experiments, samples and signals may have
+    been selected, and records of `SectionData`.
+
+    There is no way back to `LimitCycles` and a `Branch`: their systems hold functions, which no
+    dataset does. `find_limit_cycles` and `continuation` find them again from the parameters.
 
     **Raises:** `DefinitionError` for other datasets.
     """
@@ -58,10 +62,12 @@ def from_xarray(dataset: Any) -> Saved | Recording:
         kind = None
     if kind == Recording.__name__:
         return to_recording(dataset, rest)
+    if kind == SectionData.__name__:
+        return to_section_data(dataset, rest)
     if kind not in KINDS:
         raise DefinitionError(
             "`dataset` must be an xarray.Dataset that `to_xarray` made of a "
-            f"{', '.join(KINDS)} or Recording."
+            f"{', '.join(KINDS)}, Recording or SectionData."
         )
     return to_module(dataset, rest, KINDS[kind])
 

@@ -10,11 +10,19 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
+from .._core.html.parts import card, facts, table
+from .._core.html.svg import COLORS, Curve, picture
 from .._core.results import Result
+from .._core.signal import unit_of, with_unit
 from .._core.text import fields, listed
 from ..errors import DefinitionError
 from .events import EventTimes
 from .record import Record
+
+
+# What a notebook looks at: experiments (spread over all), and cycles of the one that it draws.
+# Doubled: twice the time, for larger samples of very many.
+_LOOKED_AT, _DRAWN = 64, 4
 
 
 @checked
@@ -201,6 +209,35 @@ class ExperimentData(eqx.Module):
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
+
+    def _repr_html_(self) -> str:
+        S, n, _ = self.u.shape
+        known = {
+            "cycles": f"{n // self.n_sections} of {self.n_sections} sections",
+            "window": f"the last {self.periods} periods",
+            "sections": self.label,
+        }
+        good = np.flatnonzero(self.ok)
+        some = good[:: max(1, len(good) // _LOOKED_AT)]
+        if not len(some):
+            return card("ExperimentData", self.summary(), facts(known))
+        signals = [(x, self.u[some, :, k]) for k, x in enumerate(self.inputs)]
+        signals += [(y, self.y[some, :, k]) for k, y in enumerate(self.outputs)]
+        rows = [
+            (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
+            for x, v in signals
+        ]
+        of_them = "" if len(some) == len(good) else f" of {len(some)} of them"
+        k = slice(self.window.start, self.window.start + _DRAWN * self.n_sections)
+        t = np.arange(n)[k] / self.n_sections
+        drawn = [
+            picture([Curve(t, v[0, k], color=color)], "cycles", with_unit(x, unit_of(x)))
+            for (x, v), color in zip(
+                (signals[0], signals[len(self.inputs)]), (COLORS[-1], COLORS[0]), strict=True
+            )
+        ]
+        sizes = table(("signal", f"rms{of_them}", "largest"), rows)
+        return card("ExperimentData", self.summary(), facts(known), sizes, *drawn)
 
 
 def summary(

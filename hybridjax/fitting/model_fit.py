@@ -11,10 +11,11 @@ from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
+from .._core.html.parts import card, table, text
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, unit_of_parameter
 from .problem import FitProblem, evaluate
 from .sensitivity import Identifiability
 
@@ -135,3 +136,15 @@ class ModelFit(eqx.Module):
             lines.append(f"  {name:{width}}  {value:<14.9g} {shown}")
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+            unit, seen = unit_of_parameter(self.system, name), np.isfinite(error)
+            known = f"{1.96 * error:.2g}" if seen else "not seen by itself"
+            rows.append((name, f"{value:.9g}", known, unit))
+        head, cost, *_ = repr(self).splitlines()
+        unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
+        of = head.removeprefix("ModelFit(").removesuffix(")")
+        parameters = table(("parameter", "value", "± 95 %", "unit"), rows)
+        return card("ModelFit", f"of {of}", parameters, text("\n".join([cost.strip(), *unseen])))

@@ -12,7 +12,10 @@ from .._core.boundary.arrays import Complexes, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.executor import from_host
+from .._core.html.parts import card, table
+from .._core.html.svg import COLORS, Curve, picture
 from .._core.precision import require_x64
+from .._core.signal import ratio, with_unit
 from .._core.text import listed
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
@@ -26,6 +29,9 @@ _SAME_FREQUENCY = 1e-9
 # (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
 _WIDEST_GAP = 2
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
+
+# Outputs and harmonics that a notebook shows: the largest ones of these. Doubled: twice the size.
+_SHOWN_OUTPUTS, _SHOWN_HARMONICS = 3, 5
 
 # Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
 _SILENT_LINE = 1e-10
@@ -118,6 +124,29 @@ class HTF(eqx.Module):
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
             f"{self.n_sections} sections: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
+
+    def _repr_html_(self) -> str | None:
+        """The first input's, as functions of frequency."""
+        if is_traced(self) or self.H.ndim != 4 or not self.H.size:
+            return None
+        f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
+        order = np.argsort(f)
+        u, peaks = self.inputs[0], np.nanmax(H, axis=1)
+        largest = np.argsort(-np.nanmax(peaks, axis=1), kind="stable")[:_SHOWN_HARMONICS]
+        drawn, rows = [], []
+        for j, y in enumerate(self.outputs[:_SHOWN_OUTPUTS]):
+            curves = [
+                Curve(f[order], H[k, order, j], f"H_{self.harmonics[k]}", COLORS[i])
+                for i, k in enumerate(np.sort(largest))
+            ]
+            name = with_unit(f"|H|, {u} to {y}", ratio(y, u))
+            drawn.append(picture(curves, "f (cycles/period)", name, log=True))
+            rows += [
+                (y, f"H_{self.harmonics[k]}", f"{peaks[k, j]:.4g}", f"{f[H[k, :, j].argmax()]:.4g}")
+                for k in np.sort(largest)
+            ]
+        of = f"({self.source}): {repr(self).partition('; ')[2].removesuffix(')')}"
+        return card("HTF", of, *drawn, table(("output", "", "largest modulus", "at f"), rows))
 
     def harmonic(self, m: int) -> Complex[Array, "F ny nu"]:
         """`H_m`; `m` counts modulo `N`.

@@ -13,6 +13,8 @@ from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, NonNegative, PeriodCount, Vector
 from .._core.executor import from_host
+from .._core.html.multipliers import multiplier_table, unit_circle
+from .._core.html.parts import card, facts
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.text import listed
@@ -172,6 +174,14 @@ class LDTP(eqx.Module):
             f"LDTP({self.n_sections} sections, dimension {dims}: {listed(self.inputs)} -> "
             f"{listed(self.outputs)})"
         )
+
+    def _repr_html_(self) -> str | None:
+        if is_traced(self):
+            return None
+        known = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
+        known["dimension"] = _summary(np.asarray(self.dims))
+        multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
+        return card("LDTP", f"{self.n_sections} sections", facts(known), *multipliers)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0

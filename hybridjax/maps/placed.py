@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.boundary.checked import checked_methods
 from .._core.compilation.compile import host_first
 from .._core.executor import Array, namespace, to_host
+from .._core.html.parts import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
@@ -16,6 +17,7 @@ from ..engine.lanes import Lanes
 from ..engine.tape import Tape
 from ..engine.target import Target
 from ..orbits.cycle import LimitCycle
+from ..orbits.picture import orbit_picture
 from ..sections.abstract import AbstractSections, BoundSections
 from ..sections.section_list import FamilyLike
 from ..systems.output import Output, OutputNames
@@ -78,6 +80,23 @@ class PlacedSections(eqx.Module):
         low, high = np.min(placed.dims), np.max(placed.dims)
         dimension = f"{low}" if low == high else f"{low} to {high}"
         return f"{head}: {', '.join(inside)}; dimension {dimension}; section 0 at t = {start})"
+
+    def _repr_html_(self) -> str | None:
+        if is_traced(self):
+            return None
+        placed, names = to_host(self), self.structure().names
+        t, charts = placed.lanes.t, placed.lanes.chart
+        ways, unit = np.asarray(self.duration), self.cycle.system.time_unit
+        inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
+        known = {
+            "sections": ", ".join(inside),
+            "dimension": f"{np.min(placed.dims)} to {np.max(placed.dims)}",
+            "section 0 at t": number(t[0], unit=unit),
+            "from one to the next": f"{np.min(ways):.4g} to {number(np.max(ways), 4, unit)}",
+        }
+        drawn = orbit_picture(self.cycle.trajectory(), (t, charts, placed.lanes.q.T))
+        of = f"{self.n_sections} of a {type(self.family).__name__}"
+        return card("PlacedSections", of, facts(known), drawn)
 
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions, made anew: where the sections

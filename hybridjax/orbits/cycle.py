@@ -7,6 +7,8 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.executor import to_host
+from .._core.html.multipliers import multiplier_table, unit_circle
+from .._core.html.parts import card, facts
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of
@@ -21,6 +23,7 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .fine_factors import fine_factors, weakest
 from .liouville import log_determinant
+from .picture import orbit_picture
 from .return_map import ReturnMap
 from .scale import sizes_of
 from .stiffness import stiff_charts
@@ -192,36 +195,53 @@ class LimitCycle(eqx.Module):
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
-        s, time, anchor = Structure(self.system), self.system.time_unit, to_host(self.anchor)
-        names = [tr.name for tr in s.transitions]
-        events = ", ".join(names[g] for g in self.event_sequence) or "none"
-        units = map(unit_of, s.states(int(anchor.chart[0])))
-        state = ", ".join(
-            f"{name} = {number(x, 9, unit)}"
-            for (name, x), unit in zip(self.state.items(), units, strict=True)
-        )
+        said = self._facts()
+        start, state = list(said.items())[1]
         least = "1e-10" if self._implicit else "1e-308"
         multipliers = ", ".join(_format(z, least) for z in self.multipliers) or "none but zero"
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
         return (
             f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
-            f"  period       {number(self.period, 12, time)}\n"
-            f"  at t = {number(anchor.t[0], 6, time)}   {state}\n"
-            f"  events       {events}\n"
+            f"  period       {said['period']}\n"
+            f"  {start}   {state}\n"
+            f"  events       {said['events']}\n"
             f"  multipliers  {multipliers}\n"
-            f"  residual     {float(self.residual):.2g} after {int(self.iterations)} Newton steps"
-            + self._stiffness()
+            f"  residual     {said['residual']}"
+            + "".join(f"\n  stiff        {said[name]}" for name in said if name == "stiff")
         )
 
-    def _stiffness(self) -> str:
-        """What limits explicit steps, if a chart is stiff."""
-        stiff = stiff_charts(Structure(self.system), to_host(self.legs), float(self.period))
-        return "".join(
-            f"\n  stiff        chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps "
-            'of an explicit method; `Settings(solver="auto")` takes an implicit one'
+    def _repr_html_(self) -> str | None:
+        if is_traced(self):
+            return None
+        of = f"{type(self.system).__name__}: {Result(int(self.result)).message}"
+        if self.result != Result.OK:
+            return card("LimitCycle", of, facts(self._facts()))
+        multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
+        orbit = orbit_picture(self.trajectory())
+        return card("LimitCycle", of, facts(self._facts()), orbit, *multipliers)
+
+    def _facts(self) -> dict[str, str]:
+        """What prints besides the multipliers, by what it is called."""
+        s, time, anchor = Structure(self.system), self.system.time_unit, to_host(self.anchor)
+        names = [tr.name for tr in s.transitions]
+        units = map(unit_of, s.states(int(anchor.chart[0])))
+        stiff = stiff_charts(s, to_host(self.legs), float(self.period))
+        sentences = (
+            f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an explicit "
+            'method; `Settings(solver="auto")` takes an implicit one'
             for name, rate in stiff.items()
         )
+        return {
+            "period": number(self.period, 12, time),
+            f"at t = {number(anchor.t[0], 6, time)}": ", ".join(
+                f"{name} = {number(x, 9, unit)}"
+                for (name, x), unit in zip(self.state.items(), units, strict=True)
+            ),
+            "events": ", ".join(names[g] for g in self.event_sequence) or "none",
+            "residual": f"{float(self.residual):.2g} after {int(self.iterations)} Newton steps",
+            **({"stiff": "; ".join(sentences)} if stiff else {}),
+        }
 
 
 def _require_values(cycle: LimitCycle, name: str) -> None:

@@ -1,14 +1,22 @@
 """Data at the sections of a recorded cycle."""
 
+import itertools
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
-from .._core.signal import unit_of
+from .._core.html.parts import card, facts, table
+from .._core.html.svg import COLORS, Curve, picture
+from .._core.signal import unit_of, with_unit
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record
+
+
+# Signals that a notebook draws. Doubled: twice the size.
+_DRAWN = 4
 
 
 class SectionData(eqx.Module):
@@ -97,6 +105,28 @@ class SectionData(eqx.Module):
             outputs=self.outputs,
             label="recorded",
         )
+
+    def _repr_html_(self) -> str:
+        known = {
+            "cycles": f"{self.cycles:.5g} of {self.n_sections} sections",
+            "records": str(len(self.records)),
+            "period": f"{self.period:.6g} s",
+            "missing": f"{100 * self.missing:.2g} %",
+        }
+        sizes = (f"{x:.3g}" for part in self.rms() for x in part)
+        rows = list(zip(self.signals, sizes, self.units, map(str, self.spikes), strict=True))
+        head = ("signal", "rms deviation", "unit", "spikes left out")
+        phase = np.arange(self.n_sections) / self.n_sections
+        cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
+        drawn = [
+            picture(
+                [Curve(phase, own, "average cycle", color)], "phase (cycles)", with_unit(x, unit)
+            )
+            for x, unit, own, color in list(
+                zip(self.signals, self.units, cycles.T, itertools.cycle(COLORS), strict=False)
+            )[:_DRAWN]
+        ]
+        return card("SectionData", "", facts(known), table(head, rows), *drawn)
 
     def __repr__(self) -> str:
         u, y = self.rms()

@@ -174,6 +174,8 @@ def _table(path: Path, columns: Columns, wanted: Wanted) -> _Table:
         if name.startswith(EVENT):
             events[name.removeprefix(EVENT)] = t[np.nan_to_num(values) != 0]
             continue
+        if unit.lower() == "nan":
+            raise FileFormatError(f"'{path}': the unit of '{name}' is nan: write it, or nothing.")
         signals[name] = values
         if unit:
             units[name] = unit

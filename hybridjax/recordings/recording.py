@@ -9,6 +9,9 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
+from .._core.html.parts import card, table, text
+from .._core.html.svg import COLORS, Curve, picture
+from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..sections.crossing import Crossing
 from .headers import seconds, split_header, time_unit
@@ -24,6 +27,8 @@ _BISECTIONS = 50
 # Times between samples are irregular if those at this part from either end differ by more than that
 # part of their median. Doubled: fewer recordings are said to be irregular.
 _TAIL, _IRREGULAR = 0.05, 0.1
+# What a notebook draws: samples, of so many signals. Doubled: twice the size, or time.
+_LOOKED_AT, _DRAWN = 600, 4
 
 
 class Trial(eqx.Module):
@@ -315,8 +320,50 @@ class Recording(eqx.Module):
             )
         pairs = zip(self.signals, self.units, strict=True)
         names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
+        rates = _rates(self.trials[0])
+        if len(rates) and max(rates) > (1 + _IRREGULAR) * min(rates):
+            own = (f"{key} {rate:.4g} Hz" for key, rate in zip(self.signals, rates, strict=True))
+            parts.append(f"  sampled at {', '.join(own)}")
         parts += [f"  ({note})" for note in self.notes]
         return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
+
+    def _repr_html_(self) -> str:
+        trials = [
+            (t.name, str(len(t.time)), f"{t.time[-1] - t.time[0]:.4g} s",
+             ", ".join(f"{len(at)} {name}" for name, at in t.events.items()))
+            for t in self.trials
+        ]  # fmt: skip
+        first = self.trials[0]
+        signals = [
+            (name, unit, f"{rate:.4g} Hz")
+            for name, unit, rate in zip(self.signals, self.units, _rates(first), strict=True)
+        ]
+        k = slice(0, _LOOKED_AT)
+        drawn = []
+        for x, color, unit, values in zip(
+            self.signals[:_DRAWN], COLORS, self.units, first.values[k].T, strict=False
+        ):
+            there = np.isfinite(values)
+            curve = Curve(first.time[k][there], values[there], color=color)
+            drawn.append(picture([curve], "time (s)", with_unit(x, unit)))
+        return card(
+            "Recording",
+            f"{len(trials)} trials",
+            table(("trial", "samples", "duration", "events"), trials),
+            table(("signal", "unit", "rate"), signals),
+            *drawn,
+            text("\n".join(self.notes)),
+        )
+
+
+def _rates(trial: Trial) -> list[float]:
+    """How often each signal was sampled, in Hz: by the median time between its samples; 0 where
+    there are none."""
+    rates = []
+    for values in trial.values.T:
+        step = np.diff(trial.time[np.isfinite(values)])
+        rates.append(1 / float(np.median(step)) if len(step) else 0.0)
+    return rates
 
 
 def signal_of(crossing: Crossing) -> str:

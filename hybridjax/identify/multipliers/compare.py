@@ -9,6 +9,8 @@ from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Complexes
+from ..._core.html.multipliers import complex_number
+from ..._core.html.parts import card, table
 from ...errors import DefinitionError
 
 
@@ -50,6 +52,16 @@ class MultiplierComparison(eqx.Module):
         ):
             rows.append(f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
         return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        names = self.outputs or [""] * len(self.true)
+        rows = [
+            (name, complex_number(true, 9), complex_number(estimated, 9), f"{error:.1e}")
+            for name, true, estimated, error in zip(
+                names, self.true, self.estimated, self.error, strict=True
+            )
+        ]
+        return card("MultiplierComparison", "", table(("", "true", "estimated", "error"), rows))
 
 
 def _show(value: complex) -> str:

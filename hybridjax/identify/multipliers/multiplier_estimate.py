@@ -6,6 +6,8 @@ from jaxtyping import Bool, Complex, Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import PeriodCount, Probability
+from ..._core.html.multipliers import multiplier_table, unit_circle
+from ..._core.html.parts import card, text
 from ...errors import DefinitionError
 from .compare import MultiplierComparison, Multipliers, compare_multipliers
 
@@ -110,6 +112,25 @@ class MultiplierEstimate(eqx.Module):
     def compare(self, true: Multipliers) -> MultiplierComparison:
         """The multipliers beside the true ones, paired; printing it shows a table."""
         return compare_multipliers(self.multipliers, true)
+
+    @checked
+    def half_widths(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
+        """Half the widths of the intervals of each multiplier's real and imaginary part, to first
+        order."""
+        variances = np.diagonal(self.multiplier_covariances, axis1=1, axis2=2)
+        return np.sqrt(self._radius(level, 1) * np.maximum(variances, 0))
+
+    def _repr_html_(self) -> str:
+        regions = []
+        if np.isfinite(self.multiplier_covariances).all():
+            regions = [self.ellipse(k) for k in range(len(self.multipliers))]
+        shown = multiplier_table(self.multipliers, self.half_widths())
+        circle = unit_circle(self.multipliers, regions)
+        return card(type(self).__name__, "", shown, circle, text(self._about()))
+
+    def _about(self) -> str:
+        """What there is to say besides the multipliers, for a `repr`."""
+        return ""
 
     def show_multipliers(self) -> str:
         """The multipliers and their standard errors, for a `repr`."""

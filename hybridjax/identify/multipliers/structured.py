@@ -83,14 +83,16 @@ class StructuredFit(MultiplierEstimate):
         return HTF(f, H, wanted, self.n_sections, self.inputs, self.outputs, "structured fit")
 
     def __repr__(self) -> str:
+        return f"StructuredFit(multipliers {self.show_multipliers()}; {self._about()})"
+
+    def _about(self) -> str:
         misfit = ", ".join(
             f"{name} {x:.1e}" for name, x in zip(self.outputs, self.residual, strict=True)
         )
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         return (
-            f"StructuredFit(multipliers {self.show_multipliers()}; residual {misfit}; "
-            f"{self.cost / self.freedom:.3g} times what is expected; "
-            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state})"
+            f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
+            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}{state}"
         )
 
 

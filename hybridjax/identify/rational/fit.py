@@ -9,6 +9,8 @@ from jaxtyping import Complex, Float, Int
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
+from ..._core.html.multipliers import complex_number, unit_circle
+from ..._core.html.parts import card, table
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError
@@ -106,6 +108,18 @@ class RationalFit(eqx.Module):
             state = "" if code == Result.OK else f" ({Result(int(code)).message})"
             rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}{state}")
         return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, *map(complex_number, (pole, multiplier)), f"{residual:.2e}")
+            for name, poles, own, residual in zip(
+                self.outputs, self.poles, self.multipliers, self.residual, strict=True
+            )
+            for pole, multiplier in zip(poles, own, strict=True)
+        ]
+        of = repr(self).splitlines()[0].removeprefix("RationalFit(").removesuffix(")")
+        head = ("output", "pole", "multiplier", "residual")
+        return card("RationalFit", of, table(head, rows), unit_circle(self.multipliers.ravel()))
 
 
 @checked

@@ -96,12 +96,12 @@ class SeriesFit(MultiplierEstimate):
         return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
 
     def __repr__(self) -> str:
+        return f"SeriesFit(multipliers {self.show_multipliers()}; {self._about()})"
+
+    def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         noise = ", ".join(
             f"{name} {number(x, 3, unit_of(name))}"
             for name, x in zip(self.outputs, self.noise, strict=True)
         )
-        return (
-            f"SeriesFit(multipliers {self.show_multipliers()}; noise {noise}; "
-            f"{self.n_sections} sections, {self.numerators.shape[1]} lags{state})"
-        )
+        return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"

@@ -10,6 +10,8 @@ from scipy import stats
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Probability
+from ..._core.html.parts import card, table, text
+from ..._core.html.svg import COLORS, Curve, picture
 from ..._core.signal import unit_of, with_unit
 from ..._core.text import p_value
 from ...errors import DefinitionError
@@ -21,6 +23,8 @@ from .series_fit import SeriesFit
 from .simulation import can_be_compared, simulate_record
 
 
+# Cycles that a notebook draws. Doubled: they are harder to see.
+_DRAWN = 4
 # Samples of a section, below which a correlation says nothing. Doubled: more records are refused.
 _FEWEST_SAMPLES = 8
 # Samples for each lag that is looked at by default. Doubled: half as many lags.
@@ -104,6 +108,28 @@ class Validation(eqx.Module):
         )
         rows.append(f"misfits that would be noticed in four of five such data: {seen}")
         return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        names = [with_unit(y, unit_of(y)) for y in self.outputs]
+        rows = [
+            (names[i], f"{self.fit[i]:.4g} %", f"{self.noise[i]:.3g}",
+             p_value(self.whiteness[i]), p_value(self.independence[i]))
+            for i in range(len(names))
+        ]  # fmt: skip
+        k = slice(0, _DRAWN * self.n_sections)
+        t = (self.first_section + np.arange(len(self.measured[k]))) / self.n_sections
+        curves = [
+            Curve(t, self.measured[k, 0], "measured", COLORS[-1]),
+            Curve(t, self.simulated[k, 0], "simulated"),
+        ]
+        verdict = "\n".join(repr(self).splitlines()[1 + len(names) :])
+        return card(
+            "Validation",
+            "",
+            table(("output", "fit", "rms left", "white", "independent"), rows),
+            picture(curves, "cycles", names[0]),
+            text(verdict),
+        )
 
 
 @checked

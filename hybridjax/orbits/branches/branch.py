@@ -7,6 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from ..._core.boundary.checked import checked_methods
+from ..._core.html.multipliers import complex_number
+from ..._core.html.parts import card, table
+from ..._core.html.svg import COLORS, Curve, picture
 from ..._core.memo import remembered
 from ..._core.results import Result
 from ..cycle import LimitCycle
@@ -33,6 +36,11 @@ class BranchPoint(NamedTuple):
     """Of the parameter."""
     multipliers: Complex[np.ndarray, " r"]
     """The critical ones among them lie on the unit circle to rounding."""
+
+    @property
+    def critical(self) -> Complex[np.ndarray, " c"]:
+        """Those of the multipliers."""
+        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < _ON_CIRCLE]
 
 
 class BranchEnd(NamedTuple):
@@ -98,7 +106,7 @@ class Branch(eqx.Module):
         """One line for each marked point and each end."""
         lines = [f"from {self.parameter} = {self.ends[0].value:.9g}: {self.ends[0].message}"]
         for p in self.points:
-            on = p.multipliers[np.abs(np.abs(p.multipliers) - 1) < _ON_CIRCLE]
+            on = p.critical
             at = ", ".join(f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in on)
             lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
         lines.append(f"to {self.parameter} = {self.ends[1].value:.9g}: {self.ends[1].message}")
@@ -107,3 +115,23 @@ class Branch(eqx.Module):
     def __repr__(self):
         name = type(self.cycles.systems).__name__
         return f"Branch({name} along {self.parameter}: {len(self)} cycles)\n  {self.summary()}"
+
+    def _repr_html_(self) -> str:
+        largest = np.abs(self.multipliers).max(axis=1)
+        marks = [p.index for p in self.points]
+        rows = [
+            ("from", f"{self.ends[0].value:.9g}", self.ends[0].message),
+            *(
+                (p.kind, f"{p.value:.9g}", ", ".join(complex_number(z) for z in p.critical))
+                for p in self.points
+            ),
+            ("to", f"{self.ends[1].value:.9g}", self.ends[1].message),
+        ]
+        curves = [
+            Curve(self.values[[0, -1]], np.ones(2), color=COLORS[-1]),
+            Curve(self.values, largest),
+            Curve(self.values[marks], largest[marks], color=COLORS[1], points=True),
+        ]
+        drawn = picture(curves, self.parameter, "largest modulus of multipliers")
+        of = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
+        return card("Branch", of, table(("", self.parameter, ""), rows), drawn)

@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Index, Positive
 from ..._core.execution import Execution
+from ..._core.html.parts import card, table
+from ..._core.html.svg import Curve, picture, thinned
 from ..._core.memo import remembered
 from ..._core.precision import require_x64
 from ..._core.progress import working
@@ -100,12 +102,7 @@ class LimitCycles(eqx.Module):
         Eigenvalues of the product of the factors, filled up with zeros: those far below the
         largest are lost in rounding. `cycles[i].multipliers` sees them, too.
         """
-        product = np.where(self.ok[:, None, None], turn_product(np.asarray(self.factors)), 0.0)
-        values = np.linalg.eigvals(product).astype(complex)
-        order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
-        values = np.take_along_axis(values, order, axis=-1)
-        values[~self.ok] = np.nan
-        return values
+        return _multipliers(np.asarray(self.factors), self.ok)
 
     def summary(self, limit: Index = 5) -> str:
         """`10000/10000 found`, or why the first `limit` of the others were not."""
@@ -117,6 +114,21 @@ class LimitCycles(eqx.Module):
 
     def __repr__(self):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
+
+    def _repr_html_(self) -> str:
+        """(Of very many only some are looked at.)"""
+        k = thinned(len(self))
+        largest = np.abs(_multipliers(np.asarray(self.factors)[k], self.ok[k])[:, 0])
+        shown = {"period": np.asarray(self.period)[k], "largest modulus": largest}
+        rows = [
+            (name, f"{np.nanmin(x):.6g}", f"{np.nanmax(x):.6g}")
+            for name, x in shown.items()
+            if np.isfinite(x).any()
+        ]
+        ranges = table(("", "from", "to"), rows) if rows else ""
+        curve = picture([Curve(k, largest)], "system", "largest modulus of multipliers")
+        of = f"of {type(self.systems).__name__}: {self.summary(1)}"
+        return card("LimitCycles", of, ranges, curve)
 
 
 @checked
@@ -175,6 +187,18 @@ def find_limit_cycles(
         turn.distance, found.steps, found.result, found.codes, settings, guess.conserved,
         guess.multiplicity,
     )  # fmt: skip
+
+
+def _multipliers(
+    factors: Float[np.ndarray, "S K d d"], ok: Bool[np.ndarray, " S"]
+) -> Complex[np.ndarray, "S d"]:
+    """See `LimitCycles.multipliers`."""
+    product = np.where(ok[:, None, None], turn_product(factors), 0.0)
+    values = np.linalg.eigvals(product).astype(complex)
+    order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+    values = np.take_along_axis(values, order, axis=-1)
+    values[~ok] = np.nan
+    return values
 
 
 def _stacked(systems) -> HybridSystem:

@@ -1,0 +1,207 @@
+"""What results show in notebooks: well-formed, small, with escaped names, whatever they hold."""
+
+import html.parser
+import time
+import xml.etree.ElementTree as ElementTree
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core.html.multipliers import complex_number, multiplier_table
+from hybridjax._core.html.svg import Curve, picture
+
+
+BYTES = 20_000  # the most that a result may take
+
+
+class Reader(html.parser.HTMLParser):
+    """Of the texts of a page; every tag that opens must be closed."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.texts, self.pictures = [], [], 0
+        self.feed(page)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.open.append(tag)
+        self.pictures += tag == "svg"
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def shown(thing):
+    page = thing._repr_html_()
+    assert len(page) < BYTES and "nan" not in page.replace("nanm", "")
+    return Reader(page)
+
+
+@pytest.fixture(scope="module")
+def model(kinematic_ldtp):
+    m = kinematic_ldtp
+    return hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
+
+
+def many(cycle, n):
+    """So many times the same cycle."""
+    arrays, rest = eqx.partition(cycle, eqx.is_array)
+    arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
+    c = eqx.combine(arrays, rest)
+    return hj.LimitCycles(
+        c.system, c.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
+        c.result, np.broadcast_to(c.event_sequence, (n, 2)), cycle.settings, c.conserved,
+        c.multiplicity,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(hopper_cycle):
+    t = np.linspace(0.0, 20.0, 2001)
+    tt, y, v = hopper_cycle.trajectory(21)("yM", "vM")
+    signals = {"<u>": np.cos(3 * t), "yM & co": np.interp(t, tt, y), "vM": np.interp(t, tt, v)}
+    return hj.Recording(t, signals, units={"vM": "m/s"}, events={"<hit>": [1.0]}, name="<i>")
+
+
+def test_cycles_and_sections(hopper_cycle, placed_kinematic):
+    cycle, placed = shown(hopper_cycle), shown(placed_kinematic)
+    assert {"-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"} <= set(cycle.texts)
+    assert cycle.pictures == 2 and placed.pictures == 1
+    assert {"27 in flight, 5 in stance", "2 to 4"} <= set(placed.texts)
+    assert placed_kinematic._repr_html_().count("<circle") == 32
+
+
+def test_many_cycles_and_branches(hopper_cycle):
+    """Of a million cycles, too, no more is looked at than is drawn."""
+    cycles = many(hopper_cycle, 2)
+    few = shown(cycles)
+    assert "2/2 found" in "".join(few.texts) and "0.742334" in few.texts
+    large = many(hopper_cycle, 1_000_000)
+    start = time.process_time()
+    assert shown(large).pictures == 1
+    assert time.process_time() - start < 0.5
+    lost = eqx.tree_at(lambda c: c.result, cycles, np.full(2, hj.Result.BLOW_UP))
+    assert "left all bounds" in "".join(shown(lost).texts)
+    point = hj.orbits.BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
+    end = hj.orbits.BranchEnd(1.0, hj.Result.OK, "the <values> end")
+    branch = shown(hj.Branch("k", np.array([1.0, 2.0]), cycles, (point,), (end, end)))
+    assert {"flip", "2", "-1", "the <values> end"} <= set(branch.texts) and branch.pictures == 1
+
+
+def test_linear_models_and_transfer_functions(model):
+    page = shown(model)
+    assert {"<u>", "yM & co, vM (m/s)"} & set(page.texts) and page.pictures == 1
+    htf = model.htf(np.linspace(0.05, 5, 300), harmonics=(-2, -1, 0, 1, 2))
+    page = shown(htf)
+    assert page.pictures == 2 and {"H_-2", "|H|, <u> to vM"} <= {
+        x.split(" (")[0] for x in page.texts
+    }
+    assert shown(htf.at(htf.f[:1])).pictures == 2  # of one frequency there is no curve
+
+
+def test_experiments(model):
+    design = hj.multisine(periods=16, band=(0, 4.0))
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    page = shown(data)
+    assert page.pictures == 2 and {"<u>", "yM & co"} <= set(page.texts)
+    failed = np.full(len(data.u), int(hj.Result.ZENO))
+    lost = eqx.tree_at(lambda d: d.result, data, failed)
+    assert shown(lost).pictures == 0 and "Zeno" in "".join(shown(lost).texts)
+
+
+def test_fits():
+    A, B, C = [[[0.6, 0.5], [-0.5, 0.6]]] * 4, [[[1.0], [0.3]]] * 4, [[[1.0, 0.0], [0.2, 1.0]]] * 4
+    model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(600, 1))
+    y = np.asarray(model.simulate(u)) + 1e-2 * rng.normal(size=(600, 2))
+    record = hj.Record(u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs)
+    fit = hj.fit_series(record, order=2)
+    page = shown(fit)
+    said = [tuple(map(float, x.split(" ± "))) for x in page.texts if " ± " in x]
+    parts = np.stack([fit.multipliers.real, fit.multipliers.imag], axis=1)
+    values, widths = np.reshape(said, (2, 2, 2)).transpose(2, 0, 1)
+    np.testing.assert_allclose(widths, fit.half_widths(), rtol=0.1)
+    assert (np.abs(values - parts) < 0.1 * widths).all()
+    assert any(x.startswith("noise yM & co ") for x in page.texts)
+    assert shown(hj.validate(fit, record)).pictures == 1
+    assert "error" in shown(fit.compare(model.multipliers)).texts
+    htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
+    assert {"yM & co", "pole"} <= set(shown(hj.fit_rational(htf)).texts)
+
+
+def test_intervals_are_those_of_the_normal_distribution(model):
+    """Half-widths of a real multiplier whose coefficient is known to 0.01."""
+    known = hj.identify.MultiplierBound(np.array([0.5 + 0j]), np.array([-0.5]), np.array([[1e-4]]))
+    np.testing.assert_allclose(known.half_widths(), [[1.959964e-2, 0.0]], rtol=1e-6)
+    assert "0.500 ± 0.020" in shown(known).texts
+    unknown = hj.identify.MultiplierBound(
+        known.multipliers, known.coefficients, np.array([[np.inf]])
+    )
+    assert "0.5 (unknown)" in shown(unknown).texts
+
+
+def test_recordings(recording):
+    page = shown(recording)
+    assert {"<i>", "1 <hit>", "100 Hz", "vM (m/s)"} <= set(page.texts) and page.pictures == 3
+    apex = hj.Crossing("vM", "falling")
+    data = hj.recordings.section_data(
+        recording, apex, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
+    )
+    page = shown(data)
+    assert {"<u>", "rms deviation"} <= set(page.texts) and page.pictures == 3
+
+
+def test_rates_of_signals_are_printed_where_they_differ(recording):
+    assert "sampled at" not in repr(recording)
+    t = np.linspace(0, 1, 6)
+    slow = hj.Recording(t, {"slow": t})
+    fast = hj.Recording(np.linspace(0, 1, 101), {"fast": np.linspace(0, 1, 101)})
+    assert "sampled at slow 5 Hz, fast 100 Hz" in repr(hj.Recording.beside([slow, fast]))
+
+
+def test_what_jax_traces_has_no_page(hopper_cycle, placed_kinematic, kinematic_ldtp):
+    pages = []
+
+    @jax.jit
+    def look(k):
+        for thing in (hopper_cycle, placed_kinematic, kinematic_ldtp, kinematic_ldtp.htf([0.1])):
+            traced = jax.tree_util.tree_map(
+                lambda x: x * k.astype(x.dtype) if eqx.is_array(x) else x, thing
+            )
+            pages.append(traced._repr_html_())
+        return k
+
+    look(jnp.ones(()))
+    assert pages == [None] * 4
+
+
+def test_pictures_are_xml_whatever_is_drawn():
+    x = np.arange(10.0)
+    pictures = [
+        picture([Curve(x, x)], "<x>", "y & z"),
+        picture([Curve(x, np.where(x == 3, np.nan, 1e9 + 1e-3 * x), "<name>")]),
+        picture([Curve(x, np.zeros(10))], log=True),
+        picture([Curve(x, 10.0**-x)], log=True),
+        picture([Curve(np.full(3, np.nan), x[:3])]),
+        picture([Curve(x, np.zeros(10)), Curve(x, x, points=True)], square=True),
+        picture([]),
+    ]
+    assert [p == "" for p in pictures] == [False, False, True, False, True, False, True]
+    for one in filter(None, pictures):
+        ElementTree.fromstring(one)
+    labels = [t.text for t in ElementTree.fromstring(pictures[1]).iter("text") if t.text]
+    assert len(set(labels)) == len(labels) > 4  # numbers on an axis can be told apart
+
+
+def test_numbers_have_as_many_digits_as_they_deserve():
+    assert complex_number(0.5 + 0j) == "0.5" and complex_number(0.5 - 1j) == "0.5 - 1i"
+    page = multiplier_table(np.array([0.123456 + 0.5j]), np.array([[0.0123, 0.0]]))
+    assert "0.123 ± 0.012" in page and "<td>0.5</td>" in page
