@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hybridjax._core.compilation import compilation_cache, fingerprint, stored, thorough
-from hybridjax._core.compilation.portable import Portable, build
+from hybridjax._core.compilation.portable import Portable, build, trace
 from hybridjax._core.compilation.program_store import ProgramStore
 from hybridjax._core.compilation.stored import Stored
 
@@ -97,6 +97,18 @@ def test_a_program_is_made_once_and_found_by_the_next_process(made, tmp_path):
     assert float(Stored(twice, large=False)(X, Y, 4)["b"]) == 16.0
     assert Stored(twice, large=False)(X[:2], Y, 3)["a"].x.shape == (2,)
     assert made == ["traced", "quick"] * 3
+
+
+def test_what_is_written_does_not_say_where_it_comes_from(made, tmp_path):
+    @jax.named_scope("a_place_in_the_source")
+    def named(x, y, factor):
+        return twice(jnp.sin(x), y, factor)
+
+    traced = trace(lambda *arrays: named(*arrays, 3.0), [X, Y])
+    program = build(traced, {}, kept=True)
+    assert b"a_place_in_the_source" in traced.code
+    assert b"a_place_in_the_source" not in program.to_bytes()
+    np.testing.assert_allclose(program(X, Y)["a"].x, 2 * np.sin(X), rtol=1e-15)
 
 
 def test_without_a_folder_nothing_outlives_the_process(made, monkeypatch):

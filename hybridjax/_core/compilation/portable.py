@@ -10,6 +10,7 @@ import jax
 import jax.export
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
+from jaxlib.mlir.passmanager import PassManager
 
 from ..executor import Array
 from .fingerprint import IndescribableError
@@ -107,7 +108,15 @@ def build(program: Portable, options: dict[str, Any], kept: bool) -> Executable:
     # no program there has this name.
     run.__name__ = f"program_{uuid.uuid4().hex}" if kept else "program"
     lowered = jax.jit(run).lower(*shapes)
+    _forget_origin(lowered)
     return Executable(lowered.compile(compiler_options=options), program.structure)
+
+
+def _forget_origin(lowered: jax.stages.Lowered) -> None:
+    """Leave out where in the source its operations come from: two thirds of what is written."""
+    module = lowered.compiler_ir()
+    with module.context:
+        PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
 
 
 def _types(arrays) -> list[tuple[tuple[int, ...], str]]:
