@@ -6,6 +6,7 @@ from . import (
     fitting as fitting,
     identify as identify,
     maps as maps,
+    mechanics as mechanics,
     models as models,
     orbits as orbits,
     plot as plot,

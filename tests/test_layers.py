@@ -17,6 +17,7 @@ LAYERS = [
     "errors",
     "_core",
     "systems",
+    "mechanics",
     "models",
     "linear",
     "engine",

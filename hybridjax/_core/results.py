@@ -25,6 +25,7 @@ class Result(enum.IntEnum):
     EXTRA_TURNS = 12
     COINCIDENCE = 13
     STEP_COLLAPSE = 14
+    FIELD_NOT_FINITE = 15
 
     @property
     def message(self) -> str:
@@ -39,7 +40,7 @@ _MESSAGES = {
     Result.EVENT_ORDER: "events came in another order or number than on the limit cycle",
     Result.GRAZING: "a guard or section was touched tangentially (grazing)",
     Result.ZENO: "events accumulate in finite time (Zeno)",
-    Result.BLOW_UP: "the state left all bounds, or the field returned NaN or infinity",
+    Result.BLOW_UP: "the state left all bounds",
     Result.STEP_LIMIT: "the limit on steps was reached; `Settings(max_steps=...)` raises it",
     Result.NOT_CONVERGED: "the iteration did not converge",
     Result.SINGULAR: "J - I is singular: the cycle is not isolated",
@@ -47,6 +48,10 @@ _MESSAGES = {
     Result.EQUILIBRIUM: "the iteration ended in an equilibrium instead of a cycle",
     Result.EXTRA_TURNS: "a turn met the section more often than asked (its period is shorter)",
     Result.COINCIDENCE: "two events coincide on the cycle: their order is not fixed beside it",
+    Result.FIELD_NOT_FINITE: (
+        "the field or a reset returned NaN or infinity: a division by zero, say, or a mass matrix "
+        "that is singular there"
+    ),
     Result.STEP_COLLAPSE: (
         "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "
         "the guard of a transition"

@@ -1,5 +1,6 @@
 from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
+from .biped import FiveLinkBiped as FiveLinkBiped
 from .buck import BuckConverter as BuckConverter
 from .compass import CompassGait as CompassGait
 from .compliant import CompliantHopper as CompliantHopper
@@ -11,6 +12,7 @@ from .hopper import VerticalHopper as VerticalHopper
 from .juggler import PaddleJuggler as PaddleJuggler
 from .mathieu import Mathieu as Mathieu
 from .slip import SLIPRunner as SLIPRunner
+from .torso_walker import TorsoWalker as TorsoWalker
 from .vanderpol import VanDerPol as VanDerPol
 from .walker import SimplestWalker as SimplestWalker
 from .wheel import RimlessWheel as RimlessWheel

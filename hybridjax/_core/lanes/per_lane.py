@@ -53,7 +53,7 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     @ft.cache
     def program(common: tuple[bool, ...], many: bool):
         in_axes = (axes, *[None if c else -1 for c in common])
-        work = vectorized(one) if many else one
+        work = vectorized(one, trigonometry=many)
         # Traced once, however often it is called: a Runge-Kutta step has ten stages.
         return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
 

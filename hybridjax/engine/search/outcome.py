@@ -165,6 +165,8 @@ def eventfully(
     result = update_result(state.result, graze, Result.GRAZING)
     still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
     result = update_result(result, stuck & still, Result.STEP_COLLAPSE)
+    undefined = stuck & ~xp.isfinite(new.q).all(axis=0)
+    result = update_result(result, undefined, Result.FIELD_NOT_FINITE)
     result = update_result(result, stuck, Result.BLOW_UP)
     result = update_result(result, zeno, Result.ZENO)
     result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)

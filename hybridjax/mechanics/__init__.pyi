@@ -1,0 +1,1 @@
+from .mechanism import Constrained as Constrained, Impact as Impact, Mechanism as Mechanism

@@ -1,0 +1,158 @@
+"""Mechanisms: masses, forces of motion, contacts and impacts from the kinetic and potential energy.
+
+With the Lagrangian L = T - V and generalized forces f, Lagrange's equations are
+
+    M(q) a + h(q, v) = f + J(q)' F,    M = d2T/dv2,    h = (d2T/dv dq) v - dL/dq,
+
+where h holds the forces of Coriolis, of centrifugal acceleration and of gravity, and F are the
+forces of the contacts whose coordinates c(q) have the derivative J = dc/dq (R. M. Murray, Z. Li, S.
+S. Sastry, A Mathematical Introduction to Robotic Manipulation, 1994, ch. 4 and 6). No Christoffel
+symbol is formed: h is one derivative along v of the momentum dT/dv, less one gradient.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.boundary.checked import checked
+from .._core.vector_math.small_matrices import solve_positive
+
+
+class Constrained(NamedTuple):
+    """Motion under contacts."""
+
+    acceleration: Float[Array, " n"]
+    force: Float[Array, " k"]
+    """Of the contacts on the mechanism, along the k coordinates of the contacts."""
+
+
+class Impact(NamedTuple):
+    """What an impact does."""
+
+    velocity: Float[Array, " n"]
+    """After it."""
+    impulse: Float[Array, " k"]
+    """Of the contacts on the mechanism, along the k coordinates of the contacts."""
+
+
+def _no_potential(q):
+    return 0.0
+
+
+@checked
+class Mechanism(eqx.Module):
+    """A mechanism with n coordinates q and velocities v = dq/dt, given by its energies.
+
+    ```python
+    def kinetic(q, v):
+        return 0.5 * m * l**2 * v[0] ** 2
+
+    pendulum = hj.mechanics.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
+    acceleration = pendulum.acceleration(q, v, force)  # in the field of a chart
+    ```
+
+    **Fields:**
+
+    - `kinetic`: T(q, v) -> number, quadratic in v and positive; from a mass matrix,
+        `lambda q, v: 0.5 * v @ M(q) @ v`.
+    - `potential`: V(q) -> number, by default 0.
+
+    Methods are for one state, in fields, guards, resets and outputs, and are written out as plain
+    operations there: nothing is handed to LAPACK. Where the mass matrix is singular, or
+    not positive, accelerations and velocities are NaN: a trajectory ends there with
+    `Result.FIELD_NOT_FINITE`.
+    """
+
+    kinetic: Callable[[Any, Any], Any]
+    potential: Callable[[Any], Any] = _no_potential
+
+    def energy(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
+        """T + V."""
+        return jnp.asarray(self.kinetic(q, v) + self.potential(q))
+
+    def mass(self, q: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """The mass matrix M(q)."""
+        momentum = lambda v: jax.grad(self.kinetic, 1)(q, v)  # noqa: E731
+        return jax.jacfwd(momentum)(jnp.zeros_like(q))
+
+    def bias(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        """h(q, v) = C(q, v) v + G(q): the forces that keep the velocities as they are."""
+        momentum = lambda q: jax.grad(self.kinetic, 1)(q, v)  # noqa: E731
+        lagrangian = lambda q: jnp.asarray(self.kinetic(q, v) - self.potential(q))  # noqa: E731
+        return jax.jvp(momentum, (q,), (v,))[1] - jax.grad(lagrangian)(q)
+
+    def acceleration(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], force: ArrayLike = 0.0
+    ) -> Float[Array, " n"]:
+        """a = dv/dt in M a + h = f, under generalized forces f: n numbers, or one for all."""
+        return solve_positive(self.mass(q), force - self.bias(q, v))
+
+    def constrained(
+        self,
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        force: ArrayLike,
+        contact: Callable[[Any], Any],
+    ) -> Constrained:
+        """Motion under contacts that hold, with the forces that hold them.
+
+        **Arguments:** `contact`, the coordinates c(q) that stay where they are, k < n independent
+        ones as an array (k,): the position of a foot on the ground, say. States should satisfy c =
+        const. and J v = 0: what they miss stays (c) or grows slowly (by J v) with rounding.
+        """
+        mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
+        free = solve_positive(mass, force - self.bias(q, v))
+        by_force = _solve_columns(mass, jacobian.T)
+        found = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
+        return Constrained(free + by_force @ found, found)
+
+    def impact(
+        self,
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        contact: Callable[[Any], Any],
+        restitution: ArrayLike = 0.0,
+    ) -> Impact:
+        """A rigid impact, in which only the contacts give impulses, and q stays.
+
+        M (v+ - v) = J' P and J v+ = -e J v (Y. Hurmuzlu, D. B. Marghitu, Rigid body collisions of
+        planar kinematic chains with multiple contact points, Int. J. Robotics Research 13, 1994).
+        Relabeling, where left becomes right, is a permutation of q and of the velocity that is
+        returned. Whether a contact pulls (a negative normal impulse) or would slip can be seen
+        from `impulse`.
+
+        **Arguments:** `contact`, the coordinates c(q) of the contacts made, k <= n independent ones
+        as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
+        """
+        jacobian = jax.jacfwd(lambda q: jnp.asarray(contact(q)))(q)
+        by_impulse = _solve_columns(self.mass(q), jacobian.T)
+        impulse = solve_positive(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v))
+        return Impact(v + by_impulse @ impulse, impulse)
+
+    def along(self, placement: Callable[[Any], Any]) -> "Mechanism":
+        """The mechanism in fewer coordinates p, of which all others follow: q = placement(p).
+
+        A biped whose coordinates are those of the hip and angles of its links becomes one that
+        stands on a foot: `biped.along(lambda angles: [*hip_above_foot(angles), *angles])`.
+        """
+        place = lambda p: jnp.stack([jnp.asarray(x, float) for x in placement(p)])  # noqa: E731
+        return Mechanism(
+            lambda p, v: self.kinetic(*jax.jvp(place, (p,), (v,))),
+            lambda p: self.potential(place(p)),
+        )
+
+
+def _moving(contact, q, v):
+    """The Jacobian of a contact, and the part of its acceleration that the velocities make."""
+    place = lambda q: jnp.asarray(contact(q))  # noqa: E731
+    speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
+    return jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
+
+
+def _solve_columns(matrix, columns):
+    return jnp.stack([solve_positive(matrix, x) for x in columns.T], axis=1)
