@@ -25,6 +25,7 @@ LAYERS = [
     "maps",
     "experiments",
     "identify",
+    "scale",
     "fitting",
     "recordings",
     "testing",

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from .._core.packages import package
 from ..errors import DefinitionError
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .modules import REST
-from .packages import package
 
 
 # Names of coordinates, and of what tells of events.
