@@ -11,6 +11,7 @@ from . import (
     orbits as orbits,
     plot as plot,
     recordings as recordings,
+    scale as scale,
     sections as sections,
     testing as testing,
 )
@@ -67,6 +68,8 @@ from .orbits.sweep.limit_cycles import (
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
+from .scale.draws import monte_carlo as monte_carlo
+from .scale.map import sweep as sweep
 from .sections.clock import ClockPhase as ClockPhase
 from .sections.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .sections.kinematic import KinematicPhase as KinematicPhase

@@ -19,6 +19,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.compilation import compile, stored
+from hybridjax.experiments.stored import pieces
 
 
 hj.enable_x64()
@@ -51,6 +52,7 @@ def unchecked_host():
 compile.at_ease = unchecked_host
 # Results of one test come from one program.
 stored._WORTH_A_PROCESS = np.inf
+pieces.ONE_PROGRAM = False
 
 
 class no_compilation:

@@ -16,7 +16,9 @@ def _python(*arguments):
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["reproduce", "--help"], ["identify", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["reproduce", "--help"], ["identify", "--help"], ["sweep", "--help"]]
+)
 def test_help_does_not_import_jax(arguments):
     code = (
         "import sys; from hybridjax.apps.cli import main\n"
@@ -246,3 +248,31 @@ def test_version():
     )
     run = _python("-c", code)
     assert (run.returncode, run.stdout) == (0, f"hybridjax {hj.__version__}\n")
+
+
+MODEL = """
+import hybridjax as hj
+
+class Mine(hj.models.RimlessWheel):
+    pass
+"""
+
+
+def test_sweep_draws_a_map(tmp_path, capsys):
+    pytest.importorskip("zarr")
+    (tmp_path / "my_wheel.py").write_text(MODEL)
+    model, out = f"{tmp_path}/my_wheel.py:Mine", str(tmp_path / "map.zarr")
+    axes = ["--over", "slope=0.075:0.09:2", "--over", "spokes=8:9:2"]
+    assert main(["sweep", model, *axes, "--want", "spectral_radius", "--out", out]) == 0
+    assert "4 of 4 points have a limit cycle" in capsys.readouterr().out
+    assert (tmp_path / "map-spectral_radius.png").stat().st_size > 5_000
+    for wrong, says in (
+        ([model, "--over", "slop=0:1:2"], "`slop` is no parameter of the model"),
+        ([model.replace("Mine", "Yours"), *axes], "has no 'Yours'"),
+        ([model.replace("my_", "no_"), *axes], "there is no file"),
+        ([model, *axes, *axes], "has two axes"),
+        ([model, *axes, "--want", "speed"], "`speed` is nothing that a sweep keeps"),
+        ([model, *axes, "--want", "period"], "holds other results: its `want`"),
+    ):
+        with pytest.raises(SystemExit, match=says):
+            main(["sweep", *wrong, "--out", out])

@@ -26,6 +26,7 @@ LAYERS = [
     "maps",
     "experiments",
     "identify",
+    "scale",
     "fitting",
     "recordings",
     "testing",

@@ -11,9 +11,11 @@ from collections.abc import Iterator, Sequence
 from .. import __version__
 from .option_types import (
     assignment,
+    axis,
     count,
     crossing,
     formats,
+    model,
     names,
     positive,
     seed,
@@ -79,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_reproduce(commands)
     _add_identify(commands)
+    _add_sweep(commands)
     return parser
 
 
@@ -151,6 +154,49 @@ def _add_identify(commands) -> None:
         "longer than this")  # fmt: skip
     _add_formats(identify)
     identify.set_defaults(run=_identify, parser=identify)
+
+
+def _add_sweep(commands) -> None:
+    sweep = commands.add_parser(
+        "sweep",
+        help="map the limit cycles of a system over its parameters",
+        description="Limit cycles at all combinations of some parameters' values, into a Zarr "
+        "store, which a later call goes on with, and pictures beside it.",
+    )
+    add = sweep.add_argument
+    add("model", type=model, metavar="FILE.py:NAME",
+        help="a system, its class, or a function of parameters that gives one")  # fmt: skip
+    add("--over", required=True, action="append", type=axis, metavar="NAME=LOW:HIGH:COUNT",
+        help="values of a parameter, evenly spaced; may be repeated")  # fmt: skip
+    add("--want", type=names, default=("spectral_radius", "period"), metavar="NAMES",
+        help="period, state, multipliers, spectral_radius, events, residual; with "
+        "commas (default: spectral_radius,period)")  # fmt: skip
+    add("--out", required=True, metavar="STORE", help="the Zarr store, e.g. map.zarr")
+    add("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does the work")
+    add("--force", action="store_true", help="also more than 50 million points")
+    sweep.set_defaults(run=_sweep, parser=sweep)
+
+
+def _sweep(options) -> int:
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import matplotlib
+
+    matplotlib.use("Agg")  # files only
+    from .._core.compilation.compilation_cache import enable_compilation_cache
+    from .._core.precision import enable_x64
+    from .map_command import run
+
+    enable_x64()
+    enable_compilation_cache()
+    found, pictures = run(
+        options.model, options.over, options.want, options.out, options.scheduler, options.force
+    )
+    print(found)
+    count = int((found.result == 0).sum())
+    print(f"{count} of {found.result.size} points have a limit cycle")
+    print("\n".join(pictures))
+    return 0
 
 
 def _identify(options) -> int:

@@ -40,6 +40,23 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
+def model(text: str) -> tuple[str, str]:
+    """A file of Python, and what it calls a model."""
+    file, colon, name = text.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not FILE.py:NAME")
+    return file, name
+
+
+def axis(text: str) -> tuple[str, float, float, int]:
+    """A parameter with its lowest and highest value, and how many."""
+    name, _, values = text.partition("=")
+    parts = values.split(":")
+    if not name or len(parts) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=LOW:HIGH:COUNT")
+    return name, _number(parts[0]), _number(parts[1]), count(parts[2])
+
+
 def formats(text: str) -> tuple[str, ...]:
     """Formats of figures with commas in between."""
     found, known = names(text), get_args(Format)

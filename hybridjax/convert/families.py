@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .._core.packages import package
 from ..orbits.branches.branch import Branch
 from ..orbits.sweep.limit_cycles import LimitCycles
 from ..systems.system import unit_of_parameter
-from .packages import package
 
 
 def from_limit_cycles(cycles: LimitCycles, dimension: str = "system") -> Any:

@@ -12,12 +12,12 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
+from .._core.packages import package
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from .._core.tracing import is_traced
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from .packages import package
 
 
 @checked

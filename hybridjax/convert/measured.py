@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from .._core.packages import package
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .modules import REST
-from .packages import package
 
 
 # Names of coordinates, and of what tells of events.

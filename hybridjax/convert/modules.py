@@ -15,10 +15,10 @@ import equinox as eqx
 import numpy as np
 
 from .._core.files.archive import put_together, restored, signals_in, taken_apart
+from .._core.packages import package
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
 from ..linear.ldtp import LDTP
-from .packages import package
 
 
 # The attribute with all that has no place elsewhere.

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._core.boundary.checked import checked
+from .._core.packages import package
 from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.htf import HTF
@@ -12,7 +13,6 @@ from ..orbits.branches.branch import Branch
 from ..orbits.sweep.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
-from .packages import package
 from .xarray_datasets import to_xarray
 
 

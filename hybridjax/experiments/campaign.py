@@ -2,7 +2,8 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from .._core.progress import counted
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
 from ..errors import ComputationError, DefinitionError
+from ..linear.ldtp import LDTP
 from ..maps.place import as_placed
 from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
@@ -24,12 +26,12 @@ from ..systems.structure import Outputs
 from .batches import divide, in_batches, precision_of
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD
-from .events import EventTimes, in_order
+from .events import EventList, EventTimes, in_order
 from .flow_batch import Course, IntervalEvents, closed, course, flow_batch
 from .inputs import DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
-from .options import Options
-from .start import CycleStart, Start, SteadyStart, predict_start
+from .options import Options, StartName
+from .start import CycleStart, PeriodicStart, Start, SteadyStart, predict_start
 from .steady import settle_batch
 from .stepping.plan import Stepping, plan_flow
 from .stepping.single_precision import plan_single
@@ -64,7 +66,7 @@ class Campaign:
     start: Start
     process_noise: ProcessNoise | None
     stepping: Stepping
-    program: Callable
+    program: Stored
     record_events: bool
     execution: Execution
 
@@ -99,15 +101,51 @@ class Campaign:
             outputs=self.outputs.names,
             result=result,
             simulated=Simulated(failed_at, error, self._events(log, cycle_log)),
-            cycle_outputs=self._cycle_outputs(),
+            cycle_outputs=self.cycle_outputs(),
             label=self.placed.family.label,
         )
+
+    def by(self, workers: int) -> "Campaign":
+        """The same, by so many threads."""
+        return dataclasses.replace(
+            self, execution=dataclasses.replace(self.execution, workers=workers)
+        )
+
+    @property
+    def taught(self) -> tuple[PlacedSections, Stepping, LDTP | None]:
+        """What is known before the first experiment."""
+        start = self.start.predicted if isinstance(self.start, SteadyStart) else self.start
+        model = start.model if isinstance(start, PeriodicStart) else None
+        return self.placed, self.stepping, model
+
+    def with_taught(self, taught: tuple[PlacedSections, Stepping, LDTP | None]) -> "Campaign":
+        """The same, with what another call has found out."""
+        placed, stepping, model = taught
+        state = self.__getstate__() | {"placed": placed, "stepping": stepping, "model": model}
+        new = object.__new__(Campaign)
+        new.__setstate__(state)
+        return new
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is compiled, for other processes."""
+        placed, stepping, model = self.taught
+        return {
+            "placed": placed, "stepping": stepping, "model": model,
+            "outputs": tuple(self.outputs.items), "inputs": self.inputs, "start": self.start.name,
+            "process_noise": self.process_noise, "record_events": self.record_events,
+            "execution": self.execution, "large": self.program.large,
+        }  # fmt: skip
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        made = _compose(**state)
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, getattr(made, field.name))
 
     def _respond(self, u, start, capacity: int):
         """Deviations of outputs from the cycle (S, n, ny), codes, samples of failures, errors, and
         the first `capacity` events between any two sections."""
         stepping, N = self.stepping, self.placed.n_sections
-        base = self._cycle_outputs()
+        base = self.cycle_outputs()
 
         def arguments(some):
             x, held = from_host((start[:, some], u[some]))
@@ -137,7 +175,8 @@ class Campaign:
             "that the experiments go."
         )
 
-    def _cycle_outputs(self) -> Float[np.ndarray, "N ny"]:
+    def cycle_outputs(self) -> Float[np.ndarray, "N ny"]:
+        """The outputs on the limit cycle."""
         items = tuple(self.outputs.items)
         look = lambda: np.asarray(self.placed.observe(items))  # noqa: E731
         # (An `Output` may be another one at every call.)
@@ -154,6 +193,11 @@ class Campaign:
         return Stored(flow_batch, large=False)(
             own, stepping.plan, *from_host((start, u)), stepping.settings, capacity
         ).log
+
+    def cycle_events(self) -> EventList:
+        """The events of one period of the limit cycle, those of one experiment."""
+        N, period = self.placed.n_sections, float(np.asarray(self.placed.cycle.period))
+        return in_order(self._cycle_log(), N, period)
 
     def _events(
         self, log: IntervalEvents | None, cycle_log: IntervalEvents | None
@@ -173,13 +217,15 @@ def prepare(
     outputs: Sequence[str | Output],
     options: Options,
     chunk: int | None = None,
+    one_program: bool = False,
 ) -> Campaign:
     """Check what `run_experiments` was given, and do what is done once for all experiments.
 
-    `chunk`: how many of them are run together; by default all.
+    **Arguments:** `chunk`, how many of them are run together; by default all. `one_program`: all
+    are run by the program that is compiled thoroughly, whatever there is.
     """
     placed = as_placed(cycle, sections)
-    z = placed.structure().resolve_outputs(outputs)
+    placed.structure().resolve_outputs(outputs)
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
@@ -194,20 +240,42 @@ def prepare(
     together = len(inputs) if chunk is None else chunks(len(inputs), chunk)[0].stop
     execution = divide(together, execution)
     samples = inputs.cycles * N
-    large = len(inputs) * samples > _LARGE
-    own = _course(placed, outputs, execution)
+    large = one_program or len(inputs) * samples > _LARGE
     single = execution.precision == "single"
     stepping = (plan_single if single else plan_flow)(placed, accuracy)
-    if start == "cycle":
-        begin = CycleStart(placed)
-    else:
-        begin = predict_start(placed, inputs.periods)
-        if start == "steady":
-            aside = dataclasses.replace(own, outputs=())
-            begin = SteadyStart(begin, aside, stepping, execution, Stored(settle_batch, large))
+    model = None if start == "cycle" else predict_start(placed, inputs.periods).model
+    return _compose(
+        placed=placed, stepping=stepping, model=model, outputs=outputs, inputs=inputs, start=start,
+        process_noise=options.process_noise, record_events=options.record_events,
+        execution=execution, large=large,
+    )  # fmt: skip
+
+
+def _compose(
+    *,
+    placed: PlacedSections,
+    stepping: Stepping,
+    model: LDTP | None,
+    outputs: Sequence[str | Output],
+    inputs: Inputs,
+    start: StartName,
+    process_noise: ProcessNoise | None,
+    record_events: bool,
+    execution: Execution,
+    large: bool,
+) -> Campaign:
+    """A campaign from what another process can be told."""
+    own = _course(placed, outputs, execution)
+    begin: Start = CycleStart(placed)
+    if model is not None:
+        begin = PeriodicStart(placed, model, inputs.periods)
+    if start == "steady":
+        assert isinstance(begin, PeriodicStart)
+        aside = dataclasses.replace(own, outputs=())
+        begin = SteadyStart(begin, aside, stepping, execution, Stored(settle_batch, large))
     return Campaign(
-        placed, own, z, inputs, begin, options.process_noise, stepping, Stored(flow_batch, large),
-        options.record_events, execution,
+        placed, own, placed.structure().resolve_outputs(outputs), inputs, begin, process_noise,
+        stepping, Stored(flow_batch, large), record_events, execution,
     )  # fmt: skip
 
 

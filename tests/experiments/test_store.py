@@ -1,137 +1,143 @@
-"""Folders of experiments that are damaged, hostile, or somewhere else than they seem to be."""
+"""Stores of experiments: resumed, damaged, of others, or none at all."""
 
-import json
-import os
+import shutil
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core import limits
-from hybridjax._core.files.archive import write_module
-from hybridjax.experiments import StoredExperiments, store
+from hybridjax.experiments import StoredExperiments, store_experiments
+
+from ..conftest import OUTPUTS
 
 
-ABOUT = {"format": store._FORMAT, "experiments": 5, "chunk": 2, "n_sections": 4}
+pytest.importorskip("zarr")
+
+COUNT = 100
+DESIGN = hj.multisine(experiments=COUNT)
+BATCH = {"execution": hj.Execution(batch=40)}
 
 
-def data(experiments, seed=0):
-    u = np.random.default_rng(seed).normal(size=(experiments, 8, 1))
-    return hj.ExperimentData(u, u, n_sections=4, periods=2)
+@pytest.fixture(scope="module")
+def arguments(hopper_cycle, placed_isochrons):
+    return hopper_cycle, placed_isochrons, DESIGN, OUTPUTS
+
+
+@pytest.fixture(scope="module")
+def whole(arguments):
+    return hj.run_experiments(*arguments, **BATCH)
+
+
+@pytest.fixture(scope="module")
+def made(arguments, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stores") / "records.zarr"
+    return store_experiments(folder, *arguments, chunk=40, **BATCH)
 
 
 @pytest.fixture
-def stored(tmp_path):
-    """Five experiments in three chunks."""
-    store._open(tmp_path, ABOUT)
-    stored = StoredExperiments(tmp_path)
-    for k, experiments in enumerate((2, 2, 1)):
-        write_module(stored.path(k), data(experiments, k), stored.path(k).stem)
-    return stored
+def stored(made, tmp_path):
+    """A store of 100 experiments in three chunks, for one test."""
+    shutil.copytree(made.address, tmp_path / "records.zarr")
+    return StoredExperiments(tmp_path / "records.zarr")
 
 
-def test_chunks_are_read_in_order(stored):
-    assert len(stored) == 3 and stored.missing() == []
-    read = np.concatenate([part.u for part in stored])
-    np.testing.assert_array_equal(
-        read, np.concatenate([data(n, k).u for k, n in enumerate((2, 2, 1))])
-    )
-    assert stored.summary() == "5/5 ok"
+def records(parts):
+    return np.concatenate([part.y for part in parts])
+
+
+def test_stored_experiments_are_those_of_the_whole(made, whole):
+    assert len(made) == 3 and made.experiments == COUNT and made.missing() == []
+    np.testing.assert_array_equal(records(made), whole.y)
+    np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
+    np.testing.assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    np.testing.assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
+    assert made[0].outputs[0].unit == "m"
+    assert made.summary() == whole.summary() == "100/100 ok"
+    assert "100 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
+    assert made.dataset.y.dims == ("experiment", "sample", "output")
+    np.testing.assert_array_equal(made.dataset.y.sel(output="vM"), whole.y[..., 1])
+
+
+def test_estimates_take_it_chunk_by_chunk(made, whole):
+    estimate, expected = hj.estimate_htf(made), hj.estimate_htf(whole)
+    error = np.abs(estimate.H - expected.H).max() / np.abs(expected.H).max()
+    assert error < 1e-12
+    assert len(hj.identify.missing_frequencies(made)) == 0
+
+
+def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
+    (tmp_path / "records.zarr/y/c/1/0/0").unlink()
+    assert stored.missing() == [1]
+    with pytest.raises(hj.DefinitionError, match="1 of 3 chunks .* missing, the first is 1"):
+        hj.estimate_htf(stored)
+    rotten = tmp_path / "records.zarr/u/c/2/0/0"
+    content = bytearray(rotten.read_bytes())
+    content[100] ^= 1
+    rotten.write_bytes(content)
+    with pytest.raises(hj.errors.FileFormatError, match="piece 2 .* is damaged in `u`"):
+        stored[2]
+    before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
+    again = store_experiments(stored.address, *arguments, chunk=40, **BATCH)
+    np.testing.assert_array_equal(records(again), whole.y)
+    assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
+
+
+def test_processes_share_the_chunks(arguments, whole, tmp_path):
+    for rank in (0, 1):
+        stored = store_experiments(
+            tmp_path / "records.zarr", *arguments, chunk=40, share=(rank, 2), **BATCH
+        )
+        assert stored.missing() == ([] if rank else [1])
+    np.testing.assert_array_equal(records(stored), whole.y)
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "what"),
     [
-        (dict(chunk=0), "`chunk` is 0"),
-        (dict(chunk=-1), "`chunk` is -1"),
-        (dict(chunk=None), "`chunk` is None"),
-        (dict(chunk=True), "`chunk` is True"),
-        (dict(chunk="2"), "`chunk` is '2'"),
-        (dict(experiments=10**12), "declares 500000000000 chunks"),
-        (dict(experiments=2.5), "`experiments` is 2.5"),
-        (dict(experiments=[]), "`experiments` is "),
-        (dict(n_sections=0), "`n_sections` is 0"),
-        (dict(format="hybridjax experiments 1"), "of another version"),
-        ([], "damaged, or of another version"),
-        (None, "damaged, or of another version"),
+        (dict(design=hj.multisine(experiments=COUNT, seed=1)), "design"),
+        (dict(design=DESIGN.inputs(84), discard=20), "design"),
+        (dict(outputs="yM"), "data.outputs"),
+        (dict(chunk=7), "batch"),
+        (dict(discard=1), "cycles"),
+        (dict(accuracy=1e-8), "accuracy"),
+        (dict(process_noise=hj.experiments.ProcessNoise(1e-3)), "process_noise"),
+        (dict(execution=hj.Execution(batch=8)), "batch"),
     ],
 )
-def test_manifests(tmp_path, change, says):
-    about = ABOUT | change if isinstance(change, dict) else change
-    (tmp_path / "experiments.json").write_text(json.dumps(about))
-    with pytest.raises(hj.errors.FileFormatError, match=says) as error:
+def test_other_experiments_are_refused(made, arguments, change, what):
+    names = ("cycle", "sections", "design", "outputs")
+    call = dict(zip(names, arguments, strict=True)) | dict(chunk=40) | BATCH | change
+    with pytest.raises(hj.DefinitionError, match=f"holds other results: .*`{what}"):
+        store_experiments(made.address, **call)
+
+
+def test_another_system_is_refused(made, arguments):
+    _, placed, design, outputs = arguments
+    other = eqx.tree_at(lambda p: p.cycle.system.k, placed, jnp.asarray(10.001, float))
+    with pytest.raises(hj.DefinitionError, match="`model.numbers.k` is 10.0, not 10.001"):
+        store_experiments(made.address, other.cycle, other, design, outputs, chunk=40, **BATCH)
+
+
+def test_events_are_kept(hopper_cycle, tmp_path):
+    design = hj.experiments.single_cosine([0.25, 0.75, 1.25], 4, 4)
+    call = hopper_cycle, hj.ClockPhase(4), design, "yM"
+    stored = store_experiments(tmp_path / "records.zarr", *call, chunk=2, record_events=True)
+    whole = hj.run_experiments(*call, record_events=True)
+    assert [len(part.u) for part in stored] == [2, 1]
+    np.testing.assert_allclose(stored[0].events.time, whole.events.time[:2], rtol=1e-9)
+    np.testing.assert_array_equal(stored[1].events.event, whole.events.event[2:])
+    assert stored[0].events.of(0)[0].name == whole.events.of(0)[0].name
+
+
+def test_what_is_no_store(tmp_path, arguments):
+    with pytest.raises(hj.DefinitionError, match="holds no experiments"):
         StoredExperiments(tmp_path)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, '{"format": 1}', "\x00"])
-def test_manifests_that_are_no_json(tmp_path, text):
-    (tmp_path / "experiments.json").write_text(text)
-    with pytest.raises(hj.errors.FileFormatError, match="damaged, or of another version"):
-        StoredExperiments(tmp_path)
-
-
-def test_a_manifest_without_fields(tmp_path):
-    (tmp_path / "experiments.json").write_text(json.dumps({"format": store._FORMAT}))
-    with pytest.raises(hj.errors.FileFormatError, match="`experiments` is None"):
-        StoredExperiments(tmp_path)
-
-
-def test_a_manifest_longer_than_any(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "TEXT", 10)
-    with pytest.raises(hj.errors.FileFormatError, match="damaged"):
-        store._open(tmp_path, ABOUT)
-
-
-@pytest.mark.parametrize(
-    "cycle", [None, {}, {"points": 1, "scales": []}, {"points": [[1], [1, 2]]}]
-)
-def test_a_cycle_that_is_none(tmp_path, cycle):
-    own = {"points": [[0.0, 1.0]], "scales": [[1.0, 1.0]]}
-    (tmp_path / "experiments.json").write_text(json.dumps(ABOUT | {"cycle": cycle}))
-    with pytest.raises(hj.DefinitionError, match="other experiments .its `cycle`"):
-        store._open(tmp_path, ABOUT | {"cycle": own})
-
-
-def other_module(path):
-    write_module(path, data(2, 9), "000001-other")
-
-
-REPLACED = {
-    "another kind": (lambda path: hj.save(path, hj.multisine()), "holds a 'Design'"),
-    "other data": (lambda path: hj.save(path, data(2, 9)), "was replaced by another file"),
-    "a chunk of others": (other_module, "was replaced by another file"),
-    "another chunk": (
-        lambda path: path.write_bytes(next(path.parent.glob("000000-*")).read_bytes()),
-        "was replaced by another file",
-    ),
-    "an archive": (lambda path: np.savez(path, u=np.zeros(3)), "was not written by hybridjax"),
-}
-
-
-@pytest.mark.parametrize(("replace", "says"), REPLACED.values(), ids=REPLACED)
-def test_chunks_that_were_replaced(stored, replace, says):
-    replace(stored.path(1))
-    for use in (list, StoredExperiments.summary):
-        with pytest.raises(hj.errors.FileFormatError, match=says) as error:
-            use(stored)
-        assert str(stored.path(1)) in str(error.value) and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["mine.npz", "000003-{}.npz", "1-{}.npz", "0000000000001-{}.npz"])
-def test_files_that_do_not_belong_there(stored, name):
-    name = name.format(stored.path(0).stem.partition("-")[2])
-    (stored.folder / name).write_text("")
-    with pytest.raises(hj.DefinitionError, match=f"{name}' does not belong to the experiments"):
-        StoredExperiments(stored.folder)
-    assert (stored.folder / name).exists()
-
-
-def test_nothing_is_written_through_links(stored, tmp_path):
-    away = tmp_path / "away"
-    away.write_text("mine")
-    stored.path(1).unlink()
-    os.symlink(away, stored.path(1))
-    with pytest.raises(hj.DefinitionError, match="is a link"):
-        write_module(stored.path(1), data(2), "")
-    assert away.read_text() == "mine" and stored.path(1).is_symlink()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(hj.DefinitionError, match="file"):
+        store_experiments(tmp_path / "file", *arguments, **BATCH)
+    with pytest.raises(hj.DefinitionError, match="0 <= rank < size"):
+        store_experiments(tmp_path / "s", *arguments, share=(2, 2), **BATCH)
+    with pytest.raises(TypeError, match="store_experiments has no argument 'works'.* share, start"):
+        store_experiments(tmp_path / "s", *arguments, works=2)

@@ -44,6 +44,9 @@ SECTIONS = [None, "ClockPhase", 8, [], [3], NAN, Other(), hj.Execution(), TRACED
 PAIR = ["ab", 1.0, (1.0,), (1.0, 2.0, 3.0), (NAN, 1.0), (1j, 0.0), (None, 1.0), TRACED]
 SHARES = [None, 1, (0,), (2, 2), (-1, 2), (0, 0), (0.5, 2), ("0", "2")]
 SIZES = ["x", 3, ["x"], {"x": -1.0}, {"x": NAN}, {"x": "1"}, {"x": 1j}, {"nope": 1.0}]
+CLIENTS = ["tcp://here", 3, Other()]
+RANGES = [None, 3, {}, {"x": 3}, {"x": (1.0,)}, {"x": (1.0, 0.0)}, {"x": (0.0, NAN)}, Other()]
+VALUES = [None, 3, {}, {"x": []}, {"x": [NAN]}, {"x": ["1"]}, {"x": [1.0], "y": [1.0, 2.0]}]
 BAND = [2.0, (1.0,), ("0", "1"), (NAN, 1.0), (0.0, INF), (-1.0, 1.0), (1.0, 0.5), (0.0, 1j)]
 CHANNELS = [None, 0, -1, 1.5, True, (), ("u", "u"), (3, 4), HUGE, Other()]
 
@@ -56,6 +59,37 @@ def calls(t):
     yield from linear(t)
     yield from designs(t)
     yield from experiments(t)
+    yield from scale(t)
+
+
+def scale(t):
+    """In pieces."""
+    pieces = {"chunk": COUNT[1:], "store": PATH[1:], "share": SHARES, "client": CLIENTS}
+    measures = [3, {"x": 3}, {3: abs}, {"result": abs}, Other()]
+    yield (
+        "sweep",
+        hj.sweep,
+        dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle),
+        {
+            "model": [None, "Hopper", 3, Other()],
+            "over": [*VALUES, {"nope": [1.0]}],
+            "want": WORD,
+            "measures": measures,
+            "guess": [3, "cycle", Other()],
+            "force": FLAG,
+            **pieces,
+        },
+    )
+    yield (
+        "monte_carlo",
+        hj.monte_carlo,
+        dict(function=lambda rng: "no number", draws=3),
+        {"function": CALLABLE, "draws": LIMITED, "seed": SEED, **pieces},
+    )
+    yield "Points", hj.scale.Points, dict(values={"x": [1.0]}), {"values": VALUES}
+    good = dict(ranges={"x": (0.0, 1.0)}, count=4)
+    wrong = {"ranges": RANGES, "count": LIMITED, "seed": SEED}
+    yield "sobol_points", hj.scale.sobol_points, good, wrong
 
 
 def systems(t):
@@ -297,11 +331,11 @@ def experiments(t):
     yield (
         "store_experiments",
         hj.experiments.store_experiments,
-        to_run | dict(folder="store"),
-        (drive | options | {"chunk": LIMITED, "folder": PATH, "share": SHARES}),
+        to_run | dict(store="store"),
+        (drive | options | {"chunk": LIMITED, "store": PATH, "share": SHARES, "client": CLIENTS}),
     )
-    yield "StoredExperiments", hj.experiments.StoredExperiments, dict(folder="nope"), {
-        "folder": [*PATH, "nope"],
+    yield "StoredExperiments", hj.experiments.StoredExperiments, dict(store="nope"), {
+        "store": [*PATH, "nope"],
     }  # fmt: skip
     yield (
         "response_function",

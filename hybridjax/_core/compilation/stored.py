@@ -52,7 +52,7 @@ class Stored:
     """
 
     def __init__(self, function: Callable, large: bool):
-        self._function, self._large = function, large
+        self._function, self.large = function, large
         self._chosen: dict[str, Executable] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -69,13 +69,13 @@ class Stored:
             known = _programs.setdefault(key, _Known(key))
             with known.lock, uncollected:
                 if key not in self._chosen:
-                    self._chosen[key] = known.choose(lambda: trace(flat, leaves), self._large)
+                    self._chosen[key] = known.choose(lambda: trace(flat, leaves), self.large)
         except IndescribableError:
             return self._plain(arguments)
         return known.run(self._chosen[key], leaves)
 
     def _plain(self, arguments):
-        program = _plain_program(self._function, self._large)
+        program = _plain_program(self._function, self.large)
         with _one_by_one, uncollected:  # two threads would both compile it
             program.lower(*arguments).compile()
         return program(*arguments)

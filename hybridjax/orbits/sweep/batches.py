@@ -63,6 +63,18 @@ class Rounds(NamedTuple):
     steps: Int[np.ndarray, " S"]
 
 
+class Known(NamedTuple):
+    """Cycles of K other systems, from which guesses are taken."""
+
+    systems: HybridSystem
+    """Their arrays have a leading axis of K systems."""
+    anchor: Lanes
+    period: Float[np.ndarray, " K"]
+    jacobian: Float[np.ndarray, "K d d"]
+    """Of the return map less the identity, in each."""
+    result: Int[np.ndarray, " K"]
+
+
 class Tiles(NamedTuple):
     """How the systems are solved."""
 
@@ -75,13 +87,16 @@ class Tiles(NamedTuple):
     workers: int
     programs: "Programs"
     """`QUICK` or `FULL`."""
+    known: Known | None = None
 
     @property
     def parameters(self) -> Float[np.ndarray, "S p"]:
-        """The numbers in which the systems differ, each in units of its spread. (What is not finite
-        has no neighbors to learn from; it is taken for the mean.)"""
-        arrays = jax.tree_util.tree_leaves(eqx.filter(self.systems, eqx.is_inexact_array))
-        flat = np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+        """The numbers in which the systems differ, each in units of its spread; below them those of
+        the systems that are known. (What is not finite has no neighbors to learn from; it is taken
+        for the mean.)"""
+        flat = _numbers(self.systems)
+        if self.known is not None:
+            flat = np.concatenate([flat, _numbers(self.known.systems)])
         good = np.isfinite(flat)
         count = np.maximum(good.sum(axis=0), 1)
         flat = np.where(good, flat - np.where(good, flat, 0.0).sum(axis=0) / count, 0.0)
@@ -91,34 +106,61 @@ class Tiles(NamedTuple):
         return flat[:, spread > 0] / spread[spread > 0]
 
     def solve(self, S: int) -> Rounds:
-        """Newton for all systems: first for some, spread over all, from the one guess there is,
-        then for as many again from where their neighbors' cycles are, and so on."""
-        parameters = self.parameters
+        """Newton for all systems: first for some, spread over all, from the cycles that are known
+        or the one guess there is, then for as many again from where their neighbors' cycles are,
+        and so on. Systems that fail begin again from the cycle of the nearest one that was found,
+        and in the end from where they are after flowing freely."""
+        parameters, known = self.parameters[:S], self.parameters[S:]
         order = np.random.default_rng(0).permutation(S)
-        rows = order[: self.size]
+        out = None
+
+        def guessed(rows, out, **options):
+            found = known, self.known
+            if out is not None:
+                own = parameters[order[: len(out.result)]]
+                found = own, Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
+                if self.known is not None:
+                    found = (
+                        np.concatenate([own, known]),
+                        _join(found[1], self.known._replace(systems=None)),
+                    )
+            return self._by_neighbors(*found, parameters[rows], **options)
+
         with working("cycles", S) as call:
-            with uncollected:  # here the programs are compiled
-                out = self._again(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
-            while (done := len(out.result)) < S:
+            while (done := 0 if out is None else len(out.result)) < S:
                 call.done = done
-                rows = order[done : 2 * done]
+                more = slice(done, max(2 * done, self.size))
+                rows = order[more]
+                if out is None and self.known is None:
+                    with uncollected:  # here the programs are compiled
+                        given = self._given(len(rows))
+                        out = self._settled(rows, self._newton(rows, *given, _NEWTON))
+                    continue
                 rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
-                order[done : 2 * done] = rows
-                guesses = self._by_neighbors(parameters[order[:done]], out, parameters[rows])
-                part = self._newton(rows, *self._first_step(rows, *guesses), _USUAL)
-                out = _join(out, part._replace(steps=part.steps + 1))
+                order[more] = rows
+                begin = self._first_step(rows, *guessed(rows, out))
+                part = self._newton(rows, *begin, _USUAL)
+                part = part._replace(steps=part.steps + 1)
+                out = part if out is None else _join(out, part)
         late = np.flatnonzero(out.excess > 1)
         if len(late):
             anchor, period = _pick((out.anchor, out.period), late)
             part = self._newton(order[late], anchor, period, _NEWTON - _USUAL)
             out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
-        return _pick(self._again(order, out), np.argsort(order))
+        failed = np.flatnonzero(out.result != Result.OK)
+        if len(failed) and (self.known is not None or len(failed) < S):
+            anchor, period, _ = guessed(order[failed], out, moved=False)
+            part = self._newton(order[failed], anchor, period, _NEWTON)
+            better = part.result == Result.OK
+            part = part._replace(steps=part.steps + out.steps[failed])
+            out = _replace(out, failed[better], _pick(part, better))
+        return _pick(self._settled(order, out), np.argsort(order))
 
     def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
         return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
 
-    def _again(self, rows, out: Rounds) -> Rounds:
+    def _settled(self, rows, out: Rounds) -> Rounds:
         """Another try for the systems that failed, from where they are after flowing freely."""
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
@@ -132,19 +174,22 @@ class Tiles(NamedTuple):
         failed, begin = failed[there], _pick(begin, there)
         return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
 
-    def _by_neighbors(self, known, out: Rounds, wanted):
-        """The cycle of the nearest system, moved as those around it in the same chart suggest:
-        its anchor, its period, and the Jacobian there (NaN where nothing is known)."""
-        ok = np.flatnonzero(out.result == Result.OK)
+    def _by_neighbors(self, known, found: Known, wanted, moved: bool = True):
+        """The cycle of the nearest system, unless it should not be `moved` as those around it in
+        the same chart suggest: its anchor, its period, and the Jacobian there (NaN where nothing is
+        known)."""
+        ok = np.flatnonzero(found.result == Result.OK)
         if not len(ok):
-            blank = np.full((len(wanted), *out.turn.jacobian.shape[1:]), np.nan)
+            blank = np.full((len(wanted), *found.jacobian.shape[1:]), np.nan)
             return *self._given(len(wanted)), blank
         known = known[ok]
         terms = _powers(known[:1]).shape[1]
         _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
-        anchor, period, jacobian = _pick((out.anchor, out.period, out.turn.jacobian), ok)
+        anchor, period, jacobian = _pick((found.anchor, found.period, found.jacobian), ok)
+        if not moved:
+            return _pick((anchor, period, jacobian), first)
         flat = jacobian.reshape(len(ok), -1)
         values = np.concatenate([anchor.q[..., 0], period[:, None], flat], axis=1)
         same = anchor.chart[near] == anchor.chart[first][:, None]
@@ -226,6 +271,12 @@ class Tiles(NamedTuple):
             return _pick(part, slice(len(rows) - k))
 
         return _join(*in_threads(tile, range(0, len(rows), self.size), workers))
+
+
+def _numbers(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
+    """The numbers of systems, one row for each."""
+    arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
+    return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
 
 
 def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:

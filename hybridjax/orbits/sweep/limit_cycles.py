@@ -26,16 +26,16 @@ from ...sections.crossing import AtEvent, Crossing
 from ...systems.structure import Structure, check_system
 from ...systems.system import HybridSystem
 from ..cycle import LimitCycle
-from ..return_map import turn_product
+from ..return_map import ReturnMap, turn_product
 from ..scale import given_sizes, scale_of
-from .batches import FULL, QUICK, Tiles
+from .batches import FULL, QUICK, Programs, Rounds, Tiles
 
 
 # Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
 # Doubled, it is 6 s.
 _SMALL = 2000
 # Systems per compiled call. Doubled: fewer calls, whose arrays leave the cache.
-_BATCH = 250
+BATCH = 250
 
 
 @checked_methods
@@ -173,19 +173,35 @@ def find_limit_cycles(
     arrays, rest = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
     check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
-    settings = settings.filled(SWEEP)
+    map = map_for_sweep(guess, scale, settings)
+    size = min(execution.batch or BATCH, S)
+    tiles = Tiles(systems, map, size, execution.threads, programs_for(S))
+    return as_cycles(tiles, tiles.solve(S))
+
+
+def map_for_sweep(
+    guess: LimitCycle, scale: Mapping[str, float] | None, settings: Settings | None
+) -> ReturnMap:
+    """The return map of `guess`, for the search of the cycles of many systems."""
+    settings = (Settings() if settings is None else settings).filled(SWEEP)
     s = Structure(guess.system)
     known = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
-    map = dataclasses.replace(guess.return_map, settings=settings)
-    programs = QUICK if S <= _SMALL else FULL
-    tiles = Tiles(systems, map, min(execution.batch or _BATCH, S), execution.threads, programs)
-    found = tiles.solve(S)
-    turn = found.turn
+    return dataclasses.replace(guess.return_map, settings=settings)
+
+
+def programs_for(S: int) -> Programs:
+    """What solves so many systems in all."""
+    return QUICK if S <= _SMALL else FULL
+
+
+def as_cycles(tiles: Tiles, found: Rounds) -> LimitCycles:
+    """The cycles that were found."""
+    turn, map = found.turn, tiles.map
     return LimitCycles(
-        systems, guess.base, found.period, found.anchor, turn.legs, turn.factors,
-        turn.distance, found.steps, found.result, found.codes, settings, guess.conserved,
-        guess.multiplicity,
+        tiles.systems, map.base, found.period, found.anchor, turn.legs, turn.factors,
+        turn.distance, found.steps, found.result, found.codes, map.settings, map.conserved,
+        map.multiplicity,
     )  # fmt: skip
 
 

@@ -22,4 +22,4 @@ def package(name: str) -> ModuleType:
 
 
 # The extra of a library that is not called like it.
-_EXTRAS = {"pandas": "tables"}
+_EXTRAS = {"pandas": "tables", "distributed": "scale", "zarr": "scale"}

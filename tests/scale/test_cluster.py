@@ -1,0 +1,111 @@
+"""Pieces on a cluster of two processes: the same to the last bit, whoever is killed."""
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+distributed = pytest.importorskip("distributed")
+pytest.importorskip("zarr")
+
+DRAWS = 40
+
+
+def walk(rng):
+    """A random computation that takes a while."""
+    time.sleep(0.05)
+    steps = rng.normal(size=(100, 2)).cumsum(axis=0)
+    return {"end": steps[-1], "far": np.abs(steps).max()}
+
+
+def fails(rng):
+    value = rng.uniform()
+    if value < 0.5:
+        raise hj.ComputationError("too small")
+    return value
+
+
+@pytest.fixture(scope="module")
+def client():
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return hj.monte_carlo(walk, DRAWS, seed=7, chunk=2)
+
+
+def test_draws_have_streams_of_their_own(whole):
+    for i in (0, 3, DRAWS - 1):
+        stream = np.random.SeedSequence(7, spawn_key=(i,))
+        expected = walk(np.random.default_rng(stream))
+        np.testing.assert_array_equal(whole.end[i], expected["end"])
+        assert whole.far[i] == expected["far"]
+    fewer = hj.monte_carlo(walk, 3, seed=7)
+    np.testing.assert_array_equal(fewer.end, whole.end[:3])
+
+
+def test_draws_that_fail_are_named():
+    found = hj.monte_carlo(fails, 20, seed=1)
+    assert 0 < found.failed.sum() < 20
+    np.testing.assert_array_equal(np.isnan(found.value), found.failed == 1)
+
+
+def test_draws_must_stay_alike():
+    with pytest.raises(hj.DefinitionError, match="the same names and shapes: draw 1 "):
+        hj.monte_carlo(lambda rng: np.ones(rng.integers(1, 1000)), 5)
+    with pytest.raises(hj.DefinitionError, match="must give numbers"):
+        hj.monte_carlo(lambda rng: "one", 5)
+
+
+def test_a_cluster_gives_the_same_numbers(client, whole):
+    assert hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client).identical(whole)
+
+
+def test_a_killed_worker_takes_nothing_with_it(client, whole, tmp_path):
+    store = tmp_path / "draws.zarr"
+    victim = client.cluster.workers[0].pid
+
+    def watched(count):
+        while len(list(store.glob("far/c/*"))) < count:
+            time.sleep(0.01)
+        os.kill(victim, signal.SIGKILL)
+
+    with Beside(watched, 4):
+        found = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client, store=store)
+    assert found.load().identical(whole)
+    times = {path: path.stat().st_mtime_ns for path in store.glob("far/c/*")}
+    assert len(times) == DRAWS // 2
+    (store / "end/c/3/0").unlink()
+    again = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, store=store)  # goes on without a cluster
+    assert again.load().identical(whole)
+    changed = [path.name for path, before in times.items() if path.stat().st_mtime_ns != before]
+    assert changed == ["3"]
+
+
+class Beside:
+    """Something that is done beside what stands in the context."""
+
+    def __init__(self, function, *arguments):
+        import threading
+
+        self.thread = threading.Thread(target=function, args=arguments)
+
+    def __enter__(self):
+        self.thread.start()
+
+    def __exit__(self, *_):
+        self.thread.join()
+
+
+def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
+    monkeypatch.setattr(hj, "__version__", "9.9")
+    with pytest.raises(hj.DefinitionError, match="has hybridjax 0.1.0, and this process has 9.9"):
+        hj.monte_carlo(walk, DRAWS, client=client)
