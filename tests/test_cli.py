@@ -232,10 +232,7 @@ def test_an_interruption_in_a_callback_is_not_lost(tmp_path, monkeypatch, capsys
 def test_the_main_job_imports_what_it_needs():
     """And nothing else that takes long."""
     heavy = "diffrax", "optimistix", "lineax", "scipy.linalg", "scipy.special", "matplotlib"
-    code = (
-        "import sys, hybridjax.apps.reproduce\n"
-        f"print([m for m in {heavy} if m in sys.modules])"
-    )
+    code = f"import sys, hybridjax.apps.reproduce\nprint([m for m in {heavy} if m in sys.modules])"
     run = _python("-c", code)
     assert (run.returncode, run.stdout) == (0, "[]\n"), run.stderr
 

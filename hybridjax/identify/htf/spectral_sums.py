@@ -14,7 +14,7 @@ from ..._core.boundary.stream import Stream
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.partition import check_sharing, meets_itself, regular
-from .crest_test import CrestTest, compare_crest_factors
+from .random_phases import CrestTest, compare_crest_factors
 
 
 Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
