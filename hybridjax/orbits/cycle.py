@@ -217,11 +217,12 @@ class LimitCycle(eqx.Module):
     def _stiffness(self) -> str:
         """What limits explicit steps, if a chart is stiff."""
         stiff = stiff_charts(Structure(self.system), to_host(self.legs), float(self.period))
-        return "".join(
-            f"\n  stiff        chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps "
-            'of an explicit method; `Settings(solver="auto")` takes an implicit one'
+        told = (
+            f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an explicit "
+            'method; `Settings(solver="auto")` takes an implicit one'
             for name, rate in stiff.items()
         )
+        return "".join(f"\n  stiff        {line}" for line in told)
 
 
 def _require_values(cycle: LimitCycle, name: str) -> None:
