@@ -55,6 +55,10 @@ class Radau(eqx.Module):
             raise DefinitionError(f"Radau: `stages` must be 3, 5 or 7, not {self.stages!r}.")
 
 
+Solver = diffrax.AbstractSolver | Radau
+"""What users give."""
+
+
 class ByChart(NamedTuple):
     """Solvers of some charts, by name."""
 
@@ -65,13 +69,11 @@ class ByChart(NamedTuple):
         return dict(zip(*self, strict=True)).get(name)
 
 
-def solvers(given: Any) -> Any:
+def solvers(
+    given: Solver | Method | ByChart | Mapping[str, Solver] | str | None,
+) -> Solver | Method | ByChart | str | None:
     """A solver as it is, and solvers by the names of charts in a form that can be compared."""
     return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
-
-
-Solver = diffrax.AbstractSolver | Radau
-"""What users give."""
 
 
 @ft.lru_cache
