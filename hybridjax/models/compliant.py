@@ -4,6 +4,9 @@ The hopper is that of `hopper.py`; the ground is a spring and a dashpot in paral
 (on such contacts: K. H. Hunt, F. R. E. Crossley, J. Appl. Mech. 42 (1975) 440-445).
 """
 
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
 from ..systems.chart import Chart
 from ..systems.solver import Radau
 from ..systems.system import Guess, Parameter, parameter
@@ -34,7 +37,7 @@ class CompliantHopper(VerticalHopper):
     kg: Parameter = parameter(1e5, unit="N/m", doc="stiffness of the ground")
     cg: Parameter = parameter(3e3, unit="N s/m", doc="damping of the ground")
 
-    def ground(self, ym, vm):
+    def ground(self, ym: ArrayLike, vm: ArrayLike) -> Array:
         """Force of the ground on the foot."""
         return -self.kg * ym - self.cg * vm
 

@@ -57,6 +57,12 @@ class Radau(eqx.Module):
             raise DefinitionError(f"Radau: `stages` must be 3, 5 or 7, not {self.stages!r}.")
 
 
+if TYPE_CHECKING:
+    Solver = diffrax.AbstractSolver | Radau
+else:  # diffrax takes a third of a second to import; `as_method` looks at what is given.
+    Solver = Any
+
+
 class ByChart(NamedTuple):
     """Solvers of some charts, by name."""
 
@@ -67,15 +73,11 @@ class ByChart(NamedTuple):
         return dict(zip(*self, strict=True)).get(name)
 
 
-def solvers(given: Any) -> Any:
+def solvers(
+    given: Solver | Method | ByChart | Mapping[str, Solver] | str | None,
+) -> Solver | Method | ByChart | str | None:
     """A solver as it is, and solvers by the names of charts in a form that can be compared."""
     return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
-
-
-if TYPE_CHECKING:
-    Solver = diffrax.AbstractSolver | Radau
-else:  # diffrax takes a third of a second to import; `as_method` looks at what is given.
-    Solver = Any
 
 
 @ft.lru_cache
