@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [bag]
-[coverage] [short] [losses]
+[coverage] [short] [losses] [real]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import equinox as eqx
 import numpy as np
+from real_recordings import real  # noqa: F401 (called by its name)
 from scipy import stats
 
 import hybridjax as hj
@@ -494,7 +495,7 @@ def write_trials(files, minutes, rate):
 
 ALL = (
     "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage",
-    "short", "losses",
+    "short", "losses", "real",
 )  # fmt: skip
 
 if __name__ == "__main__":

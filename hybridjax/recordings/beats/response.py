@@ -29,9 +29,8 @@ from .phase_model import basis
 
 # Harmonics of a curve, at most. Doubled: curves with finer detail, where jitter allows any.
 _MOST = 8
-# Standard errors by which forecasts of intervals left out must gain from one more harmonic.
-# Doubled: curves are smoother.
-_GAIN = 2.0
+# Harmonics beyond the best number that are tried. Doubled: those that pay only together are found.
+_FURTHER = 1
 # Phases at which a curve is given. Doubled: smoother figures.
 _POINTS = 200
 # Half of the 95 % band, relative to the mean of the curve, that is wide. Doubled: less is said.
@@ -156,9 +155,9 @@ def phase_response(
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback).
-    - `harmonics`: K. By default they are added as long as forecasts of blocks of intervals that
-      were left out gain from it by two standard errors, and not beyond 1/(2 pi jitter): the spread
-      of the phase at the end of a cycle hides what is finer.
+    - `harmonics`: K. By default one more than the number that forecasts best what was left out
+      (so that what is left of higher ones is small beside the errors), and not beyond
+      1/(pi jitter): the spread of the phase at the end of a cycle hides what is finer.
 
     Standard errors are those of blocks of intervals, whose errors may depend on each other: trials
     if there are thirty or more, else parts of them.
@@ -175,18 +174,14 @@ def phase_response(
             f"{intervals.trials} trials: record more."
         )
     fits: list[tuple[CurveFit, Accuracy]] = []
-    chosen = 0
     for k in range(most + 1):
         say(f"{k} harmonics")
         fit = fit_curve(intervals, k, fits[-1][0] if fits else None)
         fits.append((fit, accuracy_of(intervals, fit)))
-        if harmonics is not None or k == 0:
-            chosen = k
-            continue
-        if _gains(fits[chosen][1], fits[k][1]):
-            chosen = k
-        if k > chosen + 1 or k >= _resolved(fit.jitter):
+        if harmonics is None and k > min(_best(fits) + _FURTHER, _resolved(fit.jitter)):
             break
+    chosen = min(_best(fits) + 1, _resolved(fits[-1][0].jitter), len(fits) - 1)
+    chosen = chosen if harmonics is None else harmonics
     fit, accuracy = fits[chosen]
     x = np.arange(_POINTS) / _POINTS
     waves = basis(x, chosen)
@@ -225,14 +220,14 @@ def share(intervals: Intervals, used: Bool[np.ndarray, " L"], left: int | float)
 
 
 def _resolved(jitter: float) -> int:
-    """The highest harmonic that the spread of the phase leaves to be seen at the end of a cycle."""
-    return max(1, round(1 / (2 * np.pi * max(jitter, 1e-6))))
+    """The highest harmonic of which the spread of the phase leaves a seventh at the end of a
+    cycle."""
+    return max(1, round(1 / (np.pi * max(jitter, 1e-6))))
 
 
-def _gains(before: Accuracy, after: Accuracy) -> bool:
-    """Whether what was left out is forecast better beyond doubt."""
-    gain = before.left_out - after.left_out
-    return bool(gain.sum() > _GAIN * np.sqrt(len(gain)) * gain.std(ddof=1))
+def _best(fits: list[tuple[CurveFit, Accuracy]]) -> int:
+    """The number of harmonics that forecasts best what was left out."""
+    return int(np.argmin([accuracy.left_out.sum() for _, accuracy in fits]))
 
 
 def _memory(intervals: Intervals, fit: CurveFit) -> float:

@@ -15,6 +15,7 @@ from ..recording import Recording, Trial
 from ..smoothing import FEWEST
 from .coupling import unanswered
 from .cycles import other_cycles, slow_changes
+from .feedback import feedback
 from .finding import Finding, Inspection
 from .repeats import doubled_signals, repeated_samples
 from .samples import Rows, Signal, clipped, frozen, placeholders, wrapped
@@ -65,13 +66,14 @@ def inspect(recording: Recording, *, inputs: SignalNames, outputs: OptionalNames
 @checked
 def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> tuple[Finding, ...]:
     """What can be seen when the phase is known: trials of other periods and cycles, slow changes of
-    the outputs, inputs that the outputs do not answer."""
+    the outputs, inputs that the outputs do not answer, and inputs that answer the outputs."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
     names = tuple(t.name for t in recording.trials)
     return (
         *other_cycles(recording, phase, outputs),
         *slow_changes(recording, phase, outputs),
         *unanswered(data, names),
+        *feedback(data),
     )
 
 

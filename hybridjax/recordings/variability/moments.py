@@ -22,8 +22,8 @@ from ..data import SectionData
 # Sections between those of a state and those of its instruments, and how many there are of each.
 # Smoothing correlates the noise of neighbors. Doubled: weaker instruments.
 _APART, _STATE, _INSTRUMENTS = 2, 2, 3
-# Combinations of the instruments: for each number of the state, and besides. Doubled: the first stage follows
-# more of the noise.
+# Combinations of the instruments: for each number of the state, and besides. Doubled: the first
+# stage follows more of the noise.
 _PER_STATE, _MORE = 2, 2
 # Of the largest singular value: below it, a combination is rounding. Doubled: nothing changes.
 _RANK = 1e-9
@@ -45,17 +45,16 @@ class Moments(NamedTuple):
     records: Int[np.ndarray, " K"]
     """The record of each cycle."""
 
-    def plain(self, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "N d d"]:
+    def plain(self, weights: Float[np.ndarray, "B K"]) -> Float[np.ndarray, "B N d d"]:
         """J of each section by least squares; `weights`: how often each cycle counts."""
-        a, b = (np.einsum("k,nk...->n...", weights, x) for x in (self.state, self.forward))
-        return np.swapaxes(np.linalg.solve(a, np.swapaxes(b, 1, 2)), 1, 2)
+        state, forward = (_summed(weights, x) for x in (self.state, self.forward))
+        return forward @ np.linalg.inv(state)
 
-    def by_instruments(self, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "N d d"]:
+    def by_instruments(self, weights: Float[np.ndarray, "B K"]) -> Float[np.ndarray, "B N d d"]:
         """J of each section by two-stage least squares."""
-        parts = (self.square, self.seen, self.ahead)
-        square, seen, ahead = (np.einsum("k,nk...->n...", weights, x) for x in parts)
-        first = np.linalg.solve(square, np.swapaxes(seen, 1, 2))  # (N, r, d)
-        return ahead @ first @ np.linalg.inv(seen @ first)
+        square, seen, ahead = (_summed(weights, x) for x in (self.square, self.seen, self.ahead))
+        first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(seen, 2, 3)
+        return ahead @ first @ np.linalg.pinv(seen @ first)
 
     def strength(self) -> float:
         """The share of the states' variance that instruments explain, the mean over sections."""
@@ -111,6 +110,13 @@ def moments_of(data: SectionData, order: int) -> Moments:
         for part, (a, b) in zip(parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True):
             part[n, cycle[own]] = a[:, :, None] * b[:, None, :]
     return Moments(*parts, records=names[:, 0])
+
+
+def _summed(
+    weights: Float[np.ndarray, "B K"], products: Float[np.ndarray, "N K a b"]
+) -> Float[np.ndarray, "B N a b"]:
+    N, K, a, b = products.shape
+    return (weights @ np.swapaxes(products, 0, 1).reshape(K, -1)).reshape(-1, N, a, b)
 
 
 def _principal(

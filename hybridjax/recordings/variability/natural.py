@@ -20,10 +20,12 @@ _DRAWS = 1000
 # Cycles of a block: the third root of their number, and not less than this. Doubled: longer memory
 # of what disturbs the rhythm is allowed for, by fewer blocks.
 _SHORTEST_BLOCK = 4
+# Blocks in a record, below which whole records are drawn. Doubled: longer ones are, too.
+_BLOCKS = 3
 # Share of the states' variance that instruments must explain, below which they are weak. Doubled:
 # more is said.
 _WEAK = 0.5
-# Cycles for each multiplier, below which there are few. Doubled: more is said.
+# Cycles in a record, below which there are few. Doubled: more is said.
 _FEW = 50
 
 MultiplierCount = Annotated[int, Whole(1, 12)]
@@ -39,7 +41,8 @@ class NaturalMultipliers(eqx.Module):
     - `plain` (d,): by least squares on the return map, as is usual; with that bias.
     - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles.
     - `strength`: the share of the states' variance that the instruments explain.
-    - `cycles`: how many were used, that are followed by another one. `block`: cycles of a block.
+    - `cycles`: how many were used, that are followed by another one, of so many `records`.
+      `block`: cycles of a block.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -48,6 +51,7 @@ class NaturalMultipliers(eqx.Module):
     plain_draws: Complex[np.ndarray, "B d"]
     strength: float = eqx.field(static=True)
     cycles: int = eqx.field(static=True)
+    records: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
 
     def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
@@ -106,46 +110,57 @@ def natural_multipliers(
     - `order`: the number of multipliers. Directions that are not among those that vary most act as
       disturbances: believe what does not change with the order.
     - `seed`: of the bootstrap, which draws blocks of successive cycles with replacement (Künsch
-      1989), within each record.
+      1989), within each record; whole records where these are short.
 
     **Raises:** `DefinitionError` for too few cycles or signals.
     """
     moments = moments_of(data, order)
     K = len(moments.records)
-    every = np.ones(K)
+    every = np.ones((1, K))
     block = max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
     rng = np.random.default_rng(seed)
-    draws, plain = np.zeros((2, _DRAWS, order), complex)
-    for b in range(_DRAWS):
-        weights = _resampled(moments, block, rng)
-        draws[b] = _multipliers(moments.by_instruments(weights))
-        plain[b] = _multipliers(moments.plain(weights))
+    weights = np.stack([_resampled(moments, block, rng) for _ in range(_DRAWS)])
     return NaturalMultipliers(
-        multipliers=_multipliers(moments.by_instruments(every)),
-        plain=_multipliers(moments.plain(every)),
-        draws=draws,
-        plain_draws=plain,
+        multipliers=_multipliers(moments.by_instruments(every))[0],
+        plain=_multipliers(moments.plain(every))[0],
+        draws=_multipliers(moments.by_instruments(weights)),
+        plain_draws=_multipliers(moments.plain(weights)),
         strength=moments.strength(),
         cycles=K,
+        records=len(np.unique(moments.records)),
         block=block,
     )
 
 
-def _multipliers(maps: Float[np.ndarray, "N d d"]) -> Complex[np.ndarray, " d"]:
-    """By the mean characteristic polynomial, the largest first."""
-    z = np.roots(np.mean([np.poly(J).real for J in maps], axis=0)).astype(complex)
-    z = np.concatenate([z, np.zeros(maps.shape[1] - len(z))])  # (`roots` drops zeros at the end)
-    return z[np.argsort(-np.abs(z), kind="stable")]
+def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Complex[np.ndarray, "B d"]:
+    """By the mean characteristic polynomial over the sections, the largest first."""
+    values = np.linalg.eigvals(maps)
+    c = np.ones((*values.shape[:2], 1), complex)
+    for k in range(values.shape[2]):
+        later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
+        c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
+    c = c.real.mean(axis=1)[:, 1:]
+    companion = np.zeros((len(c), c.shape[1], c.shape[1]))
+    companion[:, 0] = -c
+    companion[:, np.arange(1, c.shape[1]), np.arange(c.shape[1] - 1)] = 1.0
+    z = np.linalg.eigvals(companion).astype(complex)
+    return np.take_along_axis(z, np.argsort(-np.abs(z), axis=1, kind="stable"), axis=1)
 
 
 def _resampled(moments: Moments, block: int, rng: np.random.Generator) -> Float[np.ndarray, " K"]:
-    """How often each cycle was drawn: whole blocks, as many cycles as there are in each record."""
+    """How often each cycle was drawn: blocks of each record, or whole records where these are
+    short."""
     weights = np.zeros(len(moments.records))
-    for record in np.unique(moments.records):
+    names, counts = np.unique(moments.records, return_counts=True)
+    if np.median(counts) < _BLOCKS * block:
+        for record in rng.choice(names, len(names)):
+            weights[moments.records == record] += 1.0
+        return weights
+    for record, count in zip(names, counts, strict=True):
         own = np.flatnonzero(moments.records == record)
-        length = min(block, len(own))
-        starts = rng.integers(0, len(own) - length + 1, -(-len(own) // length))
-        drawn = (starts[:, None] + np.arange(length)).ravel()[: len(own)]
+        length = min(block, count)
+        starts = rng.integers(0, count - length + 1, -(-count // length))
+        drawn = (starts[:, None] + np.arange(length)).ravel()[:count]
         np.add.at(weights, own[drawn], 1.0)
     return weights
 
@@ -157,17 +172,18 @@ def _interval(draws: Complex[np.ndarray, "B d"], level: float) -> Float[np.ndarr
 
 def _about(found: NaturalMultipliers) -> Iterator[str]:
     """What the data cannot tell."""
-    d, (low, high) = len(found.multipliers), found.interval()[0]
+    low, high = found.interval()[0]
     yield (
         f"Width: 95 % of resamplings put the largest modulus between {low:.2f} and {high:.2f}, "
         f"from {found.cycles} cycles; four times as many would halve that."
     )
-    if found.cycles < _FEW * d:
-        bias = (1 + 3 * abs(found.multipliers[0])) / found.cycles
+    each = found.cycles / found.records
+    if each < _FEW:
+        bias = (1 + 3 * abs(found.multipliers[0])) / each
         yield (
-            f"Few cycles: {found.cycles} for {d} multipliers. A regression of so few returns is "
-            f"biased towards zero, by about {bias:.2f} for the largest (Kendall 1954); this is not "
-            "corrected."
+            f"Few cycles: {each:.3g} in each of {found.records} records, whose own mean was "
+            "subtracted. That biases regressions towards negative values, by about "
+            f"{bias:.2f} for the largest (Kendall 1954); this is not corrected."
         )
     if found.strength < _WEAK:
         yield (

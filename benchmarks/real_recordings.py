@@ -1,0 +1,273 @@
+"""Real recordings (notebooks/data): the numbers of docs/real-data.md.
+
+python benchmarks/recordings.py real
+"""
+
+import pathlib
+import time
+
+import numpy as np
+from scipy import stats
+
+import hybridjax as hj
+
+
+DATA = pathlib.Path(__file__).parents[1] / "notebooks/data"
+STRIDES = (39, 40)  # of the two segments of walking that the simulations imitate
+
+
+def neuron(cell, every=1):
+    """Spikes under a sine current, one trial for each frequency, and the published curve."""
+    a = np.load(DATA / "pacemaker_neurons.npz")
+    edges = np.cumsum(a[f"cell{cell}_counts"], dtype=int)[:-1]
+    t, trials = np.arange(0, 10.0002, 2e-4), []
+    for k, steps in enumerate(np.split(a[f"cell{cell}_steps"], edges)):
+        spikes, f = np.cumsum(steps, dtype=int) / 1e4, k + 1
+        current = 20 * np.sin(2 * np.pi * f * t)
+        if k % every == 0:
+            about = dict(events={"spike": spikes}, units={"current": "pA"}, name=f"{f} Hz")
+            trials.append(hj.Recording(t, {"current": current}, **about))
+    places = np.arange(200) / 200
+    curve = np.interp(places, a["published_phase"], a[f"cell{cell}_published"], period=1)
+    return hj.Recording.join(trials), curve
+
+
+def robot():
+    """Twelve runs of five strides; a stride begins when the outer leg becomes the stance leg."""
+    a, runs = np.load(DATA / "compass_gait_robot.npz"), []
+    for run in np.unique(a["run"]):
+        rows = a["run"] == run
+        t, outer = a["time"][rows], a["outer"][rows].astype(int)
+        begins = t[np.flatnonzero(np.diff(outer, prepend=1 - outer[0]) > 0)]
+        steps = t[np.flatnonzero(np.diff(outer, prepend=1 - outer[0]))]
+        signals = {name: a[name][rows].astype(float) for name in ("voltage", "hip", "stance")}
+        units = {"voltage": "V", "hip": "rad", "stance": "rad"}
+        events = {"stride": np.append(begins, t[-1]), "step": np.append(steps, t[-1])}
+        runs.append(hj.Recording(t, signals, events=events, units=units, name=f"run {run}"))
+    return hj.Recording.join(runs)
+
+
+def walking():
+    """Both segments of the treadmill; a stride begins at a strike of the left heel."""
+    a, trials = np.load(DATA / "human_walk.npz"), []
+    for s, (first, last) in enumerate([(6, 61), (1, 54)]):
+        t, left = a[f"time{s}"].astype(float), a[f"left{s}"]
+        rows = (t >= first) & (t <= last)
+        angles = np.where(a[f"gap{s}"][:, None], np.nan, a[f"angles{s}"])[rows].astype(float)
+        signals = dict(zip(map(str, a["names"]), angles.T, strict=True))
+        events = {"strike": left[(left >= first) & (left <= last)]}
+        units = dict.fromkeys(signals, "rad")
+        trials.append(
+            hj.Recording(t[rows], signals, events=events, units=units, name=f"segment {s}")
+        )
+    return hj.Recording.join(trials)
+
+
+def neurons(every=2):
+    for cell in (8, 6):
+        recording, published = neuron(cell, every)
+        phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
+        print(f"\nNeuron {cell}: {phase}")
+        start = time.process_time()
+        found = hj.recordings.phase_response(recording, phase, input="current")
+        print(found, f"({time.process_time() - start:.0f} CPU s)", sep="\n")
+        print("R2 left out by harmonics:", np.round(found.left_out, 4))
+        at = np.array([0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95])
+        low, high = found.interval(at)
+        rows = zip(at, found(at), low, high, published[(at * 200).astype(int)], strict=True)
+        for x, z, a, b, other in rows:
+            print(f"  Z({x:.2f}) = {z:.2f} [{a:.2f}, {b:.2f}], published {other:.2f}")
+        curves = {"estimated": found, "published": published, "flat": [published.mean()]}
+        for name, curve in curves.items():
+            forecast = hj.recordings.forecast_intervals(
+                recording, phase, input="current", curve=curve
+            )
+            print(f"  {name:9s}", forecast, flush=True)
+
+
+def robots():
+    recording = robot()
+    print("\nRobot:", hj.recordings.estimate_phase(recording, hj.AtEvent("stride")))
+    steps = [np.diff(t.events["step"]) for t in recording.trials]
+    sizes, within, freedom = [], 0.0, 0
+    for duration in steps:  # a line and an alternation, which is that of the legs
+        k = np.arange(len(duration))
+        columns = np.stack([np.ones(len(k)), k, (-1.0) ** k], axis=1)
+        fit, left, *_ = np.linalg.lstsq(columns, duration)
+        sizes.append(2 * fit[2])
+        within += float(left[0])
+        freedom += len(k) - 3
+    spread = np.sqrt(within / freedom)
+    ratio = np.mean([len(d) * (x / 2) ** 2 for d, x in zip(steps, sizes, strict=True)]) / spread**2
+    rms, low, high = 1000 * np.array([np.sqrt(np.mean(np.square(sizes))), min(sizes), max(sizes)])
+    print(
+        f"alternate steps differ by {rms:.0f} ms (rms over runs; from {low:.0f} to {high:.0f}), "
+        f"steps of a leg scatter by {1000 * spread:.0f} ms: F = {ratio:.0f} of {len(steps)} and "
+        f"{freedom} degrees of freedom, p = {stats.f.sf(ratio, len(steps), freedom):.1g}"
+    )
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("stride"))
+    data = hj.recordings.section_data(
+        recording, phase, inputs="voltage", outputs=("hip", "stance"), n_sections=4
+    )
+    print(data, *hj.recordings.inspect_cycles(recording, phase, data), sep="\n")
+    try:
+        hj.recordings.hold_out(data, 1)
+    except hj.DefinitionError as error:
+        print("to hold a quarter out:", error)
+    try:
+        hj.fit_series(data, 1, check=False)
+    except hj.DefinitionError as error:
+        print("to fit all of it:", error)
+    data = hj.recordings.section_data(
+        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8
+    )
+    print("The closed loop, its input a part of it:", hj.recordings.natural_multipliers(data, 1))
+
+
+def robot_layout(seeds=40, multiplier=0.6):
+    """Twelve records of five cycles with four sections, as the robot's."""
+    print(f"\nThe robot's layout, simulated: multiplier {multiplier}, {seeds} seeds")
+    model = linear_rhythm((multiplier,), 4, 2)
+    for label, gain in (("input given", 0.0), ("feedback", 0.6)):
+        hits, values, widths = 0, [], []
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            records = [in_loop(model, 5, gain, rng) for _ in range(12)]
+            fit = hj.fit_series(records, 1, check=False, distortion=False)
+            hits += bool(fit.contains([multiplier])[0])
+            values.append(fit.multipliers[0].real)
+            widths.append(np.abs(fit.ellipse(0) - fit.multipliers[0]).max())
+        print(
+            f"{label:12s} mean {np.mean(values):.3f}, rms error "
+            f"{np.sqrt(np.mean((np.array(values) - multiplier) ** 2)):.3f}, median half-width "
+            f"{np.median(widths):.3f}, held in {hits}/{seeds}",
+            flush=True,
+        )
+
+
+def linear_rhythm(multipliers, n_sections, outputs, seed=5):
+    """Blocks A[n], C[n] of a random linear system with these multipliers; an input acts on all."""
+    rng, d = np.random.default_rng(seed), len(multipliers)
+    A = [np.linalg.qr(rng.normal(size=(d, d)))[0] for _ in range(n_sections - 1)]
+    turn = rng.normal(size=(d, d)) + 2 * np.eye(d)
+    rest = np.linalg.multi_dot([np.eye(d), *A[::-1], turn])
+    A.append(turn @ np.diag(multipliers) @ np.linalg.inv(rest))
+    return A, rng.normal(size=(n_sections, outputs, d))
+
+
+def in_loop(model, cycles, gain, rng, noise=0.3):
+    """A record whose input is white, or also answers the outputs; process and output noise."""
+    A, C = model
+    N, d = len(A), len(A[0])
+    x, u, y = rng.normal(size=d), [], []
+    for n in range((cycles + 10) * N):
+        y.append(C[n % N] @ x)
+        u.append([rng.normal() - gain * y[-1][0]])
+        x = A[n % N] @ x + u[-1][0] + 0.5 * rng.normal(size=d)
+    u, y = np.array(u[10 * N :]), np.array(y[10 * N :])
+    y = y + noise * rng.normal(size=y.shape)
+    return hj.Record(u, y, n_sections=N, drift=np.inf)
+
+
+def variability():
+    recording = walking()
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"))
+    print(f"\nWalking: {phase}")
+    for trial, periods in zip(recording.trials, phase.periods, strict=True):
+        print(f"  {trial.name}: {len(periods)} strides of {periods.mean():.3f} s, "
+              f"standard deviation {periods.std(ddof=1):.3f} s")  # fmt: skip
+    for n_sections in (8, 16, 32):
+        data = hj.recordings.section_data(
+            recording, phase, inputs=(), outputs=recording.signals, n_sections=n_sections
+        )
+        for order in (1, 2, 3):
+            found = hj.recordings.natural_multipliers(data, order)
+            print(f"{n_sections} sections: {found}", flush=True)
+
+
+def walking_layout(seeds=40, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
+    """Records as long as the segments, of a system whose multipliers are known."""
+    print(f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} seeds")
+    model = linear_rhythm(multipliers, n_sections, outputs)
+    for noise in (0.0, 0.3, 0.5):
+        rows = []
+        for seed in range(seeds):
+            found = hj.recordings.natural_multipliers(
+                variable(model, STRIDES, noise, seed), len(multipliers)
+            )
+            inside = [a <= multipliers[0] <= b
+                      for a, b in (found.interval()[0], found.plain_interval()[0])]  # fmt: skip
+            rows.append([abs(found.multipliers[0]), abs(found.plain[0]), *inside])
+        mean = np.mean(rows, axis=0)
+        print(
+            f"noise of {noise:.1f} of each output: by instruments {mean[0]:.3f}, held in "
+            f"{100 * mean[2]:.0f} %; least squares {mean[1]:.3f}, held in {100 * mean[3]:.0f} %",
+            flush=True,
+        )
+
+
+def variable(model, strides, noise, seed):
+    """Section data of a linear system that white noise disturbs at every section."""
+    (A, C), rng = model, np.random.default_rng(seed)
+    N, trials = len(A), []
+    for count in strides:
+        x, y = np.zeros(len(A[0])), []
+        for n in range((count + 20) * N):
+            y.append(C[n % N] @ x)
+            x = A[n % N] @ x + rng.normal(size=len(x))
+        y = np.array(y[20 * N :])
+        y += noise * y.std(axis=0) * rng.normal(size=y.shape)
+        t = np.arange(len(y)) / N
+        names = {f"y{i}": column for i, column in enumerate(y.T)}
+        events = {"strike": np.arange(count) * 1.0}
+        trials.append(hj.Recording(t, names, events=events, name=f"trial {len(trials)}"))
+    recording = hj.Recording.join(trials)
+    return hj.recordings.section_data(
+        recording, hj.AtEvent("strike"), inputs=(), outputs=recording.signals, n_sections=N,
+        bandwidth=np.inf,
+    )  # fmt: skip
+
+
+def phase_model(seeds=20):
+    """Coverage of the 95 % bands of phase response curves that are known."""
+    x = np.arange(400) / 400
+    curve = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)
+    t, at = np.arange(0, 4.0005, 1 / 2000), np.arange(10) / 10
+    print(f"\nPhase model, simulated: {seeds} seeds")
+    for label, second, jitter, trials in (
+        ("sines, 3 to 97 Hz", 0.25, 0.05, 30),
+        ("noise up to 100 Hz", 0.25, 0.05, 6),
+        ("sines, 3 to 97 Hz", 0.15, 0.1, 30),
+    ):
+        true = curve - second * np.cos(4 * np.pi * x)
+        held, off, orders = [], [], []
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            force = 20 * np.sin(2 * np.pi * np.linspace(3, 97, trials)[:, None] * t)
+            if "noise" in label:
+                force = np.stack(
+                    [hj.testing.random_force(4, 2000, 100, rms=15, seed=1000 * seed + k)[:, 0]
+                     for k in range(trials)]
+                )  # fmt: skip
+                force = np.pad(force, ((0, 0), (0, 1)), mode="edge")
+            rhythm = (45 + 10 * rng.uniform(size=trials)).tolist()
+            made = hj.testing.simulate_beats(
+                true, force, rate=2000, rhythm=rhythm, jitter=jitter, seed=seed
+            )
+            found = hj.recordings.phase_response(made, hj.AtEvent("beat"), input="u")
+            low, high = found.interval(at)
+            truth = np.interp(at, x, true)
+            held.append((low <= truth) & (truth <= high))
+            off.append(found(at) - truth)
+            orders.append(found.harmonics)
+        print(
+            f"{label}, {trials} trials of 4 s, jitter {jitter:g}: held {100 * np.mean(held):.1f} %"
+            f" of the time; bias up to {np.abs(np.mean(off, axis=0)).max():.3f}, rms error "
+            f"{np.sqrt(np.mean(np.square(off))):.3f}; harmonics {np.bincount(orders)}",
+            flush=True,
+        )
+
+
+def real():
+    for part in (neurons, robots, robot_layout, variability, walking_layout, phase_model):
+        part()

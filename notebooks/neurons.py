@@ -1,0 +1,114 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Spikes under a known current: a phase response curve
+#
+# A neuron of the mouse's globus pallidus fires by itself, about fifty times a second. A sine
+# current of 20 pA was injected, of another frequency in each trial of 10 s (Olivares, Wilson and
+# Goldberg; `data/README.md` has source and license). All that is used is when it fired. The phase
+# runs from 0 at one spike to 1 at the next, $\dot\varphi = w + Z(\varphi)\,I(t)$; Z is the phase
+# response curve.
+
+# %%
+from pathlib import Path
+
+import numpy as np
+
+import hybridjax as hj
+
+
+hj.enable_x64()
+files = [folder / "pacemaker_neurons.npz" for folder in (Path("data"), Path("notebooks/data"))]
+data = np.load(next(path for path in files if path.exists()))
+
+# %% [markdown]
+# ## A recording of events
+#
+# One trial for each frequency; every tenth of them, so that this page is made quickly.
+
+# %%
+time = np.arange(0, 10.0002, 2e-4)
+spikes = np.split(data["cell8_steps"].astype(int), np.cumsum(data["cell8_counts"], dtype=int)[:-1])
+trials = []
+for f in range(5, 101, 10):
+    current = 20 * np.sin(2 * np.pi * f * time)
+    trials.append(
+        hj.Recording(
+            time, {"current": current}, events={"spike": np.cumsum(spikes[f - 1]) / 1e4},
+            units={"current": "pA"}, name=f"{f} Hz",
+        )
+    )  # fmt: skip
+recording = hj.Recording.join(trials)
+phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
+print(phase)
+
+# %% [markdown]
+# The current changes intervals by half. A limit at 1.5 medians would have taken the long ones for
+# missed spikes; limits are where the lengths of the intervals end.
+
+# %%
+figure = hj.plot.phase(phase)
+
+# %% [markdown]
+# ## The curve
+#
+# With what the data cannot tell, in plain words. R2 is the share of the variance of intervals
+# within trials that is forecast in trials, or parts of them, that the curve was not fitted to.
+
+# %%
+found = hj.recordings.phase_response(recording, phase, input="current")
+print(found)
+
+# %%
+figure = hj.plot.phase_response(found)
+panel = figure.ax
+panel.plot(data["published_phase"], data["cell8_published"], color="black", lw=1, label="published")
+panel.errorbar(
+    data["measured_phase"], data["cell8_measured"], data["cell8_measured_error"],
+    fmt=".", ms=3, lw=0.5, color="gray", label="with noise currents",
+)  # fmt: skip
+legend = panel.legend()
+
+# %% [markdown]
+# The published curve is from other stimulation, with noise currents. In the middle of the cycle
+# the two agree; at its ends ours overshoots. What is left of neighboring intervals is correlated,
+# so that one number, the phase, is not all of the neuron's state. The intervals are those of the
+# phase model, which holds only so far.
+#
+# ## Forecasts of the next spike
+#
+# A fifth of each trial is left out at a time. The published curve and a flat one with the same
+# mean have only the rates of the trials to learn.
+
+# %%
+published = np.interp(np.arange(200) / 200, data["published_phase"], data["cell8_published"])
+for name, curve in {"estimated": found, "published": published, "flat": [published.mean()]}.items():
+    forecast = hj.recordings.forecast_intervals(recording, phase, input="current", curve=curve)
+    print(f"{name:10s}", forecast)
+
+# %% [markdown]
+# ## Where the truth is known
+#
+# The same protocol on a phase model with the estimated rate and jitter, and a curve of two
+# harmonics.
+
+# %%
+x = np.arange(400) / 400
+true = 1 - 0.5 * np.cos(2 * np.pi * x) - 0.2 * np.cos(4 * np.pi * x)
+force = np.stack([trial.values[::5, 0] for trial in recording.trials])
+made = hj.testing.simulate_beats(true, force, rate=1000, rhythm=52.0, jitter=found.jitter, seed=1)
+again = hj.recordings.phase_response(made, hj.AtEvent("beat"), input="u")
+low, high = again.interval(x)
+print(again)
+print(f"the band holds the true curve at {100 * np.mean((low <= true) & (true <= high)):.0f} %"
+      " of the phases")  # fmt: skip
