@@ -1,10 +1,12 @@
 """The site: every public name is in its reference, and it needs no other host."""
 
 import ast
+import html
 import re
 import subprocess
 import sys
 from collections import Counter
+from urllib.parse import unquote
 
 import pytest
 
@@ -46,6 +48,20 @@ def test_nothing_is_fetched_from_another_host(site):
         assert not fetched.findall(page.read_text()), page
     for style in site.rglob("*.css"):
         assert not re.findall(r"url\([\"']?(?:https?:)?//|@import", style.read_text()), style
+
+
+def test_links_lead_somewhere(site):
+    """Also those that MkDocs does not look at: in HTML, and in the theme's."""
+    pages = {page: page.read_text() for page in site.rglob("*.html")}
+    known = {page: set(re.findall(r'\sid="([^"]+)"', text)) for page, text in pages.items()}
+    for page, text in pages.items():
+        # (The page of errors has links from the root of the host.)
+        for link in re.findall(r'\s(?:href|src)="([^":]*)"', text) if page.stem != "404" else ():
+            path, _, anchor = unquote(html.unescape(link)).partition("#")
+            target = (page.parent / path).resolve() if path else page
+            target = target / "index.html" if target.is_dir() else target
+            assert target.exists(), (page, link)
+            assert anchor in known.get(target, {anchor}) | {""}, (page, link)
 
 
 def test_equations_are_rendered(site):

@@ -41,10 +41,13 @@ def _pages(path: Path) -> dict[str, str | bytes]:
         parts.append(f"```python\n{source}\n```")
         for output in cell["outputs"]:
             data = output.get("data", {"text/plain": output.get("text")})
-            if "image/png" in data:
+            if "text/html" in data:
+                # (On one line, lest Markdown take part of it for its own.)
+                parts.append("".join(data["text/html"]).replace("\n", "&#10;"))
+            elif "image/png" in data:
                 name = f"{path.stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 parts.append(f"![]({name})")
-            else:
+            elif "text/plain" in data:  # (what a long call said of itself is empty in the end)
                 parts.append(f"```text\n{''.join(data['text/plain'])}\n```")
     return {f"{path.stem}.md": "\n\n".join(parts)} | pictures

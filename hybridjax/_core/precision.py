@@ -55,7 +55,7 @@ def real(x: Any) -> jax.Array:
     made_by_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x))
     if made_by_jax or is_inside_program():
         return jnp.asarray(x, float)
-    with _precision(double=True):  # (No program is compiled for numbers of Python and NumPy.)
+    with jax.enable_x64(True):  # (No program is compiled for numbers of Python and NumPy.)
         return jax.device_put(np.asarray(x, float))
 
 
@@ -66,7 +66,7 @@ def at_precision(double: float, single: float) -> float:
 
 def single_precision() -> contextlib.AbstractContextManager:
     """A context in which this thread computes in 32 bits, with what `single` returns."""
-    return _precision(double=False)
+    return jax.enable_x64(False)
 
 
 def single(tree: Any) -> Any:
@@ -84,12 +84,3 @@ def single(tree: Any) -> Any:
 
 def _is_double() -> bool:
     return jax.config.read("jax_enable_x64")
-
-
-def _precision(double: bool) -> contextlib.AbstractContextManager:
-    """A context in which this thread computes in 64 bits, or in 32."""
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(double)
-    from jax.experimental import disable_x64, enable_x64  # before JAX 0.8
-
-    return enable_x64() if double else disable_x64()

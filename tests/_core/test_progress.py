@@ -1,5 +1,7 @@
 """What long calls say while they run, in a terminal; in Jupyter see tests/plot/test_jupyter.py."""
 
+import io
+import sys
 import time
 
 import jax.numpy as jnp
@@ -36,6 +38,24 @@ def test_nothing_is_said_where_nobody_watches(capsys, monkeypatch):
     with progress.working("call"):
         time.sleep(0.05)
     assert capsys.readouterr().err == ""
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_is_watched_and_a_log_is_not(monkeypatch):
+    """Without a word from the user, and the line is wiped in the end."""
+    monkeypatch.setattr(progress, "_DELAY", 0.0)
+    monkeypatch.setattr(progress, "_PERIOD", 0.01)
+    terminal, log = Terminal(), io.StringIO()
+    for file in (terminal, log):
+        monkeypatch.setattr(sys, "stderr", file)
+        with progress.working("call"):
+            time.sleep(0.2)
+    assert "call, 00:00" in terminal.getvalue() and log.getvalue() == ""
+    assert terminal.getvalue().split("\r")[-2].strip() == ""
 
 
 def test_the_outermost_call_has_the_line_and_parts_say_what_they_do(capsys, shown):

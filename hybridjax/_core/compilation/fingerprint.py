@@ -127,9 +127,20 @@ def _processor() -> list[str]:
 
 def _has_rules(jaxpr: jex.Jaxpr) -> bool:
     return any(
-        eqn.primitive.name in _RULES or any(map(_has_rules, jex.jaxprs_in_params(eqn.params)))
+        eqn.primitive.name in _RULES or any(map(_has_rules, _jaxprs(eqn.params)))
         for eqn in jaxpr.eqns
     )
+
+
+def _jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
+    """Those among the parameters of an equation, or in tuples of these. (`jax.extend.core` has a
+    function for it since JAX 0.10.)"""
+    values = [x for v in params.values() for x in (v if isinstance(v, tuple) else (v,))]
+    return [
+        x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x
+        for x in values
+        if isinstance(x, jex.Jaxpr | jex.ClosedJaxpr)
+    ]
 
 
 def _described(x: Any) -> Iterator[bytes]:

@@ -13,7 +13,8 @@ _ROWS = 12
 
 _STYLE = (
     "<style>.hybridjax{font-size:13px;line-height:1.4}"
-    ".hybridjax>div{display:flex;flex-wrap:wrap;gap:4px 24px;align-items:flex-start}"
+    ".hybridjax>div{display:flex;flex-wrap:wrap;gap:4px 24px;align-items:flex-start;"
+    "overflow:auto}"
     ".hybridjax table{border-collapse:collapse;margin:4px 0;width:auto;"
     "color:inherit;font-size:inherit}"
     ".hybridjax th,.hybridjax td{padding:1px 10px 1px 0;border:0;text-align:left;"
@@ -38,7 +39,7 @@ def card(kind: str, of: str, *parts: str) -> str:
 def facts(pairs: Mapping[str, str]) -> str:
     """What is known, by what it is called."""
     rows = (f"<tr><th>{escape(x)}</th><td>{escape(text)}</td></tr>" for x, text in pairs.items())
-    return f"<table>{''.join(rows)}</table>"
+    return f'<table class="plain">{"".join(rows)}</table>'
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -47,7 +48,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
     if len(rows) > _ROWS:
         lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
-    return f"<table>{''.join(lines)}</table>"
+    return f'<table class="plain">{"".join(lines)}</table>'
 
 
 def text(lines: str) -> str:
