@@ -5,11 +5,15 @@ time, the n states and the inputs: (rows, 2 + n + nu, L). Where only `some` lane
 others are copies of one of these; none may stand for all.
 """
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.lanes.per_lane import by_lane
 from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
@@ -20,6 +24,9 @@ from .target import AbstractLevels
 # Lanes of functions that are called for single points (in landings) as well as for all moves of a
 # tape, and of one that is called for hundreds of points. Twice as many: hardly a difference.
 _POINTS, _MANY_POINTS = 4, 16
+# From this number of lanes on, the program for many points is worth its compilation. Twice as many:
+# so are plans of experiments with twice as many sections.
+_MANY_LANES = 64
 
 
 def field(
@@ -31,7 +38,7 @@ def field(
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "n c L"]:
     """The field of chart a, and its derivatives."""
-    return s.kernel(_field, a, lanes=_POINTS)(t, q, u, some=some)
+    return s.kernel(_field, _expanded, a, lanes=_POINTS)(t, q, u, some=some)
 
 
 def step(
@@ -44,7 +51,7 @@ def step(
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(*s.kernel(_step, a)(t, q, u, h, some=some))
+    return Step(*s.kernel(_slope, _stepped, a)(t, q, u, h, some=some))
 
 
 def watched(
@@ -58,7 +65,9 @@ def watched(
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
-    return s.kernel(_watched, a, trees=(levels,))(t, q, u, index.astype(np.int32), some=some)
+    lanes = 1 if q.shape[-1] < _MANY_LANES else _MANY_POINTS
+    rows = s.kernel(_watched, _expanded, a, trees=(levels,), lanes=lanes)
+    return rows(t, q, u, index.astype(np.int32), some=some)
 
 
 def reset(
@@ -70,7 +79,7 @@ def reset(
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "m c L"]:
     """The state after transition g, and its derivatives."""
-    return s.kernel(_reset, g)(t, q, u, some=some)
+    return s.kernel(_reset, _expanded, g)(t, q, u, some=some)
 
 
 def enabled(
@@ -81,7 +90,7 @@ def enabled(
     u: Float[np.ndarray, "nu #L"],
 ) -> Bool[np.ndarray, " L"]:
     """Whether the predicate of transition g holds."""
-    return s.kernel(_enabled, g)(t, q, u)
+    return s.kernel(_enabled, by_lane, g)(t, q, u)
 
 
 def outputs(
@@ -93,7 +102,7 @@ def outputs(
     u: Float[np.ndarray, "nu #L"],
 ) -> Float[np.ndarray, "ny c L"]:
     """Outputs in chart a, and their derivatives."""
-    return s.kernel(_outputs, a, trees=(items,), lanes=_POINTS)(t, q, u)
+    return s.kernel(_outputs, _expanded, a, trees=(items,), lanes=_POINTS)(t, q, u)
 
 
 def values(
@@ -104,7 +113,7 @@ def values(
     q: Float[np.ndarray, "n L"],
 ) -> Float[np.ndarray, "ny L"]:
     """Outputs in chart a without input, without derivatives."""
-    return s.kernel(_values, a, trees=(items,), lanes=_MANY_POINTS)(t, q)
+    return s.kernel(_values, by_lane, a, trees=(items,), lanes=_MANY_POINTS)(t, q)
 
 
 def levels(
@@ -116,68 +125,83 @@ def levels(
     q: Float[np.ndarray, "n L"],
 ) -> Float[np.ndarray, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    return s.kernel(_levels, a, n_sections, trees=(levels,), lanes=_MANY_POINTS)(t, q)
+    form = _AllSections(n_sections)
+    of_all = s.kernel(_level, form, a, trees=(levels,), lanes=_MANY_POINTS)
+    return of_all(t, q, np.zeros(1, np.int32))
 
 
 def _field(a: int, system: HybridSystem, t, q, u):
-    one = lambda s, t, q, u: _expand(lambda t, q, u: s.field(a, t, q, u), t, q, u)  # noqa: E731
-    return Structure(system).by_lane(one)(t, q, u)
+    return Structure(system).field(a, t, q, u)
 
 
-def _step(a: int, system: HybridSystem, t, q, u, h):
-    field = Structure(system).by_lane(lambda s, t, q, u: s.field(a, t, q, u))
-    return jnp.stack(rk_step(lambda t, q: field(t, q, u), t, q, h))
+def _slope(a: int, system: HybridSystem, t, q, u, h):
+    return Structure(system).field(a, t, q, u)
 
 
-def _watched(a: int, system: HybridSystem, levels: AbstractLevels | None, t, q, u, index):
-    def one(s, levels, t, q, u, i):
-        def rows(t, q, u):
-            level = levels is not None and levels.present(s, a)
-            guards = [s.guard(g, t, q, u) for g in s.guards(a)]
-            return jnp.stack(guards + ([levels.level(s, a, i, t, q)] if level else []))
-
-        return _expand(rows, t, q, u)
-
-    return Structure(system).by_lane(one, levels)(t, q, u, index)
+def _watched(a: int, system: HybridSystem, levels: AbstractLevels | None, t, q, u, i):
+    s = Structure(system)
+    level = levels is not None and levels.present(s, a)
+    guards = [s.guard(g, t, q, u) for g in s.guards(a)]
+    return jnp.stack(guards + ([levels.level(s, a, i, t, q)] if level else []))
 
 
 def _reset(g: int, system: HybridSystem, t, q, u):
-    one = lambda s, t, q, u: _expand(lambda t, q, u: s.reset(g, t, q, u), t, q, u)  # noqa: E731
-    return Structure(system).by_lane(one)(t, q, u)
+    return Structure(system).reset(g, t, q, u)
 
 
 def _enabled(g: int, system: HybridSystem, t, q, u):
-    return Structure(system).by_lane(lambda s, t, q, u: s.enabled(g, t, q, u))(t, q, u)
+    return Structure(system).enabled(g, t, q, u)
 
 
 def _outputs(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q, u):
-    def one(s, items, t, q, u):
-        z = s.resolve_outputs(items)
-        return _expand(lambda t, q, u: z(a, t, q, u), t, q, u)
-
-    return Structure(system).by_lane(one, items)(t, q, u)
+    return Structure(system).resolve_outputs(items)(a, t, q, u)
 
 
 def _values(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q):
-    one = lambda s, items, t, q: s.resolve_outputs(items)(a, t, q, jnp.zeros(s.nu))  # noqa: E731
-    return Structure(system).by_lane(one, items)(t, q)
+    s = Structure(system)
+    return s.resolve_outputs(items)(a, t, q, jnp.zeros(s.nu))
 
 
-def _levels(a: int, n_sections: int, system: HybridSystem, levels: AbstractLevels, t, q):
-    def one(s, levels, t, q):
-        f = s.field(a, t, q, jnp.zeros(s.nu))
-        along = lambda i: jax.jvp(  # noqa: E731
-            lambda t, q: levels.level(s, a, i, t, q), (t, q), (jnp.ones_like(t), f)
-        )
-        return jnp.stack(jax.vmap(along)(jnp.arange(n_sections)), axis=1)
-
-    return Structure(system).by_lane(one, levels)(t, q)
+def _level(a: int, system: HybridSystem, levels: AbstractLevels, t, q, i):
+    """A level, and the field."""
+    s = Structure(system)
+    return jnp.append(s.field(a, t, q, jnp.zeros(s.nu)), levels.level(s, a, i, t, q))
 
 
-def _expand(function, t, q, u):
-    """A vector function of (t, q, u) and its derivatives, as columns of one array."""
-    n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
-    split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
-    push = lambda dx: jax.jvp(function, (t, q, u), split(dx))  # noqa: E731
-    value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
-    return jnp.concatenate([value[:, None], columns], axis=1)
+def _expanded(function: Callable, *trees: Any) -> Callable:
+    """Lanes of a vector function of (t, q, u) and its derivatives, as columns of one array."""
+
+    def one(*x):
+        own, (t, q, u, *others) = x[: len(trees)], x[len(trees) :]
+        n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
+        at = lambda t, q, u: function(*own, t, q, u, *others)  # noqa: E731
+        split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
+        push = lambda dx: jax.jvp(at, (t, q, u), split(dx))  # noqa: E731
+        value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
+        return jnp.concatenate([value[:, None], columns], axis=1)
+
+    return by_lane(one, *trees)
+
+
+def _stepped(slope: Callable, *trees: Any) -> Callable:
+    """Lanes of a Runge-Kutta step over h."""
+    field = by_lane(slope, *trees)
+    return lambda t, q, u, h: jnp.stack(rk_step(lambda t, q: field(t, q, u, h), t, q, h))
+
+
+class _AllSections(NamedTuple):
+    """Lanes of the levels of all sections, and of their rates."""
+
+    n_sections: int
+
+    def __call__(self, level: Callable, *trees: Any) -> Callable:
+        def one(*x):
+            own, (t, q, i) = x[: len(trees)], x[len(trees) :]
+            f = level(*own, t, q, i)[:-1]
+            along = lambda i: jax.jvp(  # noqa: E731
+                lambda t, q: level(*own, t, q, i)[-1], (t, q), (jnp.ones_like(t), f)
+            )
+            every = jnp.arange(self.n_sections, dtype=i.dtype)
+            return jnp.stack(jax.vmap(along)(every), axis=1)
+
+        return by_lane(one, *trees)

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -95,7 +96,7 @@ class Campaign:
             y,
             n_sections=self.placed.n_sections,
             periods=self.inputs.periods,
-            inputs=self.placed.structure().inputs,
+            inputs=self.outputs.structure.inputs,
             outputs=self.outputs.names,
             result=result,
             simulated=Simulated(failed_at, error, self._events(log, cycle_log)),
@@ -110,7 +111,8 @@ class Campaign:
         base = self._cycle_outputs()
 
         def arguments(some):
-            x, held = from_host((start[:, some], u[some]))
+            # (Nobody changes them before the program is done, so they may share memory.)
+            x, held = jax.device_put((start[:, some], u[some]))
             return self.course, stepping.plan, x, held, stepping.settings, capacity
 
         S, n, _ = u.shape
@@ -162,7 +164,7 @@ class Campaign:
             return None
         N, period = self.placed.n_sections, np.asarray(self.placed.cycle.period)
         own, cycle = (in_order(x, N, float(period)) for x in (log, cycle_log))
-        names = tuple(t.name for t in self.placed.structure().transitions)
+        names = tuple(t.name for t in self.outputs.structure.transitions)
         return EventTimes(*own, cycle.time[0], cycle.event[0], period, n_sections=N, names=names)
 
 
@@ -179,7 +181,7 @@ def prepare(
     `chunk`: how many of them are run together; by default all.
     """
     placed = as_placed(cycle, sections)
-    z = placed.structure().resolve_outputs(outputs)
+    z = _resolved(placed, outputs)
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
@@ -195,7 +197,7 @@ def prepare(
     execution = divide(together, execution)
     samples = inputs.cycles * N
     large = len(inputs) * samples > _LARGE
-    own = _course(placed, outputs, execution)
+    own = _course(placed, z, execution)
     single = execution.precision == "single"
     stepping = (plan_single if single else plan_flow)(placed, accuracy)
     if start == "cycle":
@@ -234,24 +236,31 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
         )
 
 
-# States of the cycle at its sections, by their names.
-_observed = Memory()
-_courses = Memory()
+# States of the cycle at its sections, by their names; outputs by what was asked for; courses by
+# outputs.
+_observed, _outputs, _courses = Memory(), Memory(), Memory()
 
 
-def _course(
-    placed: PlacedSections, outputs: Sequence[str | Output], execution: Execution
-) -> Course:
-    """The course in the precision that is asked for; closed, if that is possible; once for the
-    same sections and outputs."""
+def _resolved(placed: PlacedSections, outputs: Sequence[str | Output]) -> Outputs:
+    """Outputs at the sections; the same for the same sections and outputs."""
     names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
 
     def make():
+        # (Together with what is known by its `id`, which thereby keeps it.)
+        return placed.structure().resolve_outputs(outputs), outputs
+
+    return _outputs.recall(placed, names, make)[0]
+
+
+def _course(placed: PlacedSections, outputs: Outputs, execution: Execution) -> Course:
+    """The course in the precision that is asked for; closed, if that is possible; once for the
+    same sections and outputs."""
+
+    def make():
         with precision_of(execution) as convert:
-            items = placed.structure().resolve_outputs(outputs).items
-            own = convert(course(placed, items))
+            own = convert(course(placed, outputs.items))
             with contextlib.suppress(IndescribableError):
                 own = closed(own)
-            return own, outputs  # which keep their `id` as long as they live
+            return own, outputs
 
-    return _courses.recall(placed, (names, execution.precision), make)[0]
+    return _courses.recall(placed, (id(outputs), execution.precision), make)[0]
