@@ -6,11 +6,16 @@ Seconds of the wall's clock after the import, for each call in turn: `find_limit
 compiled thoroughly. A third process changes a parameter and counts
 what is traced or compiled again, and looks for host callbacks in all programs.
 
+`own` is the hopper again, of classes that are defined in `__main__`, as in a notebook, on kinematic
+sections; `bar` is the bar, with its four charts, on both families (`times_hopper`: as multiples of
+the hopper's).
+
 The same in seconds of the processor (`cpu`), and as multiples of a yardstick that is measured
 beside them, `diffeqsolve.cpu`: the first call, in a fresh process, of `diffrax.diffeqsolve` for the
 hopper's flight up to its touchdown.
 """
 
+import inspect
 import json
 import pathlib
 import re
@@ -26,35 +31,54 @@ CORES = 2
 
 def run(show, options) -> None:
     from .children import call
-    from .problems import HOPPER
+    from .problems import ALL, HOPPER
 
     yardstick = call("compile", "diffeqsolve")
     show("diffeqsolve.cpu", yardstick)
+    seconds = {}
+
+    def calls(label: str, state: str, *job: str, cache: str) -> None:
+        for name, value in call("compile", *job, HYBRIDJAX_CACHE=cache).items():
+            show(f"{label}.{state}.{name}", value)
+            if not name.endswith(".cpu"):
+                continue
+            what = name.removesuffix(".cpu")
+            show(f"{label}.{state}.{what}.times_diffeqsolve", value / yardstick)
+            seconds[label, state, what] = value
+            if label.startswith("bar."):
+                hopper = seconds[label.removeprefix("bar."), state, what]
+                show(f"{label}.{state}.{what}.times_hopper", value / hopper)
+
     for _, family in HOPPER[:1] if options.quick else HOPPER:
         with tempfile.TemporaryDirectory() as cache:
             for state in ("cold", "cached", "later"):
                 if state == "later":
-                    call("compile", family, "thoroughly", HYBRIDJAX_CACHE=cache)
-                for name, value in call("compile", family, HYBRIDJAX_CACHE=cache).items():
-                    show(f"{family}.{state}.{name}", value)
-                    if name.endswith(".cpu"):
-                        multiple = f"{name.removesuffix('.cpu')}.times_diffeqsolve"
-                        show(f"{family}.{state}.{multiple}", value / yardstick)
+                    call("compile", "hopper", family, "thoroughly", HYBRIDJAX_CACHE=cache)
+                calls(family, state, "hopper", family, cache=cache)
             folder = str(pathlib.Path(cache, "modules"))
-            found = call("compile", family, folder, HYBRIDJAX_CACHE=cache)
+            found = call("compile", "hopper", family, folder, HYBRIDJAX_CACHE=cache)
         for name, value in found.items():
             show(f"{family}.{name}", value)
+    others = [("own", "own", "kinematic"), *((f"bar.{x}", "bar", x) for m, x in ALL if m == "bar")]
+    for label, *job in [] if options.quick else others:
+        with tempfile.TemporaryDirectory() as cache:
+            for state in ("cold", "cached"):
+                calls(label, state, *job, cache=cache)
 
 
-def first_calls(family: str, repetition: int = 0):
-    """The calls with the seconds that each takes, for a hopper with its own stiffness."""
+def first_calls(model: str, family: str, repetition: int = 0):
+    """The calls with the seconds that each takes, for a hopper with its own stiffness, or a bar."""
     import hybridjax as hj
 
     from .problems import OUTPUTS, sections
 
     seconds = {}
-    hopper = hj.models.VerticalHopper(k=10 + 1e-3 * repetition)
-    own, outputs, design = sections("hopper", family), OUTPUTS["hopper"], hj.paper_design()
+    if model == "bar":
+        system = hj.models.TwoLeggedBar()
+    else:
+        make = hj.models.VerticalHopper if model == "hopper" else defined_here()
+        system, model = make(k=10 + 1e-3 * repetition), "hopper"
+    own, outputs, design = sections(model, family), OUTPUTS[model], hj.paper_design()
 
     def timed(name, work):
         begin, processor = time.perf_counter(), time.process_time()
@@ -63,11 +87,20 @@ def first_calls(family: str, repetition: int = 0):
         seconds[f"{name}.cpu"] = time.process_time() - processor
         return result
 
-    cycle = timed("find_limit_cycle", lambda: hj.find_limit_cycle(hopper))
+    cycle = timed("find_limit_cycle", lambda: hj.find_limit_cycle(system))
     timed("linearize", lambda: hj.linearize(cycle, own, outputs))
     data = timed("run_experiments", lambda: hj.run_experiments(cycle, own, design, outputs))
     assert data.ok.all()
     return seconds
+
+
+def defined_here() -> type:
+    """The class of the hopper as if it had been written in this process's main module."""
+    from hybridjax.models import hopper
+
+    main = sys.modules["__main__"].__dict__
+    exec(inspect.getsource(hopper).replace("from ..", "from hybridjax."), main)
+    return main["VerticalHopper"]
 
 
 def diffeqsolve() -> float:
@@ -96,7 +129,7 @@ def diffeqsolve() -> float:
     return time.process_time() - begin
 
 
-def main(family: str, folder: str | None) -> None:
+def main(model: str, family: str, folder: str | None) -> None:
     cores = one_thread.unpin(CORES)
     import jax
     import jax.monitoring
@@ -109,11 +142,11 @@ def main(family: str, folder: str | None) -> None:
     from . import problems  # noqa: F401  (imports count as such)
 
     if folder is None:
-        print(json.dumps({"cores": cores, **first_calls(family)}))
+        print(json.dumps({"cores": cores, **first_calls(model, family)}))
         return
     if folder == "thoroughly":
         campaign._LARGE = 0  # more is not needed for a job to wait
-        print(json.dumps(first_calls(family)))
+        print(json.dumps(first_calls(model, family)))
         return
     pathlib.Path(folder).mkdir()
     jax.config.update("jax_dump_ir_to", folder)
@@ -124,11 +157,11 @@ def main(family: str, folder: str | None) -> None:
             if name in event:
                 functions.append(fun_name)
 
-    first_calls(family)
+    first_calls(model, family)
     jax.monitoring.register_event_duration_secs_listener(listen)
-    first_calls(family)
+    first_calls(model, family)
     same = {name: len(functions) for name, functions in seen.items()}
-    again = first_calls(family, 1)
+    again = first_calls(model, family, 1)
     texts = [x.read_text() for x in pathlib.Path(folder).iterdir() if x.is_file()]
     callbacks = [x for x in texts if re.search(r"custom_call.*callback", x)]
     found = {
@@ -149,4 +182,4 @@ if __name__ == "__main__":
     if sys.argv[1] == "diffeqsolve":
         print(json.dumps(diffeqsolve()))
     else:
-        main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None)
+        main(*sys.argv[1:3], sys.argv[3] if len(sys.argv) > 3 else None)

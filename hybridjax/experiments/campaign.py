@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -97,7 +98,7 @@ class Campaign:
             y,
             n_sections=self.placed.n_sections,
             periods=self.inputs.periods,
-            inputs=self.placed.structure().inputs,
+            inputs=self.outputs.structure.inputs,
             outputs=self.outputs.names,
             result=result,
             simulated=Simulated(failed_at, error, self._events(log, cycle_log)),
@@ -148,7 +149,8 @@ class Campaign:
         base = self.cycle_outputs()
 
         def arguments(some):
-            x, held = from_host((start[:, some], u[some]))
+            # (Nobody changes them before the program is done, so they may share memory.)
+            x, held = jax.device_put((start[:, some], u[some]))
             return self.course, stepping.plan, x, held, stepping.settings, capacity
 
         S, n, _ = u.shape
@@ -206,7 +208,7 @@ class Campaign:
             return None
         N, period = self.placed.n_sections, np.asarray(self.placed.cycle.period)
         own, cycle = (in_order(x, N, float(period)) for x in (log, cycle_log))
-        names = tuple(t.name for t in self.placed.structure().transitions)
+        names = tuple(t.name for t in self.outputs.structure.transitions)
         return EventTimes(*own, cycle.time[0], cycle.event[0], period, n_sections=N, names=names)
 
 
@@ -225,7 +227,7 @@ def prepare(
     are run by the program that is compiled thoroughly, whatever there is.
     """
     placed = as_placed(cycle, sections)
-    placed.structure().resolve_outputs(outputs)
+    _resolved(placed, outputs)
     _require_return(cycle, placed)
     start, discard, accuracy = options.start, options.discard, options.accuracy
     execution = Execution() if options.execution is None else options.execution
@@ -265,7 +267,8 @@ def _compose(
     large: bool,
 ) -> Campaign:
     """A campaign from what another process can be told."""
-    own = _course(placed, outputs, execution)
+    z = _resolved(placed, outputs)
+    own = _course(placed, z, execution)
     begin: Start = CycleStart(placed)
     if model is not None:
         begin = PeriodicStart(placed, model, inputs.periods)
@@ -274,8 +277,8 @@ def _compose(
         aside = dataclasses.replace(own, outputs=())
         begin = SteadyStart(begin, aside, stepping, execution, Stored(settle_batch, large))
     return Campaign(
-        placed, own, placed.structure().resolve_outputs(outputs), inputs, begin, process_noise,
-        stepping, Stored(flow_batch, large), record_events, execution,
+        placed, own, z, inputs, begin, process_noise, stepping, Stored(flow_batch, large),
+        record_events, execution,
     )  # fmt: skip
 
 
@@ -302,24 +305,31 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
         )
 
 
-# States of the cycle at its sections, by their names.
-_observed = Memory()
-_courses = Memory()
+# States of the cycle at its sections, by their names; outputs by what was asked for; courses by
+# outputs.
+_observed, _outputs, _courses = Memory(), Memory(), Memory()
 
 
-def _course(
-    placed: PlacedSections, outputs: Sequence[str | Output], execution: Execution
-) -> Course:
-    """The course in the precision that is asked for; closed, if that is possible; once for the
-    same sections and outputs."""
+def _resolved(placed: PlacedSections, outputs: Sequence[str | Output]) -> Outputs:
+    """Outputs at the sections; the same for the same sections and outputs."""
     names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
 
     def make():
+        # (Together with what is known by its `id`, which thereby keeps it.)
+        return placed.structure().resolve_outputs(outputs), outputs
+
+    return _outputs.recall(placed, names, make)[0]
+
+
+def _course(placed: PlacedSections, outputs: Outputs, execution: Execution) -> Course:
+    """The course in the precision that is asked for; closed, if that is possible; once for the
+    same sections and outputs."""
+
+    def make():
         with precision_of(execution) as convert:
-            items = placed.structure().resolve_outputs(outputs).items
-            own = convert(course(placed, items))
+            own = convert(course(placed, outputs.items))
             with contextlib.suppress(IndescribableError):
                 own = closed(own)
-            return own, outputs  # which keep their `id` as long as they live
+            return own, outputs
 
-    return _courses.recall(placed, (names, execution.precision), make)[0]
+    return _courses.recall(placed, (id(outputs), execution.precision), make)[0]

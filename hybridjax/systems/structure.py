@@ -77,14 +77,19 @@ class Structure:
         )
 
     def kernel(
-        self, function: Callable, *static: Hashable, trees: tuple = (), lanes: int = 1
+        self,
+        function: Callable,
+        form: Callable,
+        *static: Hashable,
+        trees: tuple = (),
+        lanes: int = 1,
     ) -> Callable:
-        """`function(*static, system, *trees, *arguments)` for arrays of the host, compiled (see
-        `_core/compilation/kernel.py`)."""
-        name = function, static
+        """`function(*static, system, *trees, *point)` in this form for arrays of the host, compiled
+        (see `_core/compilation/kernel.py`)."""
+        name = function, form, static, lanes
         known = self._made.get(name)
         if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
-            known = kernel(function, static, (self.source, *trees), lanes), trees
+            known = kernel(function, form, static, (self.source, *trees), lanes), trees
             self._made[name] = known
         return known[0]
 

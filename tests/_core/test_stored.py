@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybridjax._core.compilation import compilation_cache, fingerprint, stored, thorough
+from hybridjax._core.compilation import compilation_cache, fingerprint, kept, stored, thorough
 from hybridjax._core.compilation.portable import Portable, build, trace
 from hybridjax._core.compilation.program_store import ProgramStore
 from hybridjax._core.compilation.stored import Stored
@@ -204,13 +204,14 @@ def test_threads_make_a_program_once(made):
 
 def test_a_forked_process_shares_no_lock_and_no_folder(monkeypatch):
     monkeypatch.setattr(compilation_cache, "_folder", None)
-    before = stored._store().folder
+    before = kept.store().folder
     stored._programs["key"] = stored._Known("key")
-    stored._one_by_one.acquire()
+    kept.one_by_one.acquire()
     stored._forget()
-    assert not stored._programs and stored._one_by_one.acquire(timeout=0)
-    stored._one_by_one.release()
-    assert stored._store().folder != before
+    kept._forget()
+    assert not stored._programs and kept.one_by_one.acquire(timeout=0)
+    kept.one_by_one.release()
+    assert kept.store().folder != before
 
 
 PLAINLY = {
@@ -241,3 +242,16 @@ def test_what_cannot_be_kept_is_computed_all_the_same(made, way, large):
 def test_errors_of_the_function_come_through():
     with pytest.raises(ValueError, match="not the store's fault"):
         Stored(fails, large=False)(X)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_transformations_go_through(made, large):
+    job = Stored(twice, large)
+    double = lambda x: job(x, Y, 3)["a"].x  # noqa: E731
+    expected = 2 * np.eye(3)
+    np.testing.assert_array_equal(jax.jacfwd(double)(X), expected)
+    np.testing.assert_array_equal(jax.jit(jax.jacrev(double))(X), expected)
+    np.testing.assert_array_equal(jax.vmap(double)(jnp.eye(3)), expected)
+    square = lambda x: jnp.sum(double(x) ** 2)  # noqa: E731
+    np.testing.assert_array_equal(jax.hessian(square)(X), 4 * expected)
+    assert not made

@@ -78,8 +78,8 @@ def host_first(function: Callable) -> Callable:
     def call(*arguments):
         if not on_cpu() or is_traced(arguments) or is_inside_program():
             return compiled(*arguments)
-        kind, begin = _kind(arguments), time.thread_time()
-        left = _WORTH_COMPILING - spent[kind]
+        what, begin = kind(arguments), time.thread_time()
+        left = _WORTH_COMPILING - spent[what]
         if left <= 0:
             return compiled(*arguments)
         try:
@@ -88,7 +88,7 @@ def host_first(function: Callable) -> Callable:
         except OutOfTimeError:
             return compiled(*arguments)
         finally:
-            spent[kind] += time.thread_time() - begin
+            spent[what] += time.thread_time() - begin
 
     return call
 
@@ -101,7 +101,7 @@ def at_ease() -> contextlib.AbstractContextManager:
     return np.errstate(all="ignore")
 
 
-def _kind(arguments) -> tuple:
+def kind(arguments) -> tuple:
     """What a program is compiled for: all but the values of arrays."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     array = lambda x: isinstance(x, jax.Array | np.ndarray | np.generic)  # noqa: E731

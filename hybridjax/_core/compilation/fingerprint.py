@@ -96,13 +96,21 @@ def digest(*things: Any) -> str:
 def surroundings() -> str:
     """A digest of what programs depend on beside what they are made of: the source of this package,
     versions, the processor, and settings."""
-    values = {
-        name: getattr(jax.config, name, None)
-        for name in jax.config.values
-        if not any(word in name for word in _ASIDE)
-    }
-    settings = sorted((name, repr(value)) for name, value in values.items())
-    return digest(_installed(), settings, os.environ.get("XLA_FLAGS", ""), rewrite.is_enabled())
+    names = _settings(len(jax.config.values))
+    values = repr([getattr(jax.config, name, None) for name in names])
+    flags = os.environ.get("XLA_FLAGS", "")
+    return _surroundings(_installed(), names, values, flags, rewrite.is_enabled())
+
+
+@ft.lru_cache(64)
+def _surroundings(*words: Any) -> str:
+    return digest(*words)
+
+
+@ft.lru_cache(64)
+def _settings(count: int) -> tuple[str, ...]:
+    """The names of JAX's settings, of which there are so many."""
+    return tuple(sorted(x for x in jax.config.values if not any(word in x for word in _ASIDE)))
 
 
 @ft.cache

@@ -107,16 +107,18 @@ def build(program: Portable, options: dict[str, Any], kept: bool) -> Executable:
     # What was loaded from JAX's own cache on disk cannot be written once more (it would not run):
     # no program there has this name.
     run.__name__ = f"program_{uuid.uuid4().hex}" if kept else "program"
-    lowered = jax.jit(run).lower(*shapes)
-    _forget_origin(lowered)
-    return Executable(lowered.compile(compiler_options=options), program.structure)
+    return compiled(jax.jit(run).lower(*shapes), options, program.structure)
 
 
-def _forget_origin(lowered: jax.stages.Lowered) -> None:
-    """Leave out where in the source its operations come from: two thirds of what is written."""
+def compiled(lowered: jax.stages.Lowered, options: dict[str, Any], structure: Any) -> Executable:
+    """The program of a flat list of arrays, whose results have this structure.
+
+    It does not say where in the source its operations come from: that would be half of the file.
+    """
     module = lowered.compiler_ir()
     with module.context:
         PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
+    return Executable(lowered.compile(compiler_options=options), structure)
 
 
 def _types(arrays) -> list[tuple[tuple[int, ...], str]]:

@@ -17,6 +17,9 @@ from ..files.writing import temporary_name
 
 
 _MAGIC = b"hybridjax program 1\n"
+# Programs that are smaller than this part of what there is room for are written without a look at
+# all others. Twice as much: half as many looks, and the folder may be larger for longer.
+_LARGE = 2.0**-12
 _log = logging.getLogger(__name__)
 
 
@@ -53,7 +56,8 @@ class ProgramStore:
         temporary = self.folder / temporary_name()
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._make_room(len(data))
+            if len(data) >= _LARGE * limits.PROGRAMS:
+                self._make_room(len(data))
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             with open(os.open(temporary, flags, 0o600), "wb") as file:
                 file.write(_MAGIC + _checksum(name, data) + data)

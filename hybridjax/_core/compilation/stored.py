@@ -5,42 +5,34 @@ A program is known by a digest of all that it is made of (`fingerprint.py`). Wit
 without tracing anything.
 """
 
-import atexit
 import contextlib
 import functools as ft
-import logging
 import math
 import os
-import pathlib
-import shutil
 import subprocess
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 
-from ..device import on_cpu
 from ..executor import Array
 from ..progress import say_compiling
 from ..tracing import is_inside_program, is_traced
-from . import compilation_cache, thorough
-from .compile import compiler_options, quick_jit
+from . import compilation_cache, kept, thorough
+from .compile import compiler_options, kind, quick_jit
 from .fingerprint import IndescribableError, digest, surroundings
 from .garbage_collector import uncollected
-from .loader_messages import silence
 from .portable import Executable, Portable, build, trace
-from .program_store import ProgramStore
 
 
 # Seconds that are spent in a program before it is compiled thoroughly, beside what goes on. Twice
 # as much: repeated calls stay slow for twice as long, and fewer processes are started in vain.
 _WORTH_A_PROCESS = 0.5
-
-_log = logging.getLogger(__name__)
+# Digests that are kept. Twice as many: twice as many kinds of jobs can be taken turns with.
+_KEYS = 256
 
 
 class Stored:
@@ -56,7 +48,7 @@ class Stored:
         self._chosen: dict[str, Executable] = {}
 
     def __call__(self, *arguments: Any) -> Any:
-        if is_traced(arguments) or is_inside_program() or not _is_simple():
+        if is_traced(arguments) or is_inside_program() or not kept.is_simple():
             return self._plain(arguments)
         arrays, rest = eqx.partition(arguments, eqx.is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
@@ -65,7 +57,7 @@ class Stored:
             return self._function(*eqx.combine(structure.unflatten(leaves), rest))
 
         try:
-            key = digest(self._function, surroundings(), arguments)
+            key = self._key(arguments)
             known = _programs.setdefault(key, _Known(key))
             with known.lock, uncollected:
                 if key not in self._chosen:
@@ -74,9 +66,19 @@ class Stored:
             return self._plain(arguments)
         return known.run(self._chosen[key], leaves)
 
+    def _key(self, arguments) -> str:
+        """What the program is known by."""
+        about = surroundings()
+        name = self._function, about, kind(arguments)
+        if name not in _keys:
+            if len(_keys) >= _KEYS:
+                _keys.clear()
+            _keys[name] = digest(self._function, about, arguments)
+        return _keys[name]
+
     def _plain(self, arguments):
         program = _plain_program(self._function, self.large)
-        with _one_by_one, uncollected:  # two threads would both compile it
+        with kept.one_by_one, uncollected:  # two threads would both compile it
             program.lower(*arguments).compile()
         return program(*arguments)
 
@@ -116,30 +118,26 @@ class _Known:
     def _find(self, tier: str) -> Executable | None:
         """The program, if it is in memory or on disk."""
         if tier not in self._programs:
-            data = _store().read(self._name(tier))
-            try:
-                if data is not None:
-                    with silence():
-                        self._programs[tier] = Executable.from_bytes(data)
-            except Exception as error:  # whatever JAX raises for programs of another XLA
-                _log.debug("a program on disk is not used: %s", error)
+            found = kept.find(self._name(tier))
+            if found is not None:
+                self._programs[tier] = found
         return self._programs.get(tier)
 
     def _make(self, tier: str, traced, options) -> Executable:
-        kept = compilation_cache.folder() is not None
-        with _compiling(), _once() if kept else contextlib.nullcontext():
-            program = self._programs[tier] = build(self._traced(traced), options, kept)
-        if kept:
-            _store().write(self._name(tier), program.to_bytes())
+        to_keep = compilation_cache.folder() is not None
+        with _compiling(), kept.once() if to_keep else contextlib.nullcontext():
+            program = self._programs[tier] = build(self._traced(traced), options, to_keep)
+        if to_keep:
+            kept.store().write(self._name(tier), program.to_bytes())
         return program
 
     def _traced(self, traced) -> Portable:
         """What the program is compiled from, on disk from now on."""
-        data = _store().read(self._name("traced"))
+        data = kept.store().read(self._name("traced"))
         if data is not None:
             return Portable.from_bytes(data)
         program = traced()
-        _store().write(self._name("traced"), program.to_bytes())
+        kept.store().write(self._name("traced"), program.to_bytes())
         return program
 
     def _compile_beside(self, traced) -> None:
@@ -153,7 +151,7 @@ class _Known:
 
     def _start(self) -> None:
         names = self._name("traced"), self._name("thorough")
-        self._process = thorough.start(_store().folder, *names)
+        self._process = thorough.start(kept.store().folder, *names)
         self._seconds = -math.inf  # once is enough, whatever becomes of it
 
     def _name(self, what: str) -> str:
@@ -161,44 +159,16 @@ class _Known:
 
 
 _programs: dict[str, _Known] = {}
-_one_by_one = threading.Lock()
-
-
-def _store() -> ProgramStore:
-    return ProgramStore((compilation_cache.folder() or _temporary_folder()) / "programs")
-
-
-@ft.cache
-def _temporary_folder() -> pathlib.Path:
-    """One that is deleted when this process ends."""
-    folder, owner = tempfile.mkdtemp(prefix="hybridjax-"), os.getpid()
-    atexit.register(lambda: os.getpid() == owner and shutil.rmtree(folder, ignore_errors=True))
-    return pathlib.Path(folder)
+_keys: dict[Hashable, str] = {}
 
 
 def _forget() -> None:
     """A forked process has none of the other threads, one of which may have held a lock."""
-    global _one_by_one
-    _one_by_one = threading.Lock()
     _programs.clear()
-    _temporary_folder.cache_clear()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
-
-
-@contextlib.contextmanager
-def _once() -> Iterator[None]:
-    """A context in which JAX writes no programs to its own cache."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    with _one_by_one:
-        before = getattr(jax.config, name)
-        jax.config.update(name, math.inf)
-        try:
-            yield
-        finally:
-            jax.config.update(name, before)
 
 
 @contextlib.contextmanager
@@ -208,11 +178,3 @@ def _compiling() -> Iterator[None]:
         yield
     finally:
         say_compiling(False)
-
-
-def _is_simple() -> bool:
-    """Whether JAX computes on the first CPU, and runs programs as they are."""
-    device = jax.config.jax_default_device
-    first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
-    names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
-    return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
