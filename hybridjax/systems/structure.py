@@ -20,6 +20,7 @@ from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output
+from .quotient import Quotient
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
 
@@ -278,6 +279,8 @@ def check_system(system: HybridSystem) -> None:
                 f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
                 f"{s.dims[b]} states {_list(s.charts[b].states)}."
             )
+    if isinstance(system, Quotient):
+        system.check()
 
 
 def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:
