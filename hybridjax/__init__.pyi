@@ -76,6 +76,8 @@ from .sections.kinematic import KinematicPhase as KinematicPhase
 from .sections.section_list import SectionList as SectionList
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
+from .systems.quotient import Quotient as Quotient
+from .systems.sliding import Sliding as Sliding, sliding as sliding
 from .systems.solver import Radau as Radau
 from .systems.system import (
     Guess as Guess,

@@ -1,6 +1,6 @@
 from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
-from .biped import FiveLinkBiped as FiveLinkBiped
+from .belt import BeltOscillator as BeltOscillator
 from .buck import BuckConverter as BuckConverter
 from .compass import CompassGait as CompassGait
 from .compliant import CompliantHopper as CompliantHopper
@@ -12,7 +12,8 @@ from .hopper import VerticalHopper as VerticalHopper
 from .juggler import PaddleJuggler as PaddleJuggler
 from .mathieu import Mathieu as Mathieu
 from .slip import SLIPRunner as SLIPRunner
-from .torso_walker import TorsoWalker as TorsoWalker
 from .vanderpol import VanDerPol as VanDerPol
 from .walker import SimplestWalker as SimplestWalker
+from .walkers.biped import FiveLinkBiped as FiveLinkBiped
+from .walkers.torso_walker import TorsoWalker as TorsoWalker
 from .wheel import RimlessWheel as RimlessWheel

@@ -8,15 +8,13 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.trajectory import simulate
 from ..systems.structure import Structure
+from .coincidence import TOGETHER
 from .conserved import conserved_outputs
 from .cycle import LimitCycle
 from .return_map import LEGS, Turn
 from .stiffness import fastest, points
 
 
-# Events coincide if no more than this part of the period lies between them. Doubled, so do events
-# twice as far apart.
-_TOGETHER = 1e-9
 # A system is stiff if a mode decays to this power of e within one piece of a turn. Doubled, modes
 # that decay twice as fast are not blamed for the limit on steps.
 _STIFF = 20.0
@@ -31,7 +29,7 @@ def events_of(turn: Turn) -> list[tuple[int, float]]:
 def coincident(turn: Turn) -> tuple[int, int] | None:
     """Two transitions of a turn, by index, that happen at the same time."""
     for (g, t), (other, later) in itertools.pairwise(events_of(turn)):
-        if later - t <= _TOGETHER * float(turn.period):
+        if later - t <= TOGETHER * float(turn.period):
             return g, other
     return None
 
@@ -43,8 +41,9 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         first, second = (Structure(cycle.system).transitions[g].name for g in pair)
         return (
             f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
-            "they come in one order or the other, and no linearization holds for both. Let them "
-            "happen at different times, or write them as one event."
+            "they come in one order or the other, and no linearization holds for both: "
+            "`hj.orbits.coincidences` of the cycle, which `throw=False` returns, has the "
+            "derivatives of each. Let them happen at different times, or write them as one event."
         )
     if code == Result.SINGULAR:
         kept = conserved_outputs(cycle, tuple(output.name for output in cycle.system.outputs()))

@@ -24,6 +24,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
+from .coincidence import coincidences
 from .conserved import check_conserved
 from .cycle import LimitCycle
 from .explain import coincident, events_of, explain
@@ -161,9 +162,13 @@ def find_limit_cycle(
         return _cycle(map, solve(map, True), guess.event_sequence)
     s.resolve_outputs(tuple(conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     map, solution = _in_own_sizes(map, _solve(map), given)
-    if int(solution.result) == Result.OK and coincident(solution.turn):
-        solution = solution._replace(result=jax.device_put(np.int32(Result.COINCIDENCE)))
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
+    if int(solution.result) == Result.OK and coincident(solution.turn):
+        if all(group.commute for group in coincidences(cycle)):
+            say("events coincide, in either order with the same outcome")
+        else:
+            code = jax.device_put(np.int32(Result.COINCIDENCE))
+            cycle = dataclasses.replace(cycle, result=code)
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
     check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):

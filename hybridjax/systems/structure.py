@@ -20,6 +20,7 @@ from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output
+from .quotient import Quotient
 from .solver import ByChart, Method, as_method
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
@@ -299,6 +300,8 @@ def check_system(system: HybridSystem) -> None:
                 f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
                 f"{s.dims[b]} states {_list(s.charts[b].states)}."
             )
+    if isinstance(system, Quotient):
+        system.check()
 
 
 def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ class Balls(hj.HybridSystem):
     """Two balls on one shaken table, each with a retention of its own."""
 
     other: hj.Parameter = hj.parameter(0.7)
+    coupling: hj.Parameter = hj.parameter(0.0)
 
     def charts(self):
         field = lambda t, q, u: (q[1], -9.81, q[3], -9.81)  # noqa: E731
@@ -27,7 +28,9 @@ class Balls(hj.HybridSystem):
 
             def reset(t, q, u):
                 v = -retention * q[2 * k + 1] + (1 + retention) * A * w * jnp.cos(w * t)
-                return jnp.asarray(q).at[2 * k + 1].set(v)
+                height = q[2 - 2 * k] - A * jnp.sin(w * t)  # of the other ball
+                q = jnp.asarray(q).at[2 * k + 1].set(v)
+                return q.at[2 * k + 1].add(self.coupling * height)
 
             return hj.Transition(f"impact{k}", "air", "air", guard, reset=reset)
 
@@ -79,10 +82,38 @@ class Damped(hj.HybridSystem):
 BALLS = hj.Guess("air", (0.1, 4.7, 0.1, 4.7), 0.1)
 
 
-def test_events_that_coincide():
+def test_events_that_coincide_in_either_order():
+    """Balls that know nothing of each other: twice the multipliers of one."""
+    cycle = hj.find_limit_cycle(Balls(), BALLS)
+    (both,) = hj.orbits.coincidences(cycle)
+    assert both.commute and set(both.orders) == {("impact0", "impact1"), ("impact1", "impact0")}
+    z = 0.399920196836063 + 0.574511824214789j
+    np.testing.assert_allclose(cycle.multipliers.real, [z.real] * 4, rtol=1e-7)
+    np.testing.assert_allclose(np.abs(cycle.multipliers.imag), [z.imag] * 4, rtol=1e-7)
+
+
+def test_events_whose_order_matters_have_a_derivative_for_each():
+    """A ball that lands is pushed in proportion to the height of the other, which is zero."""
+    system, begin = Balls(coupling=0.5), hj.find_limit_cycle(Balls(), BALLS)
     with pytest.raises(hj.ComputationError, match="'impact.' and 'impact.' coincide"):
-        hj.find_limit_cycle(Balls(), BALLS)
-    assert hj.find_limit_cycle(Balls(), BALLS, throw=False).result == hj.Result.COINCIDENCE
+        hj.find_limit_cycle(system, begin)
+    cycle = hj.find_limit_cycle(system, begin, throw=False)
+    assert cycle.result == hj.Result.COINCIDENCE
+    (both,) = hj.orbits.coincidences(cycle)
+    assert not both.commute
+    t0, dt = both.time - 0.05, 0.1
+    fall = np.kron(np.eye(2), [[1.0, dt / 2], [0.0, 1.0]])
+    way = cycle.trajectory(2.0)
+    k = np.flatnonzero((way.event >= 0) & (way.t > both.time - 1e-6))[0]
+    y, v = way.before[k, :2]
+    start = np.array([y - v * 0.05 - 9.81 * 0.05**2 / 2, v + 9.81 * 0.05] * 2)
+    ends = lambda q: hj.simulate(system, "air", q, dt, time=t0).after[-1]  # noqa: E731
+    for order, derivative in zip(both.orders, both.derivatives, strict=True):
+        early = int(order[0][-1])
+        step = np.zeros(4)
+        step[2 * early] = -1e-6  # this ball is lower, and lands first
+        change = (ends(start + step) - ends(start)) / 1e-6
+        np.testing.assert_allclose(change, fall @ derivative @ fall @ step / 1e-6, atol=1e-4)
 
 
 def test_events_that_nearly_coincide():

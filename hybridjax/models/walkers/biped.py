@@ -9,11 +9,11 @@ Dynamic Bipedal Robot Locomotion, CRC Press, 2007.
 import jax
 import jax.numpy as jnp
 
-from ..mechanics.mechanism import Mechanism
-from ..systems.chart import Chart
-from ..systems.output import Output
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Transition
+from ...mechanics.mechanism import Mechanism
+from ...systems.chart import Chart
+from ...systems.output import Output
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Transition
 from .torso_walker import accelerations_under_feedback, held
 
 
@@ -113,7 +113,7 @@ class FiveLinkBiped(HybridSystem):
         """The biped on its stance foot, by five angles."""
         return self.floating().along(lambda q: [*q, 0.0, 0.0])
 
-    def swing_foot(self, q):
+    def _swing_foot(self, q):
         """Its place relative to the stance foot, (x, y)."""
         s, c = jnp.sin(q), jnp.cos(q)
         return self.length * jnp.stack([s[0] + s[1] - s[3] - s[4], c[0] + c[1] - c[3] - c[4]])
@@ -131,15 +131,15 @@ class FiveLinkBiped(HybridSystem):
                 "touchdown",
                 "step",
                 "step",
-                guard=lambda t, q, u: self.swing_foot(q)[1],
+                guard=lambda t, q, u: self._swing_foot(q)[1],
                 reset=self._touchdown,
-                enabled=lambda t, q, u: self.swing_foot(q)[0] > 0,
+                enabled=lambda t, q, u: self._swing_foot(q)[0] > 0,
             ),
         )
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
-        foot = lambda q: q[5:] + self.swing_foot(q[:5])  # noqa: E731
+        foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
         after = self.floating().impact(q, v, foot).velocity
         return jnp.concatenate([q[4::-1], after[4::-1]])
 

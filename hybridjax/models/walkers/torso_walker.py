@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..mechanics.mechanism import Mechanism
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Transition
+from ...mechanics.mechanism import Mechanism
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Transition
 
 
 def accelerations_under_feedback(

@@ -1,0 +1,127 @@
+"""Sliding: motion along a surface at which the field jumps, and which both sides push into.
+
+A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, 1988; V. I. Utkin,
+Sliding Modes in Control and Optimization, 1992.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from .._core.boundary.checked import checked
+from ..errors import DefinitionError
+from .chart import Chart
+from .structure import as_vector
+from .transition import Transition
+
+
+class Sliding(NamedTuple):
+    """What `sliding` builds."""
+
+    charts: dict[str, Chart]
+    """The two charts that were given, and that of sliding."""
+    transitions: list[Transition]
+    """Between these three."""
+
+
+@checked
+def sliding(
+    charts: Mapping[str, Chart], surface: Callable[[Any, Any], Any], name: str = "slides"
+) -> Sliding:
+    """Charts and transitions of a system whose field jumps at a surface.
+
+    ```python
+    def charts(self):
+        return self.parts().charts
+
+    def transitions(self):
+        return self.parts().transitions
+
+    def parts(self):
+        sides = {"ahead": Slips(self, 1.0), "behind": Slips(self, -1.0)}
+        return hj.sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+    ```
+
+    With a and b the rates of h in the fields f_a, f_b of the two sides, a state that comes to the
+    surface h = 0 crosses it if it is carried on there (b < 0 coming from above, a > 0 from below).
+    Otherwise it slides, with the mixture of both fields that stays on the surface, f = (b f_a - a
+    f_b) / (b - a), until one side pulls it away: a rises, or b falls, through zero. Friction,
+    relays and switches without memory are of this kind.
+
+    **Arguments:**
+
+    - `charts`: two, by name: the one in which h > 0, then the one in which h < 0, with the same
+        states. Their fields must extend smoothly beyond the surface.
+    - `surface`: h(t, q) -> number.
+    - `name`: of the chart of sliding, which has the same states.
+
+    **Raises:** `DefinitionError` if the charts are not two with the same states and inputs.
+    """
+    if len(charts) != 2:
+        raise DefinitionError(f"sliding takes two charts, above and below, not {len(charts)}.")
+    (above, f), (below, g) = charts.items()
+    if f.states != g.states or f.inputs != g.inputs:
+        raise DefinitionError(
+            f"charts '{above}' and '{below}' must have the same states and inputs for a surface "
+            "between them."
+        )
+    middle = _Slides(f, g, surface)
+    height = lambda t, q, u: surface(t, q)  # noqa: E731
+    held = lambda t, q, u: middle.rates(t, q, u)[1] >= 0  # noqa: E731
+    borne = lambda t, q, u: middle.rates(t, q, u)[0] <= 0  # noqa: E731
+    no = lambda predicate: lambda t, q, u: ~predicate(t, q, u)  # noqa: E731
+    up = lambda t, q, u: middle.rates(t, q, u)[0]  # noqa: E731
+    down = lambda t, q, u: middle.rates(t, q, u)[1]  # noqa: E731
+
+    def event(source, target, guard, direction="falling", enabled=None):
+        called = f"{source} to {target}"
+        return Transition(called, source, target, guard, direction, enabled=enabled)
+
+    transitions = [
+        event(above, name, height, enabled=held),
+        event(above, below, height, enabled=no(held)),
+        event(below, name, height, "rising", enabled=borne),
+        event(below, above, height, "rising", enabled=no(borne)),
+        event(name, above, up, "rising"),
+        event(name, below, down),
+    ]
+    return Sliding({**charts, name: middle}, transitions)
+
+
+class _Slides(Chart):
+    """Motion along the surface."""
+
+    above: Chart
+    below: Chart
+    surface: Callable[[Any, Any], Any]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return self.above.states
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.above.units
+
+    @property
+    def inputs(self) -> tuple[str, ...] | None:
+        return self.above.inputs
+
+    @property
+    def absent(self) -> Mapping[str, float]:
+        return self.above.absent
+
+    def fields(self, t, q, u):
+        return [as_vector(chart.field(t, q, u)) for chart in (self.above, self.below)]
+
+    def rates(self, t, q, u):
+        """Those of the surface's function in both fields."""
+        t, q = jnp.asarray(t, float), jnp.asarray(q, float)
+        along = lambda f: jax.jvp(self.surface, (t, q), (jnp.ones_like(t), f))[1]  # noqa: E731
+        return [along(f) for f in self.fields(t, q, u)]
+
+    def field(self, t, q, u):
+        (f, g), (a, b) = self.fields(t, q, u), self.rates(t, q, u)
+        return (b * f - a * g) / (b - a)

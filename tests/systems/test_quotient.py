@@ -1,0 +1,115 @@
+"""Cycles modulo a symmetry: the walker in full, with two legs that have names and a place."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.models.walker import Step, _heelstrike
+
+
+hj.enable_x64()
+LONG_GAIT = -0.190099841065888 + 0.557598776682068j
+
+
+class Stands(hj.Chart):
+    """Angles of both legs from the normal of the slope, and how far the walker has come."""
+
+    states = ("left", "right", "left_rate", "right_rate", "x")
+    walker: hj.models.SimplestWalker
+    leg: int
+    drag: float = 0.0
+
+    def field(self, t, q, u):
+        a, b, w, v, rate = *Step(self.walker).field(t, seen(q, self.leg), u), 0.0
+        rate = jnp.cos(q[self.leg]) * q[2 + self.leg] - self.drag * q[4]
+        return told(self.leg, a, b, w, v, rate)
+
+
+def seen(q, leg):
+    """As the model has it: the stance leg, and the angle between both."""
+    other = 1 - leg
+    return q[leg], q[leg] - q[other], q[2 + leg], q[2 + leg] - q[2 + other]
+
+
+def told(leg, th, phi, w, p, x):
+    pairs = [(th, w), (th - phi, w - p)]
+    (a, va), (b, vb) = pairs if leg == 0 else pairs[::-1]
+    return a, b, va, vb, x
+
+
+class Full(hj.HybridSystem):
+    """Nothing is relabeled in the resets."""
+
+    drag: hj.Parameter = hj.parameter(0.0)
+    skew: hj.Parameter = hj.parameter(0.0)
+    early: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        model = hj.models.SimplestWalker()
+        leaning = hj.models.SimplestWalker(slope=0.009 + self.skew)
+        return {
+            "left stands": Stands(model, 0, self.drag),
+            "right stands": Stands(leaning, 1, self.drag),
+        }
+
+    def transitions(self):
+        found = []
+        for leg, (name, other) in enumerate([("left", "right"), ("right", "left")]):
+            found.append(
+                hj.Transition(
+                    f"{other} lands", f"{name} stands", f"{other} stands",
+                    guard=lambda t, q, u, leg=leg: q[leg] + q[1 - leg] + leg * self.early,
+                    reset=lambda t, q, u, leg=leg: told(
+                        1 - leg, *_heelstrike(t, seen(q, leg), u), q[4]
+                    ),
+                    enabled=lambda t, q, u, leg=leg: q[leg] < 0,
+                )
+            )  # fmt: skip
+        return found
+
+    def guess(self):
+        th, phi, w, p = hj.models.SimplestWalker().guess().state
+        return hj.Guess("left stands", told(0, th, phi, w, p, 0.0))
+
+
+MIRROR = {
+    "swap": {"left stands": "right stands"},
+    "relabel": {"left": "right", "left_rate": "right_rate"},
+}
+
+
+def test_a_step_modulo_the_symmetry_and_a_stride():
+    walker = hj.Quotient(Full(), **MIRROR, translation=("x",))
+    lands = hj.AtEvent("right lands")
+    step = hj.find_limit_cycle(walker, section=lands)
+    expected = [LONG_GAIT, np.conj(LONG_GAIT)]
+    np.testing.assert_allclose(step.multipliers, expected, rtol=1e-9)
+    np.testing.assert_allclose(step.period, 3.88246375285137, rtol=1e-10)
+    stride = hj.find_limit_cycle(walker, walker.guess(), section=lands, multiplicity=2)
+    np.testing.assert_allclose(stride.period, 2 * step.period, rtol=1e-10)
+    squares = np.array(expected) ** 2
+    np.testing.assert_allclose(
+        stride.multipliers[np.argsort(stride.multipliers.imag)],
+        squares[np.argsort(squares.imag)],
+        rtol=1e-8,
+    )
+
+
+@pytest.mark.parametrize(
+    "system, symmetry, message",
+    [
+        (Full(drag=0.1), {**MIRROR, "translation": ("x",)}, "field of chart 'left stands' changes"),
+        (Full(skew=0.1), MIRROR, "chart 'right stands' is not the mirror image"),
+        (
+            Full(early=0.1),
+            MIRROR,
+            "transition 'left lands' is not the mirror image of 'right lands'",
+        ),
+        (Full(), {"swap": {"left stands": "right"}}, "no chart 'right'"),
+        (Full(), {"translation": ("y",)}, "no state 'y'"),
+    ],
+)
+def test_what_is_no_symmetry_is_refused(system, symmetry, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.find_limit_cycle(hj.Quotient(system, **symmetry))

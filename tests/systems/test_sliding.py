@@ -1,0 +1,78 @@
+"""Motion along a surface at which the field jumps."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hybridjax as hj
+
+
+hj.enable_x64()
+
+
+def test_a_block_on_a_belt_sticks_and_slips():
+    """It leaves the belt where the spring is as strong as friction; slipping by DOP853."""
+    F, belt, decay = 1.0, 0.2, 3.0
+    slip = lambda t, q: [q[1], -q[0] + F / (1 + decay * (belt - q[1]))]  # noqa: E731
+    caught = lambda t, q: q[1] - belt  # noqa: E731
+    caught.direction, caught.terminal = 1, True
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
+    begin = solve_ivp(slip, (0, 0.5), [F, belt], **options).y[:, -1]
+    way = solve_ivp(slip, (0.5, 20), begin, events=caught, **options)
+    t, (x, _) = way.t_events[0][0], way.y_events[0][0]
+    period = t + (F - x) / belt
+
+    section = hj.AtEvent("behind to sticks")
+    cycle = hj.find_limit_cycle(hj.models.BeltOscillator(), section=section)
+    np.testing.assert_allclose(cycle.period, period, rtol=1e-9)
+    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
+    assert len(cycle.multipliers) == 0 and cycle.stable
+    names = [x.name for x in hj.models.BeltOscillator().transitions()]
+    assert sorted(names[g] for g in cycle.event_sequence) == [
+        "behind to sticks",
+        "sticks to behind",
+    ]
+
+
+class Side(hj.Chart):
+    states = ("x", "y")
+    push: hj.Parameter
+    drift: float
+
+    def field(self, t, q, u):
+        return self.drift, self.push
+
+
+class Surface(hj.HybridSystem):
+    push: hj.Parameter = hj.parameter(3.0)
+
+    def parts(self):
+        return hj.sliding({"up": Side(-1.0, 0.5), "down": Side(self.push, 2.0)}, height)
+
+    def charts(self):
+        return self.parts().charts
+
+    def transitions(self):
+        return self.parts().transitions
+
+
+def height(t, q):
+    return q[1]
+
+
+@pytest.mark.parametrize(
+    "push, end, chart",
+    [
+        (3.0, (0.5 + (3.0 * 0.5 + 1.0 * 2.0) / 4.0, 0.0), 2),  # (b f_a - a f_b) / (b - a)
+        (-1.0, (0.5 + 2.0, -1.0), 1),  # carried on
+    ],
+)
+def test_it_slides_or_crosses(push, end, chart):
+    way = hj.simulate(Surface(push), "up", (0.0, 1.0), 2.0)
+    np.testing.assert_allclose(way.after[-1], end, atol=1e-9)
+    assert way.chart[-1] == chart
+
+
+def test_what_cannot_be_put_together():
+    with pytest.raises(hj.DefinitionError, match="two charts"):
+        hj.sliding({"up": Side(1.0, 0.0)}, height)
