@@ -22,6 +22,7 @@ Printed, as `name value` lines; ratios are of one run, CPU seconds are those of 
 """
 
 import argparse
+import json
 import os
 import pathlib
 import random
@@ -162,9 +163,10 @@ def kills(count: int, folder: pathlib.Path) -> None:
         restarts += 1
         while client.poll() is None:
             time.sleep(0.02)
-            for path in store.glob("value/c/*/0"):
+            for path in store.glob("failed/c/*"):  # (its last chunk: the piece is whole)
                 stamp = path.stat().st_mtime_ns
-                twice += times.setdefault(path.parent.name, stamp) != stamp
+                twice += times.get(path.name, stamp) != stamp
+                times[path.name] = stamp
             done = len(times)
             if moments and done >= moments[0]:
                 victim = events.get(moments.pop(0), "worker")
@@ -194,7 +196,7 @@ def start(folder: pathlib.Path, store: pathlib.Path):
     while not file.exists():
         time.sleep(0.1)
     workers = [worker_process(folder) for _ in range(2)]
-    address = __import__("json").loads(file.read_text())["address"]
+    address = json.loads(file.read_text())["address"]
     here = str(pathlib.Path(__file__).parent)
     return scheduler, quiet([sys.executable, "-c", CLIENT, address, store, here]), workers
 
@@ -245,8 +247,8 @@ def workers(count: int) -> None:
     """One scheduler; the workers are threads' worth of processes that only sleep."""
     options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": None}
     with LocalCluster(**options) as cluster, Client(cluster) as client:
-        for seconds in (0.0, 1.0, 2.0, 4.0, 8.0):
-            tasks = 20 * count if seconds == 0 else max(int(16 * count / (1 + seconds)), 2 * count)
+        for seconds in (0.0, 1.0, 4.0, 16.0):
+            tasks = (5 if seconds == 0 else 3) * count
             begin = time.perf_counter()
             keep_busy(client, seconds, tasks, 2 * count)
             wall = time.perf_counter() - begin
