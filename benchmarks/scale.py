@@ -14,9 +14,9 @@ Printed, as `name value` lines; ratios are of one run, CPU seconds are those of 
   seconds of all over twice those of a half; MB of memory; and the largest difference from the
   estimate in memory of the first fiftieth, relative to the largest |H|.
 - `workers`: a scheduler with `--workers` simulated ones, in threads of four processes, whose
-  pieces sleep: `cost` of scheduling a task, `busy` for tasks of some lengths, and `busy90`, how
-  many seconds a task has to take for all workers to be busy 90 % of the time if nothing but that
-  cost stops them.
+  pieces sleep: `cost` of a task in CPU microseconds of scheduler and client, `busy` for tasks of
+  some lengths, and `busy90`, how many seconds a task has to take for all workers to be busy 90 %
+  of the time if nothing but that cost stops them.
 
     nice python benchmarks/scale.py [--skip STEP ...] [--points 1000000] [--experiments 100000]
 """
@@ -249,14 +249,14 @@ def workers(count: int) -> None:
     with LocalCluster(**options) as cluster, Client(cluster) as client:
         for seconds in (0.0, 1.0, 4.0, 16.0):
             tasks = (5 if seconds == 0 else 3) * count
-            begin = time.perf_counter()
+            begin, cpu = time.perf_counter(), time.process_time()
             keep_busy(client, seconds, tasks, 2 * count)
-            wall = time.perf_counter() - begin
+            wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
             busy = tasks * seconds / count / wall
             show(f"workers.{seconds:g}s.tasks_per_second", tasks / wall)
             show(f"workers.{seconds:g}s.busy", busy)
             if seconds == 0:
-                cost = wall / tasks
+                cost = cpu / tasks  # (of the scheduler and the client, which are in this process)
                 show("workers.cost_us", cost * 1e6)
                 show("workers.busy90_seconds", 0.9 * cost * count)
 
