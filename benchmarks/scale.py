@@ -14,14 +14,15 @@ Printed, as `name value` lines; ratios are of one run, CPU seconds are those of 
   seconds of all over twice those of a half; MB of memory; and the largest difference from the
   estimate in memory of the first fiftieth, relative to the largest |H|.
 - `workers`: a scheduler with `--workers` simulated ones, in threads of four processes, whose
-  pieces sleep: `cost` of scheduling a task, `busy` for tasks of some lengths, and `busy90`, how
-  many seconds a task has to take for all workers to be busy 90 % of the time if nothing but that
-  cost stops them.
+  pieces sleep: `cost` of a task in CPU microseconds of scheduler and client, `busy` for tasks of
+  some lengths, and `busy90`, how many seconds a task has to take for all workers to be busy 90 %
+  of the time if nothing but that cost stops them.
 
     nice python benchmarks/scale.py [--skip STEP ...] [--points 1000000] [--experiments 100000]
 """
 
 import argparse
+import json
 import os
 import pathlib
 import random
@@ -162,9 +163,10 @@ def kills(count: int, folder: pathlib.Path) -> None:
         restarts += 1
         while client.poll() is None:
             time.sleep(0.02)
-            for path in store.glob("value/c/*/0"):
+            for path in store.glob("failed/c/*"):  # (its last chunk: the piece is whole)
                 stamp = path.stat().st_mtime_ns
-                twice += times.setdefault(path.parent.name, stamp) != stamp
+                twice += times.get(path.name, stamp) != stamp
+                times[path.name] = stamp
             done = len(times)
             if moments and done >= moments[0]:
                 victim = events.get(moments.pop(0), "worker")
@@ -194,7 +196,7 @@ def start(folder: pathlib.Path, store: pathlib.Path):
     while not file.exists():
         time.sleep(0.1)
     workers = [worker_process(folder) for _ in range(2)]
-    address = __import__("json").loads(file.read_text())["address"]
+    address = json.loads(file.read_text())["address"]
     here = str(pathlib.Path(__file__).parent)
     return scheduler, quiet([sys.executable, "-c", CLIENT, address, store, here]), workers
 
@@ -245,16 +247,16 @@ def workers(count: int) -> None:
     """One scheduler; the workers are threads' worth of processes that only sleep."""
     options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": None}
     with LocalCluster(**options) as cluster, Client(cluster) as client:
-        for seconds in (0.0, 1.0, 2.0, 4.0, 8.0):
-            tasks = 20 * count if seconds == 0 else max(int(16 * count / (1 + seconds)), 2 * count)
-            begin = time.perf_counter()
+        for seconds in (0.0, 1.0, 4.0, 16.0):
+            tasks = (5 if seconds == 0 else 3) * count
+            begin, cpu = time.perf_counter(), time.process_time()
             keep_busy(client, seconds, tasks, 2 * count)
-            wall = time.perf_counter() - begin
+            wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
             busy = tasks * seconds / count / wall
             show(f"workers.{seconds:g}s.tasks_per_second", tasks / wall)
             show(f"workers.{seconds:g}s.busy", busy)
             if seconds == 0:
-                cost = wall / tasks
+                cost = cpu / tasks  # (of the scheduler and the client, which are in this process)
                 show("workers.cost_us", cost * 1e6)
                 show("workers.busy90_seconds", 0.9 * cost * count)
 

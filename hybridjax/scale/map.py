@@ -12,7 +12,7 @@ from .._core.boundary.kinds import Count, ExperimentCount, Index, Path
 from .._core.pieces.blocks import Blocks, near_cube
 from .._core.pieces.description import array_digest, function_digest, versions
 from .._core.pieces.layout import Layout
-from .._core.pieces.place import filled
+from .._core.pieces.place import check_share, filled
 from .._core.pieces.run import DaskClient
 from .._core.precision import require_x64
 from .._core.progress import say, working
@@ -94,6 +94,7 @@ def sweep(
     another version; `ComputationError` if there is no cycle in the middle, or the cluster was lost.
     """
     require_x64()
+    check_share(share)
     points = over if isinstance(over, Points) else Grid(_axes(over))
     total = math.prod(points.shape)
     names = (want,) if isinstance(want, str) else tuple(want)

@@ -23,6 +23,9 @@ from .worker import Setup, method_of, nothing, work
 # Part of a worker's time that may be spent on what a task costs beside its pieces. Halved, tasks
 # are twice as long, and the end of a run waits longer for the last ones.
 _OVERHEAD = 0.02
+# Seconds of a task for each thread of the cluster, so that the scheduler, which gives them out one
+# by one, keeps up (`benchmarks/scale.py`: workers). Halved, it does so on half as many workers.
+_SCHEDULED = 2e-3
 # Tasks that wait for each thread of a worker, so that none waits for work. Doubled, a lost worker
 # takes twice as many with it.
 _WAITING = 2
@@ -185,5 +188,6 @@ class _Run:
         for k, values in zip(pieces, done, strict=True):
             if values is not None:
                 self.store.write(k, values)
-        self.together = max(1, math.ceil(self.fixed / _OVERHEAD / max(seconds, 1e-9)))
+        long = max(self.fixed / _OVERHEAD, self.threads * _SCHEDULED)
+        self.together = max(1, math.ceil(long / max(seconds, 1e-9)))
         return len(pieces)

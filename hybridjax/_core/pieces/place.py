@@ -36,16 +36,14 @@ def filled(
 
     **Raises:** as `open_store`, `make_store` and `run_pieces`.
     """
-    rank, size = share
-    if rank >= size:
-        raise DefinitionError(f"share is (rank, size) with 0 <= rank < size, not {share}.")
+    check_share(share)
     store: Store
     if address is None:
         job, layout, _ = begin()
         store = MemoryStore(layout)
     else:
         address = absolute(address)
-        there = open_store(address, description) if rank == 0 else _wait(address, description)
+        there = open_store(address, description) if share[0] == 0 else _wait(address, description)
         if there is None:
             job, layout, start = begin()
             store = make_store(address, layout, start)
@@ -53,6 +51,13 @@ def filled(
             store, job = there, again(there.layout, there.start)
     run_pieces(job, store, client, share)
     return store
+
+
+def check_share(share: tuple[int, int]) -> None:
+    """**Raises:** `DefinitionError` for a share that no process has."""
+    rank, size = share
+    if rank >= size:
+        raise DefinitionError(f"`share` is (rank, size) with 0 <= rank < size, not {share}.")
 
 
 def absolute(address: Any) -> str:
