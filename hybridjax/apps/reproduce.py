@@ -18,6 +18,7 @@ from .._core.compilation.compilation_cache import enable_compilation_cache
 from .._core.files.figure_formats import Format
 from .._core.files.results_folder import results_folder
 from .._core.precision import enable_x64
+from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError
 from ..experiments.design.design import Design
@@ -249,8 +250,9 @@ def _perturbed(cycle: LimitCycle) -> Trajectory:
     chart = list(cycle.system.charts())[int(cycle.anchor.chart[0])]
     period = float(cycle.period)
     state = np.array(list(start.values()))
+    begin, accuracy = float(cycle.anchor.t[0]), Settings(rtol=1e-6, atol=1e-6)  # to be looked at
     return simulate(
-        cycle.system, chart, state, 12 * period, time=float(cycle.anchor.t[0]), throw=False
+        cycle.system, chart, state, 12 * period, time=begin, settings=accuracy, throw=False
     )
 
 
