@@ -131,10 +131,12 @@ UNCHECKED = {
     },
     "functions of a state, called while JAX traces them": {
         "BuckConverter.control",
+        "CompliantHopper.ground",
         "PaddleJuggler.paddle",
         "SLIPRunner.energy",
         "VerticalHopper.leg",
     },
+    "checked with the system, by what takes it": {"HybridSystem"},
     "the package's own": {
         "Plan.stride", "ReturnMap.at_phase_of", "ReturnMap.departure", "ReturnMap.held",
         "ReturnMap.judge", "ReturnMap.sizes_in", "ReturnMap.travel", "ReturnMap.turn",

@@ -2,13 +2,14 @@
 
 import functools as ft
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 
 
@@ -37,6 +38,7 @@ class Method(NamedTuple):
         return bool(np.any(np.triu(np.array(self.a))))
 
 
+@checked
 class Radau(eqx.Module):
     """The implicit Radau IIA method of order 2 `stages` - 1, for stiff charts at high accuracy.
 
@@ -48,11 +50,7 @@ class Radau(eqx.Module):
     **Arguments:** `stages`, 3, 5 or 7.
     """
 
-    stages: int = eqx.field(static=True, default=5)
-
-    def __check_init__(self):
-        if self.stages not in (3, 5, 7):
-            raise DefinitionError(f"Radau: `stages` must be 3, 5 or 7, not {self.stages!r}.")
+    stages: Literal[3, 5, 7] = eqx.field(static=True, default=5)
 
 
 Solver = diffrax.AbstractSolver | Radau
