@@ -63,6 +63,9 @@ class ByChart(NamedTuple):
     names: tuple[str, ...]
     solvers: tuple[Any, ...]
 
+    def __repr__(self):
+        return ", ".join(f"{name}: {solver}" for name, solver in zip(*self, strict=True))
+
     def get(self, name: str) -> Any:
         return dict(zip(*self, strict=True)).get(name)
 
