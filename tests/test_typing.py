@@ -131,6 +131,7 @@ UNCHECKED = {
     },
     "functions of a state, called while JAX traces them": {
         "BuckConverter.control",
+        "CompliantHopper.ground",
         "Mechanism.acceleration",
         "Mechanism.along",
         "Mechanism.bias",
@@ -142,6 +143,7 @@ UNCHECKED = {
         "SLIPRunner.energy",
         "VerticalHopper.leg",
     },
+    "checked with the system, by what takes it": {"HybridSystem"},
     "the package's own": {
         "Plan.stride", "ReturnMap.at_phase_of", "ReturnMap.departure", "ReturnMap.held",
         "ReturnMap.judge", "ReturnMap.sizes_in", "ReturnMap.travel", "ReturnMap.turn",

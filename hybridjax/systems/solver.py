@@ -2,12 +2,13 @@
 
 import functools as ft
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 
 
@@ -39,6 +40,7 @@ class Method(NamedTuple):
         return bool(np.any(np.triu(np.array(self.a))))
 
 
+@checked
 class Radau(eqx.Module):
     """The implicit Radau IIA method of order 2 `stages` - 1, for stiff charts at high accuracy.
 
@@ -50,11 +52,7 @@ class Radau(eqx.Module):
     **Arguments:** `stages`, 3, 5 or 7.
     """
 
-    stages: int = eqx.field(static=True, default=5)
-
-    def __check_init__(self):
-        if self.stages not in (3, 5, 7):
-            raise DefinitionError(f"Radau: `stages` must be 3, 5 or 7, not {self.stages!r}.")
+    stages: Literal[3, 5, 7] = eqx.field(static=True, default=5)
 
 
 if TYPE_CHECKING:
@@ -68,6 +66,9 @@ class ByChart(NamedTuple):
 
     names: tuple[str, ...]
     solvers: tuple[Any, ...]
+
+    def __repr__(self):
+        return ", ".join(f"{name}: {solver}" for name, solver in zip(*self, strict=True))
 
     def get(self, name: str) -> Any:
         return dict(zip(*self, strict=True)).get(name)

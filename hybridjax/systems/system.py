@@ -131,10 +131,12 @@ class HybridSystem(Definition):
     def __repr__(self):
         rows = []
         for field in dataclasses.fields(self):
-            if field.name == "solver" and self.solver is None:
+            if field.name == "solver":
                 continue
             unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
             rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
+        if self.solver is not None:
+            rows.append(("solver", repr(self.solver), "how charts are integrated"))
         return type(self).__name__ + columns(rows)
 
 
