@@ -68,8 +68,8 @@ strides = hj.recordings.section_data(
     bandwidth=np.inf,
 )
 print(strides)
-for finding in hj.recordings.inspect_cycles(recording, phase, strides)[-1:]:
-    print(finding)
+findings = hj.recordings.inspect_cycles(recording, phase, strides)
+print(findings[-1])
 figure = hj.plot.section_data(strides)
 
 # %% [markdown]
@@ -94,4 +94,5 @@ except hj.DefinitionError as error:
 angles = hj.recordings.section_data(
     recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8, bandwidth=np.inf
 )
-print(hj.recordings.natural_multipliers(angles))
+natural = hj.recordings.natural_multipliers(angles)
+print(natural)
