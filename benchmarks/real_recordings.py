@@ -111,7 +111,7 @@ def robots():
         phase,
         inputs="voltage",
         outputs=("hip", "stance"),
-        n_sections=4,
+        n_sections=5,
         bandwidth=np.inf,
     )
     print(data, *hj.recordings.inspect_cycles(recording, phase, data), sep="\n")
@@ -124,7 +124,7 @@ def robots():
     except hj.DefinitionError as error:
         print("to fit all of it:", error)
     data = hj.recordings.section_data(
-        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8, bandwidth=np.inf
+        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
     )
     print("The closed loop, its input a part of it:", hj.recordings.natural_multipliers(data, 1))
 
@@ -233,7 +233,7 @@ def variable(model, strides, noise, seed):
     )  # fmt: skip
 
 
-def phase_model(seeds=20):
+def phase_model(seeds=10):
     """Coverage of the 95 % bands of phase response curves that are known."""
     x = np.arange(400) / 400
     curve = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)

@@ -55,8 +55,8 @@ print(np.round(1000 * np.array([s[0::2].mean() - s[1::2].mean() for s in steps])
 # %% [markdown]
 # ## The input is made from the rhythm
 #
-# Where the legs change, angles are relabeled, and jump: nothing is smoothed across that
-# (`bandwidth=np.inf`).
+# Where the legs change, angles are relabeled, and jump: nothing is smoothed across that, and no
+# section lies there (`bandwidth=np.inf`).
 
 # %%
 strides = hj.recordings.section_data(
@@ -64,7 +64,7 @@ strides = hj.recordings.section_data(
     phase,
     inputs="voltage",
     outputs=("hip", "stance"),
-    n_sections=4,
+    n_sections=5,
     bandwidth=np.inf,
 )
 print(strides)
@@ -92,7 +92,7 @@ except hj.DefinitionError as error:
 
 # %%
 angles = hj.recordings.section_data(
-    recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8, bandwidth=np.inf
+    recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
 )
 natural = hj.recordings.natural_multipliers(angles)
 print(natural)
