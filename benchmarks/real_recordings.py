@@ -107,7 +107,12 @@ def robots():
     )
     phase = hj.recordings.estimate_phase(recording, hj.AtEvent("stride"))
     data = hj.recordings.section_data(
-        recording, phase, inputs="voltage", outputs=("hip", "stance"), n_sections=4
+        recording,
+        phase,
+        inputs="voltage",
+        outputs=("hip", "stance"),
+        n_sections=5,
+        bandwidth=np.inf,
     )
     print(data, *hj.recordings.inspect_cycles(recording, phase, data), sep="\n")
     try:
@@ -119,7 +124,7 @@ def robots():
     except hj.DefinitionError as error:
         print("to fit all of it:", error)
     data = hj.recordings.section_data(
-        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8
+        recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
     )
     print("The closed loop, its input a part of it:", hj.recordings.natural_multipliers(data, 1))
 
@@ -185,7 +190,7 @@ def variability():
             print(f"{n_sections} sections: {found}", flush=True)
 
 
-def walking_layout(seeds=40, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
+def walking_layout(seeds=30, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
     """Records as long as the segments, of a system whose multipliers are known."""
     print(f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} seeds")
     model = linear_rhythm(multipliers, n_sections, outputs)
@@ -228,7 +233,7 @@ def variable(model, strides, noise, seed):
     )  # fmt: skip
 
 
-def phase_model(seeds=20):
+def phase_model(seeds=10):
     """Coverage of the 95 % bands of phase response curves that are known."""
     x = np.arange(400) / 400
     curve = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)

@@ -54,14 +54,22 @@ print(np.round(1000 * np.array([s[0::2].mean() - s[1::2].mean() for s in steps])
 
 # %% [markdown]
 # ## The input is made from the rhythm
+#
+# Where the legs change, angles are relabeled, and jump: nothing is smoothed across that, and no
+# section lies there (`bandwidth=np.inf`).
 
 # %%
 strides = hj.recordings.section_data(
-    recording, phase, inputs="voltage", outputs=("hip", "stance"), n_sections=4
+    recording,
+    phase,
+    inputs="voltage",
+    outputs=("hip", "stance"),
+    n_sections=5,
+    bandwidth=np.inf,
 )
 print(strides)
-for finding in hj.recordings.inspect_cycles(recording, phase, strides)[-1:]:
-    print(finding)
+findings = hj.recordings.inspect_cycles(recording, phase, strides)
+print(findings[-1])
 figure = hj.plot.section_data(strides)
 
 # %% [markdown]
@@ -84,6 +92,7 @@ except hj.DefinitionError as error:
 
 # %%
 angles = hj.recordings.section_data(
-    recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=8
+    recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
 )
-print(hj.recordings.natural_multipliers(angles))
+natural = hj.recordings.natural_multipliers(angles)
+print(natural)

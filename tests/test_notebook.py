@@ -66,9 +66,24 @@ def recording(found):
     assert found.fit.contains(found.cycle.multipliers, 0.999).all()
 
 
+def neurons(found):
+    assert found.found.left_out[found.found.harmonics] > found.found.left_out[0] + 0.02
+    assert np.mean((found.low <= found.true) & (found.true <= found.high)) > 0.7
+
+
+def robot(found):
+    low, high = found.natural.interval()[0]
+    assert high - low > 0.3 and "feedback" in {f.cause for f in found.findings}
+
+
+def walking(found):
+    assert abs(found.known.multipliers[0] - 0.6) < 0.2
+
+
 CHECKS = {
-    "fit": fit, "own_system": own_system, "paper": paper, "recording": recording,
-    "strides": strides, "sweep": sweep,
+    "fit": fit, "neurons": neurons, "own_system": own_system, "paper": paper,
+    "recording": recording, "robot": robot, "strides": strides, "sweep": sweep,
+    "walking": walking,
 }  # fmt: skip
 
 

@@ -152,10 +152,11 @@ UNCHECKED = {
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses", "Inspection",
-        "Lanes",
+        "IntervalForecast", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
-        "OutputLevels", "ParameterGuesses", "Phase", "PlacedSections", "Plan", "Plot",
+        "NaturalMultipliers", "OutputLevels", "ParameterGuesses", "Phase", "PhaseResponse",
+        "PlacedSections", "Plan", "Plot",
         "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",
         "Winding",

@@ -48,13 +48,17 @@ def simulate_beats(
     n = len(table)
     table = np.append(table, table[0])
     rng = np.random.default_rng(seed)
+
+    def at(phase):
+        place = (phase % 1.0) * n
+        low = np.minimum(place.astype(int), n - 1)
+        return table[low] + (place - low) * (table[low + 1] - table[low])
+
     phase, events = rng.uniform(size=S), [[] for _ in range(S)]
     for i in range((m - 1) * steps):
         k, part = i // steps, (i % steps + 0.5) / steps
         u = (1 - part) * force[:, k] + part * force[:, k + 1]
-        place = phase * n
-        low = np.minimum(place.astype(int), n - 1)
-        z = table[low] + (place - low) * (table[low + 1] - table[low])
+        z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
         move = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):

@@ -28,6 +28,9 @@ _POINTS = 1024
 # How far tables reach, in cycles: the step in which an interval ends goes beyond 1. Doubled:
 # nothing changes.
 _REACH = 1.5
+# Largest logarithm of what a difference in phase grows by in a step. Doubled: nothing changes but
+# where curves jump, whose slope is not known there.
+_LARGEST_GROWTH = 0.5
 # Iterations of Newton's method for the end of an interval within a step. Doubled: nothing changes.
 _NEWTON = 4
 
@@ -99,6 +102,11 @@ def forecast(
     return found
 
 
+def _exp(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Of what changes in a step; where a curve jumps, it is no larger than that."""
+    return np.exp(np.clip(x, -_LARGEST_GROWTH, _LARGEST_GROWTH))
+
+
 class _Chunk:
     """Intervals that are integrated together."""
 
@@ -138,7 +146,7 @@ class _Chunk:
                 if slopes:
                     short = np.minimum(part, 1.0)[:, None]
                     gain = (1 - short) * growth[done, None] + short * after_growth[done, None]
-                    gain = np.exp(short * h[done, None] * (growth[done, None] + gain) / 2)
+                    gain = _exp(short * h[done, None] * (growth[done, None] + gain) / 2)
                     last = (1 - short) * force[done] + short * after_force[done]
                     half = short * h[done, None] / 2
                     at_end = gain * (drift[done] + half * force[done]) + half * last
@@ -146,7 +154,7 @@ class _Chunk:
                     found.by_curve[rows[done]] = at_end[:, :p]
                     found.by_rate[rows[done]] = at_end[:, p]
             if slopes:
-                gain = np.exp(h * (growth + after_growth) / 2)[:, None]
+                gain = _exp(h * (growth + after_growth) / 2)[:, None]
                 half = h[:, None] / 2
                 drift = gain * (drift + half * force) + half * after_force
                 force, growth = after_force, after_growth

@@ -29,8 +29,11 @@ from .phase_model import basis
 
 # Harmonics of a curve, at most. Doubled: curves with finer detail, where jitter allows any.
 _MOST = 8
+# Relative difference of two errors of forecasts that are as good as equal. Doubled: curves are
+# smoother.
+_AS_GOOD = 0.02
 # Harmonics beyond the best number that are tried. Doubled: those that pay only together are found.
-_FURTHER = 1
+_FURTHER = 2
 # Phases at which a curve is given. Doubled: smoother figures.
 _POINTS = 200
 # Half of the 95 % band, relative to the mean of the curve, that is wide. Doubled: less is said.
@@ -155,9 +158,10 @@ def phase_response(
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback).
-    - `harmonics`: K. By default one more than the number that forecasts best what was left out
-      (so that what is left of higher ones is small beside the errors), and not beyond
-      1/(pi jitter): the spread of the phase at the end of a cycle hides what is finer.
+    - `harmonics`: K. By default one more (so that what is left of higher ones is small beside the
+      errors) than the smallest number whose forecasts of what was left out are within 2 % of the
+      best, and not beyond 1/(pi jitter): the spread of the phase at the end of a cycle hides what
+      is finer.
 
     Standard errors are those of blocks of intervals, whose errors may depend on each other: trials
     if there are thirty or more, else parts of them.
@@ -226,8 +230,9 @@ def _resolved(jitter: float) -> int:
 
 
 def _best(fits: list[tuple[CurveFit, Accuracy]]) -> int:
-    """The number of harmonics that forecasts best what was left out."""
-    return int(np.argmin([accuracy.left_out.sum() for _, accuracy in fits]))
+    """The smallest number of harmonics that forecasts what was left out as well as any."""
+    missed = np.sqrt([accuracy.left_out.sum() for _, accuracy in fits])
+    return int(np.argmax(missed <= missed.min() * (1 + _AS_GOOD)))
 
 
 def _memory(intervals: Intervals, fit: CurveFit) -> float:

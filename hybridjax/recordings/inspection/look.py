@@ -72,7 +72,7 @@ def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> tup
     return (
         *other_cycles(recording, phase, outputs),
         *slow_changes(recording, phase, outputs),
-        *unanswered(data, names),
+        *(unanswered(data, names) if outputs else ()),
         *feedback(data),
     )
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
-from ..recording import Recording
+from ..recording import Recording, Trial
 from ..smoothing import bridgeable, gaps, inside
 from .winding import LONGEST_GAP, Phase, Winding
 
@@ -32,7 +32,7 @@ _OWN = 20
 _LONG_GAP, _SHORT_GAP = 0.25, 0.1
 # Share of intervals of another kind that make them part of the rhythm. Doubled: rhythms of long and
 # short cycles are cut at each long one.
-_COMMON = 0.15
+_COMMON = 0.05
 # Cycles by which a causal phase goes on until the next event, at least. Doubled: it follows a
 # sudden change of the period with more delay.
 _LEAST_PROGRESS = 0.1
@@ -59,6 +59,7 @@ def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
                 f"trial '{trial.name}' has no event '{name}'; its events are: {there}."
             )
         times.append(trial.events[name])
+        _refuse_outside(trial, name)
     intervals = np.concatenate([np.diff(t) for t in times])
     if len(intervals) < 2:
         raise DefinitionError(f"there are too few events '{name}' for two cycles.")
@@ -89,6 +90,18 @@ def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
         else:
             stretches.append(tuple(Winding(p, np.arange(len(p), dtype=float), True) for p in parts))
     return Phase(stretches, dropped=dropped, missed=missed, lead=0 if causal else 1)
+
+
+def _refuse_outside(trial: Trial, name: str) -> None:
+    """**Raises:** `DefinitionError` if events of this name all lie before the first sample of a
+    trial or after the last."""
+    at, time = trial.events[name], trial.time
+    if len(at) and not ((at >= time[0]) & (at <= time[-1])).any():
+        raise DefinitionError(
+            f"trial '{trial.name}': all events '{name}' ({at[0]:.6g} s, ...) are outside of the "
+            f"recording, which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another "
+            "zero or unit."
+        )
 
 
 class _Rhythm(NamedTuple):

@@ -1,0 +1,108 @@
+"""Phase response curves of rhythms of which only the events are known."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.recordings.beats.estimation import fit_curve
+from hybridjax.recordings.beats.intervals import intervals_of
+from hybridjax.recordings.beats.phase_model import Table, forecast
+
+
+X = np.arange(200) / 200
+CURVE = 1 - 0.5 * np.cos(2 * np.pi * X) + 0.2 * np.sin(2 * np.pi * X)
+BEAT = hj.AtEvent("beat")
+
+
+def beats(jitter, trials=4, seconds=4, seed=0):
+    t = np.arange(0, seconds + 1e-9, 1e-3)
+    force = np.stack([6 * np.sin(2 * np.pi * f * t) for f in np.linspace(2, 17, trials)])
+    return hj.testing.simulate_beats(CURVE, force, rate=1000, rhythm=10.0, jitter=jitter, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return beats(0.05, trials=8)
+
+
+@pytest.fixture(scope="module")
+def found(noisy):
+    return hj.recordings.phase_response(noisy, BEAT, input="u")
+
+
+def test_a_rhythm_without_noise_is_found_exactly():
+    exact = hj.recordings.phase_response(beats(0.0), BEAT, input="u", harmonics=1)
+    np.testing.assert_allclose(exact.coefficients, [1, -0.5, 0.2], atol=3e-3)
+    np.testing.assert_allclose(exact.rates, 10, atol=5e-3)
+    assert exact.r2 > 0.9999 and exact.result == 0 and exact.miscounted == 0
+
+
+def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
+    low, high = found.interval(X, 0.99)
+    assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
+    assert found.harmonics >= 1 and abs(found.jitter - 0.05) < 0.01
+    flat = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=[1.0], folds=3)
+    own = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=found, folds=3)
+    true = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=CURVE, folds=3)
+    assert flat.r2 + 0.01 < own.r2 < true.r2 + 0.02
+    assert "Shape: it adds" in repr(found)
+
+
+def test_slopes_are_derivatives(noisy):
+    intervals = intervals_of(noisy, hj.recordings.estimate_phase(noisy, BEAT), "u")
+    table, a, rates = Table.of(2, 0.05), np.array([1, -0.4, 0.2, 0.1, 0]), np.full(8, 10.0)
+    base = forecast(intervals, table, a, rates)
+    for k in range(5):
+        moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates, slopes=False)
+        difference = (moved.duration - base.duration) / 1e-5
+        np.testing.assert_allclose(base.by_curve[:, k], difference, atol=0.02 * 0.1)
+    moved = forecast(intervals, table, a, rates + 1e-5, slopes=False)
+    np.testing.assert_allclose(base.by_rate, (moved.duration - base.duration) / 1e-5, atol=5e-4)
+
+
+def test_missed_events_do_not_count(noisy):
+    lost = hj.testing.spoil(noisy, "u", hj.testing.Dirt(lost_events=6, seed=1))
+    phase = hj.recordings.estimate_phase(lost, BEAT)
+    fit = fit_curve(intervals_of(lost, phase, "u"), 1)
+    assert np.abs(fit.coefficients - [1, -0.5, 0.2]).max() < 0.1
+    assert phase.missed + (~fit.used).sum() > 20
+
+
+def test_intervals_of_all_lengths_are_no_missed_events():
+    """A slow current makes some intervals three times as long as others."""
+    t = np.arange(0, 20.0005, 1e-3)
+    slow = 5 * np.sin(np.pi * t)[None]
+    slow = hj.testing.simulate_beats([1.0], slow, rate=1000, rhythm=10.0, jitter=0.03)
+    (periods,) = hj.recordings.estimate_phase(slow, BEAT).periods
+    assert periods.max() > 1.8 * np.median(periods)
+    assert len(periods) == len(slow.trials[0].events["beat"]) - 1
+
+
+def test_what_is_refused(noisy):
+    def refuse(message, recording=noisy, phase=BEAT, **options):
+        with pytest.raises(hj.DefinitionError, match=message) as error:
+            hj.recordings.phase_response(recording, phase, **{"input": "u"} | options)
+        assert "\n" not in str(error.value)
+
+    refuse("no signal 'v'; the recording has u", input="v")
+    refuse("no event 'spike'", phase=hj.AtEvent("spike"))
+    t = np.arange(0.0, 10, 0.01)
+    beat = {"beat": np.arange(9.0)}
+    refuse("u is constant", hj.Recording(t, {"u": 0 * t}, events=beat))
+    refuse("has no samples of the input u", hj.Recording(t, {"u": np.nan * t}, events=beat))
+    wave = {"u": np.sin(t)}
+    refuse(
+        "all events 'beat' .* are outside of the recording",
+        hj.Recording(t, wave, events={"beat": t[:50] + 20}),
+    )
+    refuse("too few events", hj.Recording(t, wave, events={"beat": [1.0, 2.0]}))
+    refuse("9 intervals|8 intervals are too few", hj.Recording(t, wave, events=beat), harmonics=4)
+    angle = hj.KinematicPhase(4, position="a", velocity="b")
+    circle = hj.Recording(t, wave | {"a": np.cos(6 * t), "b": np.sin(6 * t)})
+    refuse("must be one of events", circle, hj.recordings.estimate_phase(circle, angle))
+
+
+def test_events_alone_are_identified(noisy):
+    found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
+    assert found.data.outputs == ("duration",) and found.fit.outputs == ("duration",)
+    assert np.isfinite(found.fit.numerators).all()

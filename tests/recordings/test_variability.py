@@ -1,0 +1,69 @@
+"""Multipliers from natural variability, and inputs that are feedback."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.recordings.inspection.feedback import feedback
+
+
+N = 8
+
+
+def variable(noise, strides=(300, 300), multiplier=0.6, seed=0):
+    """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
+    rng, gains = np.random.default_rng(seed), np.random.default_rng(5).normal(size=(N, 3))
+    trials = []
+    for count in strides:
+        x, y = 0.0, []
+        for n in range(count * N):
+            y.append(gains[n % N] * x)
+            x = multiplier ** (1 / N) * x + rng.normal()
+        y = np.array(y)
+        y += noise * y.std(axis=0) * rng.normal(size=y.shape)
+        signals = {f"y{i}": column for i, column in enumerate(y.T)}
+        t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
+        trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
+    recording = hj.Recording.join(trials)
+    return hj.recordings.section_data(
+        recording, hj.AtEvent("e"), inputs=(), outputs=recording.signals, n_sections=N,
+        bandwidth=np.inf,
+    )  # fmt: skip
+
+
+def test_instruments_have_no_bias_by_noise():
+    found = [hj.recordings.natural_multipliers(variable(0.7, seed=k)) for k in range(3)]
+    (low, high), (_, top) = found[0].interval(0.99)[0], found[0].plain_interval()[0]
+    assert low < 0.6 < high and top < 0.6
+    assert abs(np.mean([f.multipliers[0].real for f in found]) - 0.6) < 0.05
+    assert np.mean([f.plain[0].real for f in found]) < 0.53
+    assert any("least squares gives" in text for text in found[0].warnings)
+
+
+def test_short_records_are_drawn_whole():
+    """No interval is narrow because a record holds only one block."""
+    found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
+    low, high = found.interval()[0]
+    assert high - low > 0.2 and any("Few cycles" in text for text in found.warnings)
+
+
+def test_what_is_refused():
+    data = variable(0.1, strides=(6,))
+    with pytest.raises(hj.DefinitionError, match="too few for 3 multipliers"):
+        hj.recordings.natural_multipliers(data, 3)
+    with pytest.raises(hj.DefinitionError, match="the state at a section has 6 numbers"):
+        hj.recordings.natural_multipliers(data, 7)
+    with pytest.raises(hj.DefinitionError, match="holds no input"):
+        hj.fit_series(data, 1)
+
+
+def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
+    turns = hj.AtEvent("turn")
+    marked = rhythm.mark("turn", hj.Crossing("v", "falling"))
+    given = hj.recordings.section_data(
+        marked, turns, inputs="force", outputs=("x", "v"), n_sections=8
+    )
+    assert feedback(given) == []
+    loop = hj.recordings.section_data(marked, turns, inputs="x", outputs="v", n_sections=8)
+    (finding,) = feedback(loop)
+    assert finding.cause == "feedback" and "repeats with the cycle" in finding.text
