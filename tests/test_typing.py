@@ -132,13 +132,6 @@ UNCHECKED = {
     "functions of a state, called while JAX traces them": {
         "BuckConverter.control",
         "CompliantHopper.ground",
-        "Mechanism.acceleration",
-        "Mechanism.along",
-        "Mechanism.bias",
-        "Mechanism.constrained",
-        "Mechanism.energy",
-        "Mechanism.impact",
-        "Mechanism.mass",
         "PaddleJuggler.paddle",
         "SLIPRunner.energy",
         "VerticalHopper.leg",

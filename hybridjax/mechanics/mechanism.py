@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.vector_math.small_matrices import solve_positive
+from ..systems.structure import as_vector
 
 
 class Constrained(NamedTuple):
@@ -129,7 +130,7 @@ class Mechanism(eqx.Module):
         **Arguments:** `contact`, the coordinates c(q) of the contacts made, k <= n independent ones
         as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
         """
-        jacobian = jax.jacfwd(lambda q: jnp.asarray(contact(q)))(q)
+        jacobian = jax.jacfwd(lambda q: as_vector(contact(q)))(q)
         by_impulse = _solve_columns(self.mass(q), jacobian.T)
         impulse = solve_positive(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v))
         return Impact(v + by_impulse @ impulse, impulse)
@@ -140,7 +141,7 @@ class Mechanism(eqx.Module):
         A biped whose coordinates are those of the hip and angles of its links becomes one that
         stands on a foot: `biped.along(lambda angles: [*hip_above_foot(angles), *angles])`.
         """
-        place = lambda p: jnp.stack([jnp.asarray(x, float) for x in placement(p)])  # noqa: E731
+        place = lambda p: as_vector(placement(p))  # noqa: E731
         return Mechanism(
             lambda p, v: self.kinetic(*jax.jvp(place, (p,), (v,))),
             lambda p: self.potential(place(p)),
@@ -149,7 +150,7 @@ class Mechanism(eqx.Module):
 
 def _moving(contact, q, v):
     """The Jacobian of a contact, and the part of its acceleration that the velocities make."""
-    place = lambda q: jnp.asarray(contact(q))  # noqa: E731
+    place = lambda q: as_vector(contact(q))  # noqa: E731
     speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
     return jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
 

@@ -43,7 +43,7 @@ class Quotient(HybridSystem):
     of a step of `system`, the multipliers of a step are those of S P, and those of the stride,
     (S P)^2, are their squares.
 
-    **Fields:**
+    **Arguments:**
 
     - `system`: written in full, with its own guess in a chart that is kept.
     - `swap`: charts that are mirror images of each other, {kept: left out}. The transitions of
@@ -60,10 +60,34 @@ class Quotient(HybridSystem):
     """
 
     system: HybridSystem
-    swap: Mapping[str, str] = eqx.field(static=True, default_factory=dict, converter=dict)
-    relabel: Mapping[str, str] = eqx.field(static=True, default_factory=dict, converter=dict)
-    flipped: SignalNames = eqx.field(static=True, default=())
-    translation: SignalNames = eqx.field(static=True, default=())
+    pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    names: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    flipped: tuple[str, ...] = eqx.field(static=True)
+    translation: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        system: HybridSystem,
+        swap: Mapping[str, str] | None = None,
+        relabel: Mapping[str, str] | None = None,
+        flipped: SignalNames = (),
+        translation: SignalNames = (),
+    ):
+        self.system = system
+        self.pairs, self.names = (tuple((x or {}).items()) for x in (swap, relabel))
+        self.flipped, self.translation = (
+            (x,) if isinstance(x, str) else tuple(x) for x in (flipped, translation)
+        )
+
+    @property
+    def swap(self) -> dict[str, str]:
+        """Charts that are kept, each with its mirror image, which is left out."""
+        return dict(self.pairs)
+
+    @property
+    def relabel(self) -> dict[str, str]:
+        """States that trade their names."""
+        return dict(self.names)
 
     def __check_init__(self):
         charts = self.system.charts()

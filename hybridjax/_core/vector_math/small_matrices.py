@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 LARGEST, LARGEST_PIVOTED = 12, 7
 
 
+@jax.jit
 def solve_positive(
     matrix: Float[Array, "*b n n"], right: Float[Array, "*b n"]
 ) -> Float[Array, "*b n"]:

@@ -6,15 +6,15 @@ E. R. Westervelt, J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedbac
 Dynamic Bipedal Robot Locomotion, CRC Press, 2007.
 """
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ...mechanics.mechanism import Mechanism
 from ...systems.chart import Chart
 from ...systems.output import Output
 from ...systems.system import Guess, HybridSystem, Parameter, parameter
 from ...systems.transition import Transition
-from .torso_walker import accelerations_under_feedback, held
+from .torso_walker import accelerations_under_feedback, chain, held, on_its_foot, tips
 
 
 class Step(Chart):
@@ -41,9 +41,8 @@ class Step(Chart):
         wanted = [knee / 2, -knee / 2, torso, mirrored - swing_knee / 2, mirrored + swing_knee / 2]
         one = jnp.ones_like(slope)
         along = jnp.stack([one, one, 0 * one, -1 - slope / 2, -1 + slope / 2])
-        a = accelerations_under_feedback(mechanism, q, v, along, jnp.stack(wanted))
         torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
-        a = a + mechanism.acceleration(q, 0 * v, torque + mechanism.bias(q, 0 * v))
+        a = accelerations_under_feedback(mechanism, q, v, along, jnp.stack(wanted), torque)
         return jnp.concatenate([v, a])
 
 
@@ -84,39 +83,24 @@ class FiveLinkBiped(HybridSystem):
 
     def floating(self) -> Mechanism:
         """The biped with free feet, by five angles and the place (x, y) of the stance foot."""
-        m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])
-        about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])
-        center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])
-        order = jnp.array([0, 1, 2, 1, 0])
-        masses, inertias = m[order], (about_joint - m * center**2)[order]
-
-        def centers(q):
-            way = jnp.stack([jnp.sin(q[:5]), jnp.cos(q[:5])], axis=1)
-            knee = q[5:] + self.length * way[0]
-            hip = knee + self.length * way[1]
-            other_knee = hip - self.length * way[3]
-            return jnp.stack([
-                knee - self.shin_center * way[0],
-                hip - self.thigh_center * way[1],
-                hip + self.torso_center * way[2],
-                hip - self.thigh_center * way[3],
-                other_knee - self.shin_center * way[4],
-            ])  # fmt: skip
-
-        def kinetic(q, v):
-            speeds = jax.jvp(centers, (q,), (v,))[1]
-            return 0.5 * jnp.sum(masses[:, None] * speeds**2) + 0.5 * jnp.sum(inertias * v[:5] ** 2)
-
-        return Mechanism(kinetic, lambda q: self.g * jnp.sum(masses * centers(q)[:, 1]))
+        order = np.array([0, 1, 2, 1, 0])
+        m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])[order]
+        about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]
+        center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])[order]
+        # From the foot along whole links, and then along part of the own one.
+        links = np.array(
+            [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
+        )
+        arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
+        return chain(arms, m, about_joint - m * center**2, self.g)
 
     def standing(self) -> Mechanism:
         """The biped on its stance foot, by five angles."""
-        return self.floating().along(lambda q: [*q, 0.0, 0.0])
+        return on_its_foot(self.floating())
 
     def _swing_foot(self, q):
         """Its place relative to the stance foot, (x, y)."""
-        s, c = jnp.sin(q), jnp.cos(q)
-        return self.length * jnp.stack([s[0] + s[1] - s[3] - s[4], c[0] + c[1] - c[3] - c[4]])
+        return tips(self.length * np.array([[1.0, 1.0, 0.0, -1.0, -1.0]]), q[:5])[:, 0]
 
     def outputs(self):
         """`leg`: the angle of the line from stance foot to hip, which grows all the time."""

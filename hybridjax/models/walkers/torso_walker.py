@@ -8,12 +8,42 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..._core.vector_math.small_matrices import solve_positive
 from ...mechanics.mechanism import Mechanism
 from ...systems.chart import Chart
 from ...systems.system import Guess, HybridSystem, Parameter, parameter
 from ...systems.transition import Transition
+
+
+def tips(arms: Float[Array, "k n"], q: Float[Array, " n"]) -> Float[Array, "2 k"]:
+    """Where points of a chain of links are, relative to its foot: `arms` are the lengths that they
+    have along each link, q the links' angles from the vertical."""
+    return jnp.stack([jnp.sin(q), jnp.cos(q)]) @ arms.T
+
+
+def chain(
+    arms: Float[Array, "k n"],
+    masses: Float[Array, " k"],
+    inertias: Float[Array, " n"] | float,
+    g: Array,
+) -> Mechanism:
+    """A chain of n links in a plane, by their angles and the place (x, y) of its foot."""
+    n = arms.shape[1]
+    places = lambda q: q[n:, None] + tips(arms, q[:n])  # noqa: E731
+
+    def kinetic(q, v):
+        speeds = jax.jvp(places, (q,), (v,))[1]
+        return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
+
+    return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]))
+
+
+def on_its_foot(mechanism: Mechanism) -> Mechanism:
+    """A chain whose foot stands at the origin, by its angles."""
+    return mechanism.along(lambda q: jnp.append(q, jnp.zeros(2)))
 
 
 def accelerations_under_feedback(
@@ -22,16 +52,19 @@ def accelerations_under_feedback(
     v: Float[Array, " n"],
     along: Float[Array, " n"],
     wanted: Float[Array, " n"],
+    torque: Float[Array, " n"],
 ) -> Float[Array, " n"]:
     """Accelerations `wanted` + x `along` of a chain that stands on a point, with motors between
     its links.
 
     Angles are absolute, so that the motors' torques have no sum: the sum of the equations of
-    motion, 1'(M a + h) = 0, gives x. The motors do the rest (input-output linearization).
+    motion, 1'(M a + h) = 0, gives x. The motors do the rest (input-output linearization), and know
+    nothing of a further `torque`.
     """
     mass = mechanism.mass(q)
     left_over = jnp.sum(mechanism.bias(q, v)) + jnp.sum(mass @ wanted)
-    return wanted - along * left_over / jnp.sum(mass @ along)
+    passive = -left_over / jnp.sum(mass @ along)
+    return wanted + along * passive + solve_positive(mass, torque)
 
 
 def held(error: Array, rate: Array, stiffness: Array) -> Array:
@@ -50,9 +83,8 @@ class Step(Chart):
         upright = held(q[2] - p.lean, v[2], p.stiffness)
         mirrored = held(q[0] + q[1], v[0] + v[1], p.stiffness)
         wanted = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
-        a = accelerations_under_feedback(mechanism, q, v, jnp.array([1.0, -1.0, 0.0]), wanted)
-        torque = u[0] * jnp.array([0.0, -1.0, 1.0])
-        a = a + mechanism.acceleration(q, 0 * v, torque + mechanism.bias(q, 0 * v))
+        along, torque = jnp.array([1.0, -1.0, 0.0]), u[0] * jnp.array([0.0, -1.0, 1.0])
+        a = accelerations_under_feedback(mechanism, q, v, along, wanted, torque)
         return jnp.concatenate([v, a])
 
 
@@ -82,23 +114,14 @@ class TorsoWalker(HybridSystem):
 
     def floating(self) -> Mechanism:
         """The walker with free feet, by three angles and the place (x, y) of the stance foot."""
-        masses = jnp.stack([self.m, self.m, self.mH, self.mT])
-
-        def places(q):
-            way = jnp.stack([jnp.sin(q[:3]), jnp.cos(q[:3])])
-            hip = q[3:] + self.r * way[:, 0]
-            masses = q[3:] + self.r / 2 * way[:, 0], hip - self.r / 2 * way[:, 1]
-            return jnp.stack([*masses, hip, hip + self.l * way[:, 2]])
-
-        def kinetic(q, v):
-            speeds = jax.jvp(places, (q,), (v,))[1]
-            return 0.5 * jnp.sum(masses[:, None] * speeds**2)
-
-        return Mechanism(kinetic, lambda q: self.g * jnp.sum(masses * places(q)[:, 1]))
+        half = self.r / 2
+        legs = half * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
+        arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
+        return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
 
     def standing(self) -> Mechanism:
         """The walker on its stance foot, by three angles."""
-        return self.floating().along(lambda q: [*q, 0.0, 0.0])
+        return on_its_foot(self.floating())
 
     def charts(self):
         return {"step": Step(self)}
@@ -118,12 +141,11 @@ class TorsoWalker(HybridSystem):
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
         after = self.floating().impact(q, v, self._swing_foot).velocity
-        swapped = jnp.array([1, 0, 2])
+        swapped = np.array([1, 0, 2])
         return jnp.concatenate([q[swapped], after[swapped]])
 
     def _swing_foot(self, q):
-        way = jnp.stack([jnp.sin(q[:2]), jnp.cos(q[:2])])
-        return q[3:] + self.r * (way[:, 0] - way[:, 1])
+        return q[3:] + tips(self.r * np.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
 
     def guess(self):
         return Guess("step", (-self.stride, self.stride, self.lean, 1.5, -1.5, 0.0))
