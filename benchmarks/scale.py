@@ -43,7 +43,7 @@ import hybridjax as hj
 
 
 STEPS = ("sweep", "kills", "experiments", "workers")
-QUIET = {"dashboard_address": None, "threads_per_worker": 1}
+QUIET = {"dashboard_address": ":0", "threads_per_worker": 1}
 
 
 def show(name: str, value: float) -> None:
@@ -245,7 +245,7 @@ def experiments(count: int, folder: pathlib.Path) -> None:
 
 def workers(count: int) -> None:
     """One scheduler; the workers are threads' worth of processes that only sleep."""
-    options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": None}
+    options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": ":0"}
     with LocalCluster(**options) as cluster, Client(cluster) as client:
         for seconds in (0.0, 1.0, 4.0, 16.0):
             tasks = (5 if seconds == 0 else 3) * count
