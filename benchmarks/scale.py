@@ -218,7 +218,7 @@ def experiments(count: int, folder: pathlib.Path) -> None:
     outputs, periods = ("yM", "vM"), 16
 
     def store(S: int):
-        design = hj.multisine(experiments=S, periods=periods)
+        design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
         records = hj.experiments.store_experiments(
             folder / f"{S}.zarr", cycle, placed, design, outputs, start="cycle", discard=4
