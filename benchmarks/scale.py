@@ -43,7 +43,7 @@ import hybridjax as hj
 
 
 STEPS = ("sweep", "kills", "experiments", "workers")
-QUIET = {"dashboard_address": None, "threads_per_worker": 1}
+QUIET = {"dashboard_address": ":0", "threads_per_worker": 1}
 
 
 def show(name: str, value: float) -> None:
@@ -218,7 +218,7 @@ def experiments(count: int, folder: pathlib.Path) -> None:
     outputs, periods = ("yM", "vM"), 16
 
     def store(S: int):
-        design = hj.multisine(experiments=S, periods=periods)
+        design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
         records = hj.experiments.store_experiments(
             folder / f"{S}.zarr", cycle, placed, design, outputs, start="cycle", discard=4
@@ -245,7 +245,7 @@ def experiments(count: int, folder: pathlib.Path) -> None:
 
 def workers(count: int) -> None:
     """One scheduler; the workers are threads' worth of processes that only sleep."""
-    options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": None}
+    options = {"n_workers": 4, "threads_per_worker": count // 4, "dashboard_address": ":0"}
     with LocalCluster(**options) as cluster, Client(cluster) as client:
         for seconds in (0.0, 1.0, 4.0, 16.0):
             tasks = (5 if seconds == 0 else 3) * count

@@ -24,7 +24,7 @@ def main() -> None:
         tempfile.TemporaryDirectory() as folder,
         SLURMCluster(
             cores=1, processes=1, memory="2GB", walltime="00:20:00", job_script_prologue=kept,
-            log_directory=folder, scheduler_options={"dashboard_address": None},
+            log_directory=folder, scheduler_options={"dashboard_address": ":0"},
         ) as cluster,
     ):  # fmt: skip
         cluster.scale(jobs=2)

@@ -9,6 +9,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments import StoredExperiments, store_experiments
+from hybridjax.experiments.options import Options
+from hybridjax.experiments.stored.pieces import prepare_pieces
 
 from ..conftest import OUTPUTS
 
@@ -118,6 +120,20 @@ def test_another_system_is_refused(made, arguments):
     other = eqx.tree_at(lambda p: p.cycle.system.k, placed, jnp.asarray(10.001, float))
     with pytest.raises(hj.DefinitionError, match="`model.numbers.k` is 10.0, not 10.001"):
         store_experiments(made.address, other.cycle, other, design, outputs, chunk=40, **BATCH)
+
+
+@pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
+def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
+    """It gets all but what is compiled, and gives the same records."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    design = hj.experiments.single_cosine([0.25, 0.75], 32, 4)
+    options = Options(start=start)
+    job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
+    sent = cloudpickle.loads(cloudpickle.dumps(job.restored(job.arrays())))
+    here, there = job.run(0, None), sent.run(0, 1)
+    assert here.keys() == there.keys()
+    for name, values in here.items():
+        np.testing.assert_array_equal(there[name], values)
 
 
 def test_events_are_kept(hopper_cycle, tmp_path):

@@ -32,7 +32,7 @@ def fails(rng):
 
 @pytest.fixture(scope="module")
 def client():
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
         yield client
 
@@ -56,6 +56,22 @@ def test_draws_that_fail_are_named():
     found = hj.monte_carlo(fails, 20, seed=1)
     assert 0 < found.failed.sum() < 20
     np.testing.assert_array_equal(np.isnan(found.value), found.failed == 1)
+
+
+def test_an_interruption_leaves_whole_pieces(tmp_path):
+    stop = iter([False] * 7 + [True])  # (the first draw is made once more, to see its shape)
+
+    def drawn(rng):
+        if next(stop, False):
+            raise KeyboardInterrupt
+        return rng.normal()
+
+    with pytest.raises(KeyboardInterrupt):
+        hj.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
+    assert len(list(tmp_path.glob("draws.zarr/value/c/*"))) == 3
+    found = hj.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
+    expected = [np.random.default_rng(np.random.SeedSequence(0, spawn_key=(i,))) for i in range(10)]
+    np.testing.assert_array_equal(found.value, [rng.normal() for rng in expected])
 
 
 def test_draws_must_stay_alike():

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ... import __version__
+
 
 def versions() -> dict[str, str]:
     """Of the packages on which numbers depend to the last bit."""
-    names = ("hybridjax", "jax", "jaxlib", "numpy", "scipy")
-    return {name: importlib.metadata.version(name) for name in names}
+    others = ("jax", "jaxlib", "numpy", "scipy")
+    return {"hybridjax": __version__} | {x: importlib.metadata.version(x) for x in others}
 
 
 def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
