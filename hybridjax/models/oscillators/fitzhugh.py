@@ -5,9 +5,9 @@ R. FitzHugh, Impulses and physiological states in theoretical models of nerve me
 nerve axon, Proc. IRE 50 (1962) 2061-2070.
 """
 
-from ..systems.chart import Chart
-from ..systems.solver import Radau
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.solver import Radau
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Membrane(Chart):

@@ -6,9 +6,9 @@ thesis, Cornell University, 1998.
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Transition
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Transition
 
 
 class Swing(Chart):

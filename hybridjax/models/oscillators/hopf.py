@@ -6,8 +6,8 @@ fields, Springer 1983, Sec. 3.4.
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Plane(Chart):

@@ -6,8 +6,8 @@ rotor stability, J. American Helicopter Society 16(2), 1971 (without reversed fl
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Blade(Chart):

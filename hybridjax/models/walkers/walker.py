@@ -6,9 +6,9 @@ and scaling, J. Biomechanical Engineering 120, 1998.
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Transition
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Transition
 
 
 class Step(Chart):

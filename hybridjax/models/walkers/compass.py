@@ -8,9 +8,9 @@ import math
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Transition
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Transition
 
 
 class Step(Chart):

@@ -6,8 +6,8 @@ T. Mook, Nonlinear oscillations, Wiley 1979, Sec. 4.1.
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Line(Chart):

@@ -6,9 +6,9 @@ alternate friction models, Nonlinear Dynamics 16, 1998.
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
-from ..systems.sliding import Sliding, sliding
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.sliding import Sliding, sliding
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Slips(Chart):

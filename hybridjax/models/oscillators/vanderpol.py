@@ -3,8 +3,8 @@
 B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926).
 """
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
 
 
 class Oscillation(Chart):
