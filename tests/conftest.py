@@ -7,6 +7,11 @@ import tempfile
 # Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
 # that wait for each other cost ten times the work, and XLA reports each cached program.
 os.environ.update(OPENBLAS_NUM_THREADS="1", TF_CPP_MIN_LOG_LEVEL="3")
+# Most of the time of a test is that of compiling what it runs once.
+os.environ["XLA_FLAGS"] = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    + os.environ.get("XLA_FLAGS", "")
+)
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _programs = tempfile.TemporaryDirectory()
     os.environ["HYBRIDJAX_CACHE"] = _programs.name

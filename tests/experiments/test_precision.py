@@ -24,10 +24,9 @@ def both(request, hopper_cycle, design):
     placed = request.getfixturevalue(
         {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}[request.param]
     )
-    run = lambda precision: hj.run_experiments(  # noqa: E731
-        hopper_cycle, placed, design, OUTPUTS, execution=hj.Execution(batch=40, precision=precision)
-    )
-    return placed, run("double"), run("single")
+    double = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS)
+    single = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, execution=SINGLE)
+    return placed, double, single
 
 
 def test_errors_are_those_reported(both):
