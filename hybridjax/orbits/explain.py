@@ -93,6 +93,8 @@ def _about_stiffness(cycle: LimitCycle, turn: Turn, expected: float) -> str:
     if turn.result != Result.STEP_LIMIT:
         return ""
     for a, t, q in points(s, turn.legs):
+        if (method := s.method(a)) and method.implicit:
+            continue
         rate = max(rate, float(fastest(s, a, t, q).max()))
     if rate * expected / LEGS < _STIFF:
         return ""
