@@ -32,7 +32,7 @@ _OWN = 20
 _LONG_GAP, _SHORT_GAP = 0.25, 0.1
 # Share of intervals of another kind that make them part of the rhythm. Doubled: rhythms of long and
 # short cycles are cut at each long one.
-_COMMON = 0.05
+_COMMON = 0.1
 # Cycles by which a causal phase goes on until the next event, at least. Doubled: it follows a
 # sudden change of the period with more delay.
 _LEAST_PROGRESS = 0.1
