@@ -62,7 +62,8 @@ def check_share(share: tuple[int, int]) -> None:
 
 def absolute(address: Any) -> str:
     """An address that means the same in another process."""
-    return str(address) if "://" in str(address) else os.path.abspath(address)
+    address = str(address).removeprefix("file://")
+    return address if "://" in address else os.path.abspath(address)
 
 
 def _wait(address: str, description: Mapping[str, Any]) -> ZarrStore:
