@@ -1,20 +1,23 @@
 import contextlib
 import os
 import pathlib
+import subprocess
+import sys
 import tempfile
 
 
 # Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
 # that wait for each other cost ten times the work, and XLA reports each cached program.
 os.environ.update(OPENBLAS_NUM_THREADS="1", TF_CPP_MIN_LOG_LEVEL="3")
-# Most of the time of a test is that of compiling what it runs once.
-os.environ["XLA_FLAGS"] = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    + os.environ.get("XLA_FLAGS", "")
-)
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _programs = tempfile.TemporaryDirectory()
     os.environ["HYBRIDJAX_CACHE"] = _programs.name
+    # Most of the time of a test is that of compiling what it runs once. (XLA ends the process where
+    # it does not know an option.)
+    _quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    _flags = {**os.environ, "XLA_FLAGS": f"{_quick} {os.environ.get('XLA_FLAGS', '')}"}
+    if not subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=_flags).returncode:
+        os.environ.update(_flags)
 
 import hypothesis
 import jax
@@ -24,7 +27,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.compilation import compile, stored
-from hybridjax.experiments.stored import pieces
 
 
 hj.enable_x64()
@@ -57,7 +59,7 @@ def unchecked_host():
 compile.at_ease = unchecked_host
 # Results of one test come from one program.
 stored._WORTH_A_PROCESS = np.inf
-pieces.ONE_PROGRAM = False
+stored.ONE_PROGRAM = False
 
 
 class no_compilation:

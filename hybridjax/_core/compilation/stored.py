@@ -31,6 +31,9 @@ from .portable import Executable, Portable, build, trace
 # Seconds that are spent in a program before it is compiled thoroughly, beside what goes on. Twice
 # as much: repeated calls stay slow for twice as long, and fewer processes are started in vain.
 _WORTH_A_PROCESS = 0.5
+# Whether experiments that go into a store all wait for the thorough program: of two programs, which
+# ran would depend on time.
+ONE_PROGRAM = True
 # Digests that are kept. Twice as many: twice as many kinds of jobs can be taken turns with.
 _KEYS = 256
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..._core.compilation import stored
 from ..._core.execution import Execution
 from ..._core.pieces.blocks import Blocks
 from ..._core.pieces.description import array_digest, digest_of, versions
@@ -26,8 +27,6 @@ from ..options import Options
 
 
 KIND = "experiments"
-# Whether all wait for one program: of two programs, which ran would depend on time.
-ONE_PROGRAM = True
 # Events of an experiment that are kept, for each of the limit cycle in the same time. Doubled,
 # files are larger.
 _MORE_EVENTS = 2
@@ -100,7 +99,7 @@ def prepare_pieces(
     given = Execution() if options.execution is None else options.execution
     # (Batches as for one thread: their size does not depend on the machine.)
     alone = dataclasses.replace(options, execution=dataclasses.replace(given, workers=1))
-    campaign = prepare(cycle, sections, design, outputs, alone, chunk, one_program=ONE_PROGRAM)
+    campaign = prepare(cycle, sections, design, outputs, alone, chunk, one_program=stored.ONE_PROGRAM)
     S = len(campaign.inputs)
     return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
 
