@@ -16,7 +16,8 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # it does not know an option.)
     _quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     _flags = {**os.environ, "XLA_FLAGS": f"{_quick} {os.environ.get('XLA_FLAGS', '')}"}
-    if not subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=_flags).returncode:
+    _try = [sys.executable, "-c", "import jax; jax.devices()"]
+    if subprocess.run(_try, env=_flags).returncode == 0:
         os.environ.update(_flags)
 
 import hypothesis

@@ -99,7 +99,9 @@ def prepare_pieces(
     given = Execution() if options.execution is None else options.execution
     # (Batches as for one thread: their size does not depend on the machine.)
     alone = dataclasses.replace(options, execution=dataclasses.replace(given, workers=1))
-    campaign = prepare(cycle, sections, design, outputs, alone, chunk, one_program=stored.ONE_PROGRAM)
+    campaign = prepare(
+        cycle, sections, design, outputs, alone, chunk, one_program=stored.ONE_PROGRAM
+    )
     S = len(campaign.inputs)
     return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
 
