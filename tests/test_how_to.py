@@ -1,4 +1,5 @@
-"""The pages that say how to do something run as they stand, and print what they show."""
+"""Pages of the site run as they stand, and print what they show: those on how to do something, and
+the examples of the reference."""
 
 import pytest
 from matplotlib import pyplot
@@ -6,7 +7,8 @@ from matplotlib import pyplot
 from .sessions import ROOT, Session, blocks, same_output
 
 
-PAGES = ["docs/index.md", *(f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md"))]
+FOLDERS = ("docs/how-to", "docs/reference")
+PAGES = ["docs/index.md", *(f"{x}/{p.name}" for x in FOLDERS for p in (ROOT / x).glob("*.md"))]
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ dt { color: #555; font-size: .85rem; } dd { margin: 0; }
 .warn { border-left: 4px solid #D55E00; padding: .3rem 1rem; background: #fdf3ec; }
 .fine { border-left: 4px solid #009E73; padding: .3rem 1rem; background: #edf8f4; }
 img { max-width: 100%; height: auto; } figure { margin: 1rem 0; }
+.wide { overflow-x: auto; } .wide img { min-width: 44rem; }
 figcaption { color: #555; font-size: .9rem; } ul { margin: .5rem 0; padding-left: 1.2rem; }
 """
 
@@ -47,7 +48,7 @@ def page(found: Identification, images: dict[str, str]) -> str:
         "<h2>Responses to a push</h2>",
         f"<p>What a brief push of area 1 (standard deviation {found.responses.width:.2g} cycles) "
         "does at each phase of the cycle.</p>",
-        _figure(images["impulse_responses"], "Bands hold the true response with 95 %."),
+        _figure(images["impulse_responses"], "Bands hold the true response with 95 %.", wide=True),
         "<h2>Harmonic transfer functions</h2>",
         *(
             _figure(image, _CAPTIONS[name.split("_")[0]])
@@ -204,6 +205,7 @@ def _validation(found: Identification, images: dict[str, str]) -> list[str]:
         _figure(
             images["validation"],
             "Measured and simulated deviations; correlations of what is left.",
+            wide=True,
         ),
     ]
 
@@ -220,11 +222,12 @@ def _recording(found: Identification, images: dict[str, str]) -> list[str]:
         f"<p>{phase.cycles} whole cycles. Period {phase.period:.4g} s (median), with a standard "
         f"deviation of {_percent(phase.jitter)} from cycle to cycle and a drift of "
         f"{100 * phase.drift:.2g} % per cycle.</p>",
-        _figure(images["phase"], "Durations of the cycles."),
+        _figure(images["phase"], "Durations of the cycles.", wide=True),
         _figure(
             images["sections"],
             "Average cycle; deviations with twice their standard deviation; power of inputs, and "
             "outputs from cycle to cycle at the section where they vary most.",
+            wide=True,
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
         f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags"
@@ -279,8 +282,11 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f'<div class="table"><table>{body}</table></div>'
 
 
-def _figure(image: str, caption: str) -> str:
+def _figure(image: str, caption: str, wide: bool = False) -> str:
+    """`wide`: of several panels side by side, which narrow screens scroll rather than shrink."""
+    name = "wide" if wide else "narrow"
     return (
-        f'<figure><img alt="{_safe(caption)}" src="data:image/png;base64,{image}">'
+        f'<figure><div class="{name}"><img alt="{_safe(caption)}" '
+        f'src="data:image/png;base64,{image}"></div>'
         f"<figcaption>{_safe(caption)}</figcaption></figure>"
     )
