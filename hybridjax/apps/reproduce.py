@@ -155,7 +155,7 @@ def _set_up() -> None:
 
 
 def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
-    known = [field.name for field in dataclasses.fields(VerticalHopper)]
+    known = [x.name for x in dataclasses.fields(VerticalHopper) if x.name != "solver"]
     for name in parameters:
         if name not in known:
             raise DefinitionError(

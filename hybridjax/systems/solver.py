@@ -75,9 +75,15 @@ class ByChart(NamedTuple):
 
 
 def solvers(
-    given: Solver | Method | ByChart | Mapping[str, Solver] | str | None,
-) -> Solver | Method | ByChart | str | None:
-    """A solver as it is, and solvers by the names of charts in a form that can be compared."""
+    given: Solver | Method | ByChart | Mapping[str, Solver] | None,
+) -> Solver | Method | ByChart | None:
+    """A solver as it is, and solvers by the names of charts in a form that can be compared.
+
+    **Raises:** `DefinitionError` for what is no solver.
+    """
+    for one in given.values() if isinstance(given, Mapping) else (given,):
+        if not isinstance(one, Method | eqx.Module | ByChart | None):
+            raise _no_solver(one)
     return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
 
 
@@ -94,10 +100,7 @@ def as_method(solver: Any) -> Method:
     import diffrax
 
     if not isinstance(solver, diffrax.AbstractSolver):
-        raise DefinitionError(
-            f"a solver must be one of diffrax, such as `diffrax.Kvaerno5()`, or `hj.Radau()`, not "
-            f"{solver!r}."
-        )
+        raise _no_solver(solver)
     name = type(solver).__name__
     if solver.term_structure not in (diffrax.AbstractTerm, diffrax.ODETerm):
         raise DefinitionError(
@@ -118,6 +121,13 @@ def as_method(solver: Any) -> Method:
             "`diffrax.Tsit5()` or `hj.Radau()`."
         )
     return _from_tableau(name, tableau, float(solver.order(None)))  # pyright: ignore
+
+
+def _no_solver(given: Any) -> DefinitionError:
+    return DefinitionError(
+        "a solver must be one of diffrax, such as `diffrax.Kvaerno5()`, or `hj.Radau()`, not "
+        f"{given!r}."
+    )
 
 
 def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) -> Method:

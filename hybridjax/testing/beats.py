@@ -9,6 +9,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NonNegative, Positive, Seed
+from ..errors import DefinitionError
 from ..recordings.recording import Recording
 
 
@@ -38,9 +39,15 @@ def simulate_beats(
     - `jitter`: s, the standard deviation of the phase that a cycle adds.
 
     **Returns:** a `Recording` with S trials, the input `u` and the events `beat`.
+
+    **Raises:** `DefinitionError` for a curve without values, or not as many rhythms as trials.
     """
     force = np.asarray(force, float)
     S, m = force.shape
+    if not len(np.asarray(curve)):
+        raise DefinitionError("`curve` needs at least one value.")
+    if np.size(rhythm) not in (1, S):
+        raise DefinitionError(f"`rhythm` must be one number, or one for each of {S} trials.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)
     steps = int(np.ceil(w.max() / (rate * _STEP)))
     h = 1 / (rate * steps)

@@ -44,6 +44,8 @@ FEW = [*COUNT, 10**6]
 
 INPUT = [None, *OUTPUT]
 TRUE = ["x", None, [NAN], [INF], Other(), {}]
+# (Durations alone, or variability alone, are data, too.)
+OR_NONE = [3, "nope", ("nope",), (3,), ("x", "x"), Other()]
 SIGNAL = [None, 3, (), "nope", ("nope",), (3,), ("x", "x"), Other()]
 
 
@@ -244,7 +246,7 @@ def recordings(t):
     }  # fmt: skip
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
     taken = {
-        "recording": instance(t.record), "phase": definition, "inputs": SIGNAL, "outputs": SIGNAL,
+        "recording": instance(t.record), "phase": definition, "inputs": OR_NONE, "outputs": OR_NONE,
         "n_sections": [*optional(LIMITED), 8.5], "bandwidth": LIMIT, "sampled": WORD,
         "timing": optional(WORD), "drift": LIMIT,
     }  # fmt: skip
@@ -260,7 +262,7 @@ def recordings(t):
     }  # fmt: skip
     yield "inspect", hj.recordings.inspect, dict(
         recording=t.recording, inputs="f", outputs=("x", "v")
-    ), {"recording": instance(t.record), "inputs": SIGNAL, "outputs": SIGNAL}  # fmt: skip
+    ), {"recording": instance(t.record), "inputs": SIGNAL, "outputs": OR_NONE}  # fmt: skip
     yield "inspect_cycles", hj.recordings.inspect_cycles, dict(
         recording=t.recording, phase=t.phase, data=t.section_data
     ), {
@@ -291,7 +293,7 @@ def recordings(t):
     yield "impulse_responses", hj.recordings.impulse_responses, dict(
         fit=t.found.fit, data=t.found.data
     ), {
-        "fit": instance(t.structured), "data": data, "cycles": [*POSITIVE, 10**9],
+        "fit": instance(t.structured), "data": data, "cycles": optional([*POSITIVE, 10**9]),
         "width": optional(POSITIVE),
     }  # fmt: skip
     yield "without_drift", hj.recordings.without_drift, dict(

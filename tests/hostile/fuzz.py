@@ -21,7 +21,7 @@ from matplotlib import pyplot
 import hybridjax as hj
 from hybridjax._core.boundary import arrays as of_arrays, containers, scalars
 
-from . import about_data, about_models, about_plots
+from . import about_data, about_models, about_plots, about_rhythms
 from .run import Hang, ring
 from .things import Things
 from .values import Other, label
@@ -186,7 +186,7 @@ def main() -> None:
     found, home, things = {}, os.getcwd(), Things()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        for about in (about_models, about_data, about_plots):
+        for about in (about_models, about_data, about_plots, about_rhythms):
             for name, function, good, _ in about.calls(things):
                 wanted = name in arguments.names if arguments.names else name not in SLOW
                 if wanted and checker(function):

@@ -18,7 +18,7 @@ from matplotlib import pyplot
 
 import hybridjax as hj
 
-from . import about_data, about_models, about_plots
+from . import about_data, about_models, about_plots, about_rhythms
 from .things import Things
 from .values import Right, Traced, label
 
@@ -99,7 +99,7 @@ def told(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
 
 def rows(things: Things, only: list[str]):
     """Name, function, good arguments, argument and its value of each call."""
-    for about in (about_models, about_data, about_plots):
+    for about in (about_models, about_data, about_plots, about_rhythms):
         for name, function, good, arguments in about.calls(things):
             for argument, values in arguments.items():
                 for value in values if not only or name in only else ():

@@ -148,6 +148,18 @@ class Things:
         )
 
     @ft.cached_property
+    def variability(self):
+        return hj.recordings.section_data(
+            self.recording, self.phase, inputs=(), outputs=("x", "v"), n_sections=2
+        )
+
+    @ft.cached_property
+    def beats(self):
+        return hj.recordings.phase_response(
+            self.recording, hj.AtEvent("strike"), input="f", harmonics=1
+        )
+
+    @ft.cached_property
     def found(self):
         return hj.identify_recording(
             self.recording, self.phase, inputs="f", outputs=("x",), order=1, n_sections=2

@@ -27,7 +27,9 @@ from ..vector_math import rewrite
 
 _PACKAGE = __name__.partition(".")[0]
 # Objects of JAX in the parameters of equations that their names and `repr` describe.
-_BY_REPR = "UnspecifiedValue", "Mesh", "AbstractMesh", "PartitionSpec", "AvalLayout"
+_BY_REPR = (
+    "UnspecifiedValue", "Mesh", "AbstractMesh", "NamedSharding", "PartitionSpec", "AvalLayout"
+)  # fmt: skip
 # Functions in the parameters of equations. Derivative rules are described by the derivative of the
 # program that has them (see `Program`).
 _RULES = {
@@ -72,7 +74,7 @@ class Program:
 
     def __call__(self, numbers: list, *arguments: Any) -> jax.Array:
         (value,) = jex.jaxpr_as_fun(self._jaxpr)(*numbers, *arguments)
-        return value
+        return jnp.asarray(value)
 
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, Program) and self.digest == other.digest

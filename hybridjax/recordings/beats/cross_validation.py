@@ -11,6 +11,7 @@ from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked
 from ..._core.boundary.scalars import Whole
 from ..._core.progress import working
+from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
 from ..phase.winding import Phase
 from ..recording import Recording
@@ -69,8 +70,10 @@ def forecast_intervals(
     out; or values at n equal steps of the phase from 0 on (one value: a flat curve), as they are:
     then only the rates of the trials are learned.
 
-    **Raises:** `DefinitionError` as `phase_response`.
+    **Raises:** `DefinitionError` as `phase_response`, and for a curve without values.
     """
+    if not isinstance(curve, PhaseResponse) and not len(np.asarray(curve)):
+        raise DefinitionError("`curve` needs at least one value.")
     intervals = intervals_of(recording, phase_of(recording, phase), input)
     place = np.concatenate([np.arange(n) / n for n in np.bincount(intervals.trial)])
     fold = np.minimum((place * folds).astype(int), folds - 1)
