@@ -86,6 +86,20 @@ def test_wrong_solvers_are_refused_where_they_are_given():
         as_method(3)
 
 
+@pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
+def test_estimates_are_of_the_size_of_errors(solver):
+    """Of a step whose end is known, one of its modes stiff."""
+    method, h = as_method(solver), 0.4
+
+    def field(t, q):
+        return jnp.stack([-(q[0] ** 2), -30 * (q[1] - jnp.cos(t)) - jnp.sin(t)])
+
+    step = take_step(method, field, jnp.zeros(1), jnp.ones((2, 1)), jnp.array([h]))
+    error = np.abs(np.asarray(step.q[:, 0]) - [1 / (1 + h), np.cos(h)]).max()
+    estimate = np.abs(np.asarray(step.error)).max() ** method.gain
+    assert 0.5 < estimate / error < 10
+
+
 def test_inverses_of_many_matrices():
     matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
     matrix[0, 0] = 0.0  # pivots are needed
