@@ -99,7 +99,6 @@ def test_other_types_stay():
     assert left(vectorized(jnp.sin), jnp.float16(1)) == {"sin"}
 
 
-@pytest.mark.skipif(not hasattr(jax.lax, "AccuracyMode"), reason="before JAX 0.7")
 def test_requested_accuracies_stay():
     exact = ft.partial(jax.lax.sin, accuracy=jax.lax.AccuracyMode.HIGHEST)
     assert left(vectorized(exact), 1.0) == {"sin"}
