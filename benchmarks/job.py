@@ -69,7 +69,8 @@ MODELS = {"VerticalHopper": "hopper", "TwoLeggedBar": "bar"}
 def make_job(cycle, sections, u) -> Job:
     """A job from a limit cycle of hybridjax, `PlacedSections` on it, and inputs (S, n[, 1])."""
     system, family = cycle.system, sections.family
-    parameters = {x.name: float(getattr(system, x.name)) for x in dataclasses.fields(system)}
+    names = [x.name for x in dataclasses.fields(system) if x.name != "solver"]
+    parameters = {name: float(getattr(system, name)) for name in names}
     states = np.asarray(sections.lanes.q, float).T
     names = list(system.charts())
     charts = tuple(names[a] for a in np.asarray(sections.lanes.chart))
