@@ -4,7 +4,6 @@ A `Job` holds no object of hybridjax, so that a peer needs nothing but numpy to 
 can be pickled for another process.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -69,8 +68,9 @@ MODELS = {"VerticalHopper": "hopper", "TwoLeggedBar": "bar"}
 def make_job(cycle, sections, u) -> Job:
     """A job from a limit cycle of hybridjax, `PlacedSections` on it, and inputs (S, n[, 1])."""
     system, family = cycle.system, sections.family
-    names = [x.name for x in dataclasses.fields(system) if x.name != "solver"]
-    parameters = {name: float(getattr(system, name)) for name in names}
+    from hybridjax.systems.system import own_fields
+
+    parameters = {x.name: float(getattr(system, x.name)) for x in own_fields(system)}
     states = np.asarray(sections.lanes.q, float).T
     names = list(system.charts())
     charts = tuple(names[a] for a in np.asarray(sections.lanes.chart))

@@ -39,6 +39,7 @@ from ..sections.abstract import AbstractSections
 from ..sections.clock import ClockPhase
 from ..sections.crossing import Crossing
 from ..sections.kinematic import KinematicPhase
+from ..systems.system import own_fields
 from .helper import Helper
 from .paper_report import OUTPUTS, summarize, table
 
@@ -155,7 +156,7 @@ def _set_up() -> None:
 
 
 def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
-    known = [x.name for x in dataclasses.fields(VerticalHopper) if x.name != "solver"]
+    known = [x.name for x in own_fields(VerticalHopper)]
     for name in parameters:
         if name not in known:
             raise DefinitionError(

@@ -73,7 +73,7 @@ class Quotient(HybridSystem):
         flipped: SignalNames = (),
         translation: SignalNames = (),
     ):
-        self.system = system
+        self.system, self.solver = system, system.solver
         self.pairs, self.names = (tuple((x or {}).items()) for x in (swap, relabel))
         self.flipped, self.translation = (
             (x,) if isinstance(x, str) else tuple(x) for x in (flipped, translation)
@@ -279,6 +279,10 @@ class _Reduced(Chart):
     @property
     def inputs(self) -> tuple[str, ...] | None:
         return self.chart.inputs
+
+    @property
+    def solver(self) -> Any:
+        return self.chart.solver
 
     @property
     def absent(self) -> Mapping[str, float]:

@@ -47,6 +47,11 @@ def unit_of_parameter(system: Any, path: str) -> str:
     return type(system).__dataclass_fields__[name].metadata.get("unit", "")
 
 
+def own_fields(system: Any) -> tuple[dataclasses.Field, ...]:
+    """The fields of a system or its class that its author wrote: its parameters."""
+    return tuple(x for x in dataclasses.fields(system) if x.name != "solver")
+
+
 def _number(x: Scalar) -> Array:
     return real(x)
 
@@ -130,9 +135,7 @@ class HybridSystem(Definition):
 
     def __repr__(self):
         rows = []
-        for field in dataclasses.fields(self):
-            if field.name == "solver":
-                continue
+        for field in own_fields(self):
             unit, doc = (field.metadata.get(key, "") for key in ("unit", "doc"))
             rows.append((field.name, f"{value(getattr(self, field.name))} {unit}".rstrip(), doc))
         if self.solver is not None:

@@ -10,6 +10,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.systems.structure import Structure, check_system
+from hybridjax.systems.system import own_fields
 
 from ..toys import Field, Switched, TwoInputs
 
@@ -46,7 +47,7 @@ def test_models_are_well_formed(model):
     system = getattr(hj.models, model)()
     check_system(system)
     assert system.solver is None
-    for field in (field for field in dataclasses.fields(system) if field.name != "solver"):
+    for field in own_fields(system):
         value = getattr(system, field.name)
         assert isinstance(value, jax.Array) and value.dtype == np.float64 and value.shape == ()
         assert field.metadata["doc"]
