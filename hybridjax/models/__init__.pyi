@@ -1,5 +1,6 @@
 from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
+from .chain import BouncingChain as BouncingChain
 from .buck import BuckConverter as BuckConverter
 from .compliant import CompliantHopper as CompliantHopper
 from .hopper import VerticalHopper as VerticalHopper

@@ -1,0 +1,104 @@
+"""A row of masses that bounce on a shaken table, coupled to their neighbors by springs.
+
+Each mass alone is the ball of `juggler.py` (P. J. Holmes, J. Sound and Vibration 84, 1982). Of any
+size: 2n states, n events.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Count
+from ..systems.chart import Chart
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class Flight(Chart):
+    chain: "BouncingChain"
+
+    @property
+    def states(self):
+        masses = range(1, self.chain.n + 1)
+        return (*(f"y{i}" for i in masses), *(f"v{i}" for i in masses))
+
+    @property
+    def units(self):
+        return ("m",) * self.chain.n + ("m/s",) * self.chain.n
+
+    def field(self, t, q, u):
+        p = self.chain
+        y, v = q[: p.n], q[p.n :]
+        stretch = p.k * jnp.diff(y) + p.c * jnp.diff(v)
+        force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
+        return jnp.concatenate([v, force / p.m - p.g])
+
+
+class Contact(eqx.Module):
+    """Mass `i`, counted from 0, and the table below it."""
+
+    chain: "BouncingChain"
+    i: int
+
+    def gap(self, t, q, u):
+        return q[self.i] - self.chain.table(t, self.i)[0]
+
+    def impact(self, t, q, u):
+        e, n = self.chain.restitution, self.chain.n
+        _, speed = self.chain.table(t, self.i)
+        return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
+
+
+@checked_methods
+class BouncingChain(HybridSystem):
+    """`n` equal masses in a row above a table, each joined to its neighbors by a spring and a
+    dashpot. Along the table a wave travels that is as long as the row: every mass bounces once a
+    period, one after the other.
+
+    States: heights `y1` to `yn` and speeds `v1` to `vn`. Input `u` is a force on the first mass.
+    Impacts keep the share `restitution` of the speed relative to the table.
+    """
+
+    input_units = ("N",)
+    time_unit = "s"
+
+    n: Count = eqx.field(static=True, default=2)
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of each")
+    k: Parameter = parameter(0.3, unit="N/m", doc="stiffness between neighbors")
+    c: Parameter = parameter(0.05, unit="N s/m", doc="damping between neighbors")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.5, doc="relative speed kept at an impact")
+    A: Parameter = parameter(0.3, unit="m", doc="amplitude of the table")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the table")
+
+    def table(self, t: ArrayLike, i: ArrayLike) -> tuple[Array, Array]:
+        """Height and speed of the table below mass `i`, counted from 0."""
+        rate = 2 * jnp.pi / self.T
+        phase = rate * t - 2 * jnp.pi * i / self.n
+        return self.A * jnp.sin(phase), self.A * rate * jnp.cos(phase)
+
+    def charts(self):
+        return {"flight": Flight(self)}
+
+    def transitions(self):
+        contacts = [Contact(self, i) for i in range(self.n)]
+        return [
+            Transition(f"impact {x.i + 1}", "flight", "flight", x.gap, reset=x.impact)
+            for x in contacts
+        ]
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""
+        a, v = self.restitution, self.g * self.T / 2
+        rate = 2 * jnp.pi / self.T
+        first = jnp.arccos((1 - a) / (1 + a) * v / (self.A * rate)) / rate
+        impact = first + jnp.arange(self.n) * self.T / self.n
+        past = -impact % self.T
+        lift = self.A * jnp.sin(rate * first)
+        y = lift + v * past - self.g * past**2 / 2
+        return Guess("flight", jnp.concatenate([y, v - self.g * past]))
