@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..systems.alike import Member
 from ..systems.structure import Structure
 from . import kernels
 from .lanes import Lanes
@@ -177,11 +178,14 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
 
     end, by = np.zeros((M, 1 + s.d)), np.zeros((M, 1 + s.d, 1 + s.d + s.nu))
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
-    for g in {-1, *code[code >= 0]}:
-        now = np.flatnonzero(np.maximum(code, -1) == g)
+    for kind in [(-1,), *s.kinds]:
+        now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
         new, dnew = q[:, now], dq[now]
-        if g >= 0:
-            by_reset = kernels.reset(s, int(g), t[now], new, u[:, now])
+        if len(now) == 0:
+            continue
+        if kind != (-1,):
+            place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(np.int32)
+            by_reset = kernels.reset(s, Member(kind, place), t[now], new, u[:, now])
             new = by_reset[:, 0]
             by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
             dnew = by_t @ dt[now] + by_q @ dnew

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._core.compilation.fingerprint import Program
+from ..systems.alike import Kind, Member
 from ..systems.chart import Chart
 from ..systems.output import Output
 from ..systems.solver import Method
@@ -24,11 +25,13 @@ from .target import AbstractLevels
 
 
 class _Event(NamedTuple):
-    """What is left of a transition; no guard: it is scheduled."""
+    """What is left of a transition: the programs of its kind, and its place there. No guard: it is
+    scheduled."""
 
     name: str
     source: str
     target: str
+    place: int
     guard: Program | None
     reset: Program
     enabled: Program | None
@@ -76,9 +79,9 @@ class ClosedSystem(HybridSystem):
                 x.name,
                 x.source,
                 x.target,
-                self._function(x.guard) if schedule is None else schedule,
-                reset=self._function(x.reset),
-                enabled=None if x.enabled is None else self._function(x.enabled),
+                self._of_kind(x.guard, x) if schedule is None else schedule,
+                reset=self._of_kind(x.reset, x),
+                enabled=None if x.enabled is None else self._of_kind(x.enabled, x),
             )
             for x, schedule in zip(self.closed.events, self.schedules, strict=True)
         ]
@@ -89,9 +92,23 @@ class ClosedSystem(HybridSystem):
             for x in self.closed.outputs
         ]
 
-    def _function(self, program: Program | None):
-        assert program is not None
+    def _function(self, program: Program):
         return lambda t, q, u: program(self.numbers, t, q, u)
+
+    def _of_kind(self, program: Program | None, event: _Event) -> "_ClosedFunction":
+        assert program is not None
+        return _ClosedFunction(self.numbers, event.place, program)
+
+
+class _ClosedFunction(eqx.Module):
+    """A function of a transition, which differs from those of its kind by a place only."""
+
+    numbers: list[Array]
+    place: int
+    program: Program = eqx.field(static=True)
+
+    def __call__(self, t, q, u):
+        return self.program(self.numbers, jnp.asarray(self.place, int), t, q, u)
 
 
 class _ClosedChart(Chart):
@@ -151,18 +168,23 @@ def close(
         field = program(lambda s, z, levels, *x: s.field(a, *x), *at(a))
         return _Chart(s.names[a], tuple(map(str, s.charts[a].states)), s.method(a), field)
 
-    def event(g: int, x: Transition) -> _Event:
-        point, by_clock = at(s.chart_index(x.source)), isinstance(x.guard, Scheduled)
-        guard = lambda s, z, levels, *x: s.guard(g, *x)  # noqa: E731
-        enabled = lambda s, z, levels, *x: s.enabled(g, *x)  # noqa: E731
-        return _Event(
-            x.name,
-            x.source,
-            x.target,
+    def of_kind(kind: Kind) -> dict[int, _Event]:
+        one = s.transitions[kind[0]]
+        by_clock = isinstance(one.guard, Scheduled)
+        point = array((), jnp.result_type(int)), *at(s.chart_index(one.source))
+        guard = lambda s, z, levels, k, *x: s.guard(Member(kind, k), *x)  # noqa: E731
+        reset = lambda s, z, levels, k, *x: s.reset(Member(kind, k), *x)  # noqa: E731
+        enabled = lambda s, z, levels, k, *x: s.enabled(Member(kind, k), *x)  # noqa: E731
+        programs = (
             None if by_clock else program(guard, *point),
-            program(lambda s, z, levels, *x: s.reset(g, *x), *point),
-            None if x.enabled is None else program(enabled, *point),
+            program(reset, *point),
+            None if one.enabled is None else program(enabled, *point),
         )
+        members = [(g, s.transitions[g]) for g in kind]
+        return {
+            g: _Event(x.name, x.source, x.target, place, *programs)
+            for place, (g, x) in enumerate(members)
+        }
 
     def output(k: int, name: str) -> _Output:
         one = lambda a: lambda s, z, levels, *x: s.resolve_outputs(z[k])(a, *x)[0]  # noqa: E731
@@ -176,10 +198,11 @@ def close(
         return program(function, array((), jnp.result_type(int)), *at(a)[:2])
 
     charts = range(len(s.charts))
+    events = {g: event for kind in s.kinds for g, event in of_kind(kind).items()}
     closed = _Closed(
         tuple(map(str, s.inputs)),
         tuple(map(chart, charts)),
-        tuple(event(g, x) for g, x in enumerate(s.transitions)),
+        tuple(events[g] for g in sorted(events)),
         tuple(output(k, x) for k, x in enumerate(s.resolve_outputs(outputs).names)),
     )
     schedules = [x.guard if isinstance(x.guard, Scheduled) else None for x in s.transitions]

@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import Array, cond, namespace, on_host, put, stop_gradient
+from .._core.lanes.rows import put_rows
 from .._core.precision import at_precision
-from ..systems.structure import Structure
+from ..systems.alike import Kind, Member
+from ..systems.structure import Structure, stacked
 from ..systems.transition import Scheduled
 from . import kernels
 from .lanes import Lanes, for_each_chart, needed, only
@@ -113,12 +115,7 @@ def _noise(
         n = s.dims[a]
         point = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
         noise = at_precision(*ROUNDING) * _guard_rounding(s, a, *point)
-        place = {row: k for k, row in enumerate(rows)}
-        each = [
-            xp.where(here, noise[place[g]], out[g]) if g in place else out[g]
-            for g in range(len(out))
-        ]
-        return xp.stack(each)
+        return put_rows(out, rows, here, noise)
 
     xp = namespace(lanes.t)
     nothing = xp.zeros((len(s.transitions), lanes.t.shape[0]))
@@ -135,8 +132,10 @@ def _guard_rounding(
         slopes = kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))[:, 1 : 2 + len(q)]
         return np.sum(np.abs(slopes * np.concatenate([t[None], q])), axis=1)
 
+    kinds = s.guard_kinds(a)
+
     def one(s, t, q, u):
-        guards = lambda t, q: jnp.stack([s.guard(g, t, q, u) for g in s.guards(a)])  # noqa: E731
+        guards = lambda t, q: stacked(s.guard_values(kinds, t, q, u))  # noqa: E731
         by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
         return jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q)
 
@@ -147,20 +146,21 @@ def apply_resets(
     s: Structure, t, chart, q, u: Float[Array, "nu L"], fired: Int[Array, " L"]
 ) -> tuple[Float[Array, "d L"], Int[Array, " L"]]:
     """States and charts after the transitions `fired` (-1: none)."""
-    for g, transition in enumerate(s.transitions):
-        here = fired == g
+    for kind in s.kinds:
+        transition = s.transitions[kind[0]]
+        here, place = _within(kind, fired)
         n = s.dims[s.chart_index(transition.source)]
         b = s.chart_index(transition.target)
 
-        def work(carry, g=g, n=n, b=b, here=here):
+        def work(carry, kind=kind, n=n, b=b, here=here, place=place):
             q, chart = carry
             xp, point = namespace(q), [only(here, x) for x in (t, q[:n], u)]
             if on_host(q):
-                new = kernels.reset(s, g, *point, here)[:, 0]
+                new = kernels.reset(s, Member(kind, place), *point, here)[:, 0]
             else:
                 own = Structure(needed(here, s.source))
-                reset = own.by_lane(lambda s, t, q, u: s.reset(g, t, q, u))
-                new = reset(*needed(here, point))
+                reset = own.by_lane(lambda s, t, q, u, k: s.reset(Member(kind, k), t, q, u))
+                new = reset(*needed(here, point), place)
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
             return xp.where(here, new, q), xp.where(here, b, chart)
 
@@ -172,17 +172,30 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
     """Whether the predicates of the transitions `which` hold; True where there is none."""
     xp = namespace(t)
     out = xp.ones(t.shape, bool)
-    for g, transition in enumerate(s.transitions):
+    for kind in s.kinds:
+        transition = s.transitions[kind[0]]
         if transition.enabled is not None:
-            here = which == g
+            here, place = _within(kind, which)
             n = s.dims[s.chart_index(transition.source)]
-            arguments = only(here, t), only(here, q[:n]), only(here, u)
+            point = only(here, t), only(here, q[:n]), only(here, u)
             if on_host(t):
-                holds = kernels.enabled(s, g, *arguments)
+                holds = kernels.enabled(s, Member(kind, place), *point)
             else:
-                holds = s.by_lane(lambda s, t, q, u, g=g: s.enabled(g, t, q, u))(*arguments)
+                one = lambda s, t, q, u, k, kind=kind: s.enabled(Member(kind, k), t, q, u)  # noqa: E731
+                holds = s.by_lane(one)(*point, place)
             out = xp.where(here, holds, out)
     return out
+
+
+def _within(kind: Kind, g: Int[Array, " L"]) -> tuple[Bool[Array, " L"], Int[Array, " #L"]]:
+    """Which of the transitions g (-1: none) are of a kind, and their places there (else 0)."""
+    xp = namespace(g)
+    if len(kind) == 1:
+        return g == kind[0], xp.asarray(np.zeros(1, np.int32))
+    places = np.full(max(kind) + 2, -1, np.int32)  # the last for -1
+    places[list(kind)] = np.arange(len(kind))
+    place = xp.asarray(places)[xp.minimum(g, len(places) - 1)]
+    return place >= 0, xp.maximum(place, 0)
 
 
 def next_schedule(

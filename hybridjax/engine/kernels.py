@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.lanes.per_lane import by_lane
+from ..systems.alike import Kind, Member
 from ..systems.output import Output
 from ..systems.solver import Method, Radau, as_method
-from ..systems.structure import Structure
+from ..systems.structure import Structure, stacked
 from ..systems.system import HybridSystem
 from .solver import take_step
 from .solver.implicit import integrated_divergence
@@ -111,31 +112,32 @@ def watched(
 ) -> Float[np.ndarray, "r c L"]:
     """The guards of chart a, and the level if it has one, with their derivatives."""
     lanes = 1 if q.shape[-1] < _MANY_LANES else _MANY_POINTS
-    rows = s.kernel(_watched, _expanded, a, trees=(levels,), lanes=lanes)
+    static = a, s.guard_kinds(a)
+    rows = s.kernel(_watched, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
 
 def reset(
     s: Structure,
-    g: int,
+    g: Member,
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
     some: Bool[np.ndarray, " L"] | None = None,
 ) -> Float[np.ndarray, "m c L"]:
-    """The state after transition g, and its derivatives."""
-    return s.kernel(_reset, _expanded, g)(t, q, u, some=some)
+    """The state after transitions of one kind, and its derivatives."""
+    return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
 
 
 def enabled(
     s: Structure,
-    g: int,
+    g: Member,
     t: Float[np.ndarray, " #L"],
     q: Float[np.ndarray, "n L"],
     u: Float[np.ndarray, "nu #L"],
 ) -> Bool[np.ndarray, " L"]:
-    """Whether the predicate of transition g holds."""
-    return s.kernel(_enabled, by_lane, g)(t, q, u)
+    """Whether the predicates of transitions of one kind hold."""
+    return s.kernel(_enabled, by_lane, g.kind)(t, q, u, g.place)
 
 
 def outputs(
@@ -187,19 +189,21 @@ def _slope_beside(a: int, system: HybridSystem, t, q, u, h, along):
     return Structure(system).field(a, t, q, u)
 
 
-def _watched(a: int, system: HybridSystem, levels: AbstractLevels | None, t, q, u, i):
+def _watched(
+    a: int, kinds: tuple[Kind, ...], system: HybridSystem, levels: AbstractLevels | None, t, q, u, i
+):
     s = Structure(system)
     level = levels is not None and levels.present(s, a)
-    guards = [s.guard(g, t, q, u) for g in s.guards(a)]
-    return jnp.stack(guards + ([levels.level(s, a, i, t, q)] if level else []))
+    guards = s.guard_values(kinds, t, q, u)
+    return stacked(guards + ([levels.level(s, a, i, t, q)] if level else []))
 
 
-def _reset(g: int, system: HybridSystem, t, q, u):
-    return Structure(system).reset(g, t, q, u)
+def _reset(kind: Kind, system: HybridSystem, t, q, u, place):
+    return Structure(system).reset(Member(kind, place), t, q, u)
 
 
-def _enabled(g: int, system: HybridSystem, t, q, u):
-    return Structure(system).enabled(g, t, q, u)
+def _enabled(kind: Kind, system: HybridSystem, t, q, u, place):
+    return Structure(system).enabled(Member(kind, place), t, q, u)
 
 
 def _outputs(a: int, system: HybridSystem, items: tuple[str | Output, ...], t, q, u):

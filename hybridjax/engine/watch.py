@@ -1,7 +1,6 @@
 """The functions whose zeros end a move: guards, and the level function of the target section."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import Array, namespace, on_host, put
 from .._core.lanes.per_lane import shared
+from .._core.lanes.rows import pick, put_rows
 from ..systems.solver import Method
-from ..systems.structure import Structure
+from ..systems.structure import Structure, stacked
 from . import kernels
 from .lanes import for_each_chart, only
 from .solver import take_step
@@ -115,17 +115,18 @@ class ChartFlow(NamedTuple):
         self, t: Float[Array, " #L"], q: Float[Array, "n L"], f: Float[Array, "n L"]
     ) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, guards, levels = self.a, self.s.guards(self.a), self.target.levels
+        a, levels = self.a, self.target.levels
         if on_host(q):
             index = self.target.index
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.some)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
         level = levels is not None and shared(levels).present(self.s, a)
+        kinds = self.s.guard_kinds(a)
 
         def one(s, levels, t, q, u, i, f):
             def all_of_them(t, q):
-                rows = [s.guard(g, t, q, u) for g in guards]
-                return jnp.stack(rows + ([levels.level(s, a, i, t, q)] if level else []))
+                rows = s.guard_values(kinds, t, q, u)
+                return stacked(rows + ([levels.level(s, a, i, t, q)] if level else []))
 
             return jax.jvp(all_of_them, (t, q), (jnp.ones_like(t), f))
 
@@ -216,31 +217,6 @@ def nothing(s: Structure, t: Float[Array, " L"]) -> Watch:
     return Watch(xp.ones(shape), xp.zeros(shape))
 
 
-def take(seen: Watch, rows: list[int]) -> Watch:
-    """Some rows of a `Watch`."""
-    return Watch(*(namespace(x).stack([x[row] for row in rows]) for x in seen))
-
-
 def write(out: Watch, rows: list[int], here: Bool[Array, " L"], new: Watch) -> Watch:
     """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
-    xp, place = namespace(here), {row: k for k, row in enumerate(rows)}
-    return Watch(
-        *(
-            xp.stack(
-                [xp.where(here, y[place[r]], x[r]) if r in place else x[r] for r in range(len(x))]
-            )
-            for x, y in zip(out, new, strict=True)
-        )
-    )
-
-
-def pick(x: Float[Array, "R L"], rows: Sequence[int], which: Int[Array, " L"]):
-    """Each lane's entry in the row of its function `which`; 0 where that is not among `rows`.
-
-    (A chain of selections: unlike a sum or a gather, XLA computes it together with its users.)
-    """
-    xp = namespace(x)
-    out = xp.zeros_like(x[0])
-    for k, row in enumerate(rows):
-        out = xp.where(which == row, x[k], out)
-    return out
+    return Watch(*(put_rows(x, rows, here, y) for x, y in zip(out, new, strict=True)))

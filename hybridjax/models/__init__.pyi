@@ -1,7 +1,7 @@
 from .ball import BouncingBall as BouncingBall
 from .bar import TwoLeggedBar as TwoLeggedBar
-from .chain import BouncingChain as BouncingChain
 from .buck import BuckConverter as BuckConverter
+from .chain import BouncingChain as BouncingChain
 from .compliant import CompliantHopper as CompliantHopper
 from .hopper import VerticalHopper as VerticalHopper
 from .juggler import PaddleJuggler as PaddleJuggler

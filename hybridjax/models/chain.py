@@ -7,7 +7,7 @@ size: 2n states, n events.
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count

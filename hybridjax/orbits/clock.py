@@ -89,7 +89,7 @@ def _functions(s: Structure, a: int) -> Iterator:
         guard = lambda t, q, k=row: kernels.watched(s, a, None, t, q, u, index)[k : k + 1]  # noqa: E731
         yield f"the guard of '{s.transitions[g].name}'", guard
     for g in s.guards(a) + s.schedules(a):
-        reset = lambda t, q, g=g: kernels.reset(s, g, t, q, u)  # noqa: E731
+        reset = lambda t, q, g=g: kernels.reset(s, s.member(g), t, q, u)  # noqa: E731
         yield f"the reset of '{s.transitions[g].name}'", reset
 
 

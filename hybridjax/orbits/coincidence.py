@@ -108,8 +108,8 @@ def _ways(s: Structure, t: float, way: _Way, left: int, due: float) -> Iterator[
         value, slope = row[0], row[2 : 2 + len(q)]
         rate = row[1] + slope @ field
         fires = rate < 0 and abs(value) <= -due * rate and g not in way.events
-        if fires and kernels.enabled(s, g, time, q, u).all():
-            new = kernels.reset(s, g, time, q, u)[..., 0]
+        if fires and kernels.enabled(s, s.member(g), time, q, u).all():
+            new = kernels.reset(s, s.member(g), time, q, u)[..., 0]
             b = s.chart_index(s.transitions[g].target)
             state, by_t, by_q = new[:, 0], new[:, 1], new[:, 2 : 2 + len(q)]
             after = kernels.field(s, b, time, state[:, None], u)[:, 0, 0]

@@ -185,7 +185,8 @@ def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
             a, b = s.chart_index(transition.source), s.chart_index(transition.target)
             if a in known and b not in known:
                 before = points[a, : s.dims[a], None]
-                after = kernels.reset(s, g, np.array([t]), before, np.zeros((s.nu, 1)))[:, 0, 0]
+                point = np.array([t]), before, np.zeros((s.nu, 1))
+                after = kernels.reset(s, s.member(g), *point)[:, 0, 0]
                 points[b], known = np.pad(after, (0, s.d - len(after))), known | {b}
     return points
 

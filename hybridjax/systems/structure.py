@@ -4,6 +4,7 @@ Everything below `systems` sees a system through `Structure`: charts and transit
 functions that return arrays, guards that fall through zero at their event.
 """
 
+import dataclasses
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
@@ -14,10 +15,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from .._core.compilation.kernel import kernel
-from .._core.lanes.per_lane import PerLane, by_lane, shared
+from .._core.executor import Array
+from .._core.lanes.per_lane import PerLane, by_lane, one_lane, shared
+from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
+from .alike import Kind, Member, chosen, kinds
 from .chart import Chart
 from .output import Output
 from .quotient import Quotient
@@ -31,6 +35,16 @@ def as_vector(value: Any) -> jax.Array:
     if isinstance(value, tuple | list):
         return jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
     return jnp.asarray(value, float)
+
+
+def stacked(parts: Sequence[jax.Array]) -> jax.Array:
+    """Numbers and vectors, one after the other, as a vector."""
+    if all(x.ndim == 0 for x in parts):
+        return jnp.stack(parts)
+    return jnp.concatenate([jnp.atleast_1d(x) for x in parts])
+
+
+_kinds = Memory()
 
 
 class Structure:
@@ -51,10 +65,6 @@ class Structure:
         self.d = max(self.dims)
         self.inputs: tuple[Signal, ...] = signals(system.inputs, system.input_units)
         self.nu = len(self.inputs)
-        out = [[g for g, tr in enumerate(self.transitions) if tr.source == n] for n in self.names]
-        by_clock = [isinstance(tr.guard, Scheduled) for tr in self.transitions]
-        self._guards = [[g for g in own if not by_clock[g]] for own in out]
-        self._schedules = [[g for g in own if by_clock[g]] for own in out]
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
@@ -129,26 +139,87 @@ class Structure:
     def field(self, a: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
+    @property
+    def kinds(self) -> list[Kind]:
+        """The transitions, those of one kind together."""
+
+        def make():
+            found = []
+            for kind in kinds(self.transitions):
+                found += [kind] if len(kind) == 1 or self._is_one(kind) else [(g,) for g in kind]
+            return found
+
+        return _kinds.recall(self.source, None, make)
+
+    def _is_one(self, kind: Kind) -> bool:
+        """Whether functions can be traced with the numbers in which they differ as arguments. (Not
+        if a number decides what Python does.)"""
+        n = self.dims[self.chart_index(self.transitions[kind[0]].source)]
+
+        def at_a_point(system, place, *point):
+            s, x = Structure(system), Member(kind, place)
+            return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
+
+        real, array = jnp.result_type(float), jax.ShapeDtypeStruct
+        point = array((), real), array((n,), real), array((self.nu,), real)
+        try:
+            eqx.filter_eval_shape(at_a_point, one_lane(self.source), array((), int), *point)
+        except Exception:  # whatever a user's function raises, or JAX there
+            return False
+        return True
+
+    def member(self, g: int) -> Member:
+        """Transition g by its kind, for one lane."""
+        kind = next(kind for kind in self.kinds if g in kind)
+        return Member(kind, np.array([kind.index(g)], np.int32))
+
+    def guard_kinds(self, a: int) -> tuple[Kind, ...]:
+        """Kinds of the state-dependent transitions out of chart a."""
+        return tuple(kind for kind in self.kinds if self._leaves(kind[0], a, by_clock=False))
+
     def guards(self, a: int) -> list[int]:
-        """Indices of the state-dependent transitions out of chart a."""
-        return self._guards[a]
+        """Indices of the state-dependent transitions out of chart a, by kind."""
+        return [g for kind in self.guard_kinds(a) for g in kind]
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
-        return self._schedules[a]
+        return [g for g in range(len(self.transitions)) if self._leaves(g, a, by_clock=True)]
 
-    def guard(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
-        """Transition g's guard, signed so that it falls through zero at the event."""
+    def _leaves(self, g: int, a: int, by_clock: bool) -> bool:
         tr = self.transitions[g]
+        return tr.source == self.names[a] and isinstance(tr.guard, Scheduled) == by_clock
+
+    def transition(self, g: int | Member) -> Transition:
+        """A transition by its index, or as a member of its kind (of a single lane)."""
+        if not isinstance(g, Member):
+            return self.transitions[g]
+        alike = [self.transitions[x] for x in g.kind]
+        if len(alike) == 1:
+            return alike[0]
+        functions = chosen([(x.guard, x.reset, x.enabled) for x in alike], g.place)
+        guard, reset, enabled = functions
+        return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
+
+    def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+        """Transition g's guard, signed so that it falls through zero at the event."""
+        tr = self.transition(g)
         a = self.chart_index(tr.source)
         return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, t, u)), float)
 
-    def reset(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
-        tr = self.transitions[g]
+    def guard_values(self, kinds: Sequence[Kind], t: Array, q: Array, u: Array) -> list[jax.Array]:
+        """All guards of some kinds, in parts: a vector for each kind, or if each is the only one of
+        its kind, numbers."""
+        if all(len(kind) == 1 for kind in kinds):
+            return [self.guard(g, t, q, u) for (g,) in kinds]
+        every = lambda kind: jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))  # noqa: E731
+        return [every(kind)(np.arange(len(kind))) for kind in kinds]
+
+    def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+        tr = self.transition(g)
         return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), t, u)))
 
-    def enabled(self, g: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
-        tr = self.transitions[g]
+    def enabled(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+        tr = self.transition(g)
         if tr.enabled is None:
             return jnp.asarray(True)
         return jnp.asarray(

@@ -38,6 +38,18 @@ def shared(tree: Any) -> Any:
     return tree.tree if isinstance(tree, PerLane) else tree
 
 
+def one_lane(tree: Any) -> Any:
+    """What a single lane has of a tree: shapes in place of its arrays."""
+    arrays, rest = eqx.partition(shared(tree), eqx.is_array)
+    leaves, structure = jax.tree_util.tree_flatten(arrays)
+    own = tree.own if isinstance(tree, PerLane) else (False,) * len(leaves)
+    shapes = [
+        jax.ShapeDtypeStruct(x.shape[:-1] if o else x.shape, x.dtype)
+        for x, o in zip(leaves, own, strict=True)
+    ]
+    return eqx.combine(structure.unflatten(shapes), rest)
+
+
 def by_lane(function: Callable, *trees: Any) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 

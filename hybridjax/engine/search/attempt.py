@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, cond, namespace, put
+from ..._core.lanes.rows import pick, take_rows
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..events import width
@@ -13,7 +14,7 @@ from ..hermite import NEAR, control_points, root_near_end
 from ..lanes import Lanes, for_each_chart, only
 from ..settings import Settings, size, tolerance
 from ..solver.step import Step, rounding_error
-from ..watch import ChartFlow, Watch, chart_flow, nothing, pick, take, write
+from ..watch import ChartFlow, Watch, chart_flow, nothing, write
 from .aim import Aim
 from .state import State, Task
 
@@ -154,7 +155,8 @@ def attempt(
             error = xp.where(here, error, out.error)
             return out._replace(q=put(out.q, slice(n), end), error=error, along=along)
 
-        before, which = take(state.seen, rows), xp.where(here, aim.which, -1)
+        before = Watch(*(take_rows(x, rows) for x in state.seen))
+        which = xp.where(here, aim.which, -1)
         home, moved = _Home(step.q, step.f1, zero, no, zero), tau
         if not in_step:
             home = cond(
@@ -181,7 +183,7 @@ def attempt(
         high = xp.maximum(xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3]))
         scale = xp.maximum(xp.abs(ends[0]), xp.abs(ends[1]))
         own = (np.array(rows)[:, None] == which) & home.lands
-        armed = xp.stack([ready[row] for row in rows])
+        armed = take_rows(ready, rows)
         far = xp.where(armed, low > NEAR * scale, high <= 0)
         fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
         # (By rounding, the zero may lie a little before the start.)

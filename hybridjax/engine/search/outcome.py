@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, cond, namespace, put
+from ..._core.lanes.rows import pick
 from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
@@ -16,7 +17,7 @@ from ..hermite import CubicCrossing, first_crossing
 from ..lanes import Lanes
 from ..solver.tableau import method_of
 from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
-from ..watch import Watch, pick, watch
+from ..watch import Watch, watch
 from .aim import Aim, Way
 from .attempt import SLOW, Attempt, deviation
 from .state import Approach, State, Task

@@ -1,0 +1,114 @@
+"""Contacts that are written once: the same events as if each were written by itself."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.engine import kernels
+from hybridjax.systems.structure import Structure
+
+from ..toys import Field
+
+
+class Mark(eqx.Module):
+    """Where the first coordinate of a point on a circle falls or rises through a level."""
+
+    levels: jax.Array
+    weight: jax.Array
+    i: int
+
+    def guard(self, t, q, u):
+        return q[0] - self.levels[self.i]
+
+    def reset(self, t, q, u):
+        return q.at[2].add(self.weight * 10.0**self.i)
+
+    def enabled(self, t, q, u):
+        return q[2] < 700.0
+
+
+class Stubborn(Mark):
+    """The same, where Python looks at the number."""
+
+    def guard(self, t, q, u):
+        return (q[0] - self.levels[self.i]) if self.i != 1 else q[0] - self.levels[1]
+
+
+class Circle(hj.HybridSystem):
+    """A point that turns at rate 1, and counts marks in a third state."""
+
+    mark: type = eqx.field(static=True, default=Mark)
+    apart: bool = eqx.field(static=True, default=False)
+    weights: jax.Array = eqx.field(default_factory=lambda: jnp.array([1.0, 2.0, 3.0]))
+    levels: jax.Array = eqx.field(default_factory=lambda: jnp.array([0.6, -0.2, 0.1]))
+
+    def charts(self):
+        return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}
+
+    def transitions(self):
+        found = []
+        for i, weight in enumerate(self.weights):
+            x = self.mark(self.levels, weight, i)
+            for way in ("falling", "rising"):
+                functions = x.guard, x.reset, x.enabled
+                if self.apart:
+                    functions = [lambda t, q, u, f=f: f(t, q, u) for f in functions]
+                guard, reset, enabled = functions
+                name = f"{i} {way}"
+                found.append(hj.Transition(name, "turn", "turn", guard, way, reset, enabled))
+        return found
+
+
+START = (0.9, (1 - 0.81) ** 0.5, 0.0)
+
+
+def run(system):
+    return hj.simulate(system, "turn", START, 9.0)
+
+
+def test_kinds_are_found():
+    assert Structure(Circle()).kinds == [(0, 2, 4), (1, 3, 5)]
+    one_by_one = [(g,) for g in range(6)]
+    assert Structure(Circle(apart=True)).kinds == one_by_one
+    assert sorted(Structure(Circle(mark=Stubborn)).kinds) == one_by_one
+    assert Structure(hj.models.BouncingChain(n=3)).kinds == [(0, 1, 2)]
+    assert Structure(hj.models.TwoLeggedBar()).kinds == [(g,) for g in range(8)]
+
+
+@pytest.mark.parametrize("other", [Circle(apart=True), Circle(mark=Stubborn)])
+def test_events_are_those_of_transitions_of_their_own(other):
+    one, two = run(Circle()), run(other)
+    assert len(one.events) == 8
+    assert [e.name for e in one.events] == [e.name for e in two.events]
+    np.testing.assert_allclose([e.time for e in one.events], [e.time for e in two.events])
+    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+
+
+def test_times_of_events_are_exact():
+    first = {e.name: e.time for e in reversed(run(Circle()).events)}
+    for i, level in enumerate(Circle().levels):
+        assert first[f"{i} falling"] == pytest.approx(np.arccos(level) - np.arccos(0.9), abs=1e-11)
+
+
+def test_contacts_are_traced_once():
+    traced = []
+
+    class Counting(hj.models.BouncingChain):
+        def table(self, t, i):
+            traced.append(i)
+            return super().table(t, i)
+
+    def count(n):
+        structure = Structure(Counting(n=n))
+        assert len(structure.kinds) == 1
+        traced.clear()  # each contact was looked at by itself
+        for g in range(n):
+            point = np.zeros(1), np.ones((2 * n, 1)), np.zeros((1, 1))
+            kernels.reset(structure, structure.member(g), *point)
+            kernels.watched(structure, 0, None, *point, np.zeros(1, np.int32))
+        return len(traced)
+
+    assert count(5) == count(2) > 0
