@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 # In the order in which they run.
 NAMES = (
-    "experiments", "honesty", "precision", "sizes", "jacobians", "gradients", "grid", "steps",
+    "experiments", "honesty", "precision", "sizes", "size", "jacobians", "gradients", "grid", "steps",
     "solvers", "cores", "compile",
 )  # fmt: skip
 

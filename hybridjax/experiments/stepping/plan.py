@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..._core.boundary.scalars import Number
-from ..._core.compilation.compile import host_first
+from ..._core.compilation.compile import at_ease, host_first
 from ..._core.executor import Array, from_host, namespace, to_host
 from ..._core.memo import Memory
 from ..._core.results import Result
+from ...engine.jacobian import tape_jacobian
 from ...engine.move import move
 from ...engine.search.stride import Stride
 from ...engine.settings import Settings
@@ -35,9 +36,6 @@ _TOLERANCES = (1.0, 1e-2, 1e-4)
 # The relative tolerance of the reference to which the ways are compared. Twice as much shows where
 # accuracies near 1e-13 are asked for.
 _REFERENCE_RTOL = 1e-13
-# The step of the differences that give section maps, relative to the states' scales. With twice the
-# step, twice as much of the maps' curvature is taken for their slope.
-_DIFFERENCE = 1e-6
 # Room for the way to a level, which takes longer in some lanes than on the cycle, as a ratio of
 # times. Twice as much makes equal steps longer than they need to be.
 _ROOM = 1.25
@@ -102,13 +100,13 @@ def make_plan(
     """
     N = placed.n_sections
     placed = to_host(placed)
-    ways = to_host(_try_ways(placed, settings, scale))
-    K = len(ways.estimate)
-    exact = ways.ends[:, K]
-    J = np.transpose((ways.ends[:, K + 1 :] - exact[:, None]) / _DIFFERENCE, (2, 0, 1))
-    J = J / scale[:, None, :]
+    ways = to_host(_try_ways(placed, settings))
+    *_, target = placed.onwards()
+    with at_ease():
+        J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
+    J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
-    error = np.transpose(ways.ends[:, :K] - exact[:, None], (1, 2, 0))
+    error = np.transpose(ways.ends[:, :-1] - ways.ends[:, -1:], (1, 2, 0))
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
     impact = np.maximum(_impact(J, error, scale), _ROUNDING)
@@ -147,8 +145,8 @@ class _Ways(NamedTuple):
     """What was tried from every section to the next."""
 
     ends: Float[Array, "n B N"]
-    """(t, q) after each of K ways to go, after the reference, and after it from starts that are
-    nudged in each coordinate; NaN for those that do not arrive."""
+    """(t, q) after each of K ways to go, and after the reference; NaN for those that do not
+    arrive."""
     estimate: Float[Array, "K N"]
     """Error estimates of the ways to go, relative to the tolerance."""
     first: Float[Array, "K N"]
@@ -158,8 +156,8 @@ class _Ways(NamedTuple):
 
 
 @host_first
-def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N n"]) -> _Ways:
-    s, xp, (N, n) = placed.structure(), namespace(scale), scale.shape
+def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
+    s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
     K = len(_EQUAL_STEPS) + len(_TOLERANCES)
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
@@ -167,20 +165,16 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     by_level = xp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
     longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
-    # Ways, with a lane for every section: K candidates, the reference, and one for each coordinate
-    # of (t, q).
-    W = K + 1 + n
-    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), *[2] * (1 + n)])
-    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, *[1.0] * (1 + n)])
+    # Ways, with a lane for every section: K candidates, and the reference.
+    W = K + 1
+    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), 2])
+    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
-    nudge = np.concatenate([np.zeros((K + 1, n)), _DIFFERENCE * np.eye(n)])
-    nudge = (nudge.T[:, :, None] * scale.T[:, None]).reshape(n, -1)
 
     all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W), tree)  # noqa: E731
     each = lambda x: xp.repeat(xp.asarray(x), N)  # noqa: E731
     lanes = all_ways(placed.lanes)
-    lanes = lanes._replace(t=lanes.t + nudge[0], q=lanes.q + nudge[1:])
     per_lane = ("time", "index", "event", "limit")
     target = dataclasses.replace(target, **{x: all_ways(getattr(target, x)) for x in per_lane})
     start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
@@ -189,7 +183,7 @@ def _try_ways(placed: PlacedSections, settings: Settings, scale: Float[Array, "N
     tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
     moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start)
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
-    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(n, W, N)
+    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, N)
     estimate = moved.error.reshape(W, N)[:K] * (rtol[:K, None] / settings.rtol)
     first = longest / divide[:K, None]
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
