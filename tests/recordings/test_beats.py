@@ -120,3 +120,4 @@ def test_events_alone_are_identified(noisy):
     found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
     assert found.data.outputs == ("duration",) and found.fit.outputs == ("duration",)
     assert np.isfinite(found.fit.numerators).all()
+    assert any("Shape: it adds" in text for text in found.advice.warnings)

@@ -12,6 +12,8 @@ from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
+from ..._core.html.parts import card, text
+from ..._core.html.svg import COLORS, Curve, picture
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
@@ -42,7 +44,7 @@ _EXCESS = 2.0
 # Level of the test for a flat curve. Doubled: more curves have a shape by chance.
 _LEVEL = 0.01
 
-Curve = Annotated[Numbers, Reals("n")]
+Phases = Annotated[Numbers, Reals("n")]
 
 
 @checked_methods
@@ -102,12 +104,12 @@ class PhaseResponse(eqx.Module):
         """What the data cannot tell, in plain words."""
         return tuple(_about(self))
 
-    def __call__(self, phase: Curve) -> Float[np.ndarray, " n"]:
+    def __call__(self, phase: Phases) -> Float[np.ndarray, " n"]:
         """The curve at some phases, in cycles."""
         return self._waves(phase) @ self.coefficients
 
     def interval(
-        self, phase: Curve, level: Probability = 0.95
+        self, phase: Phases, level: Probability = 0.95
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Lower and upper bounds that hold the curve with this probability, as a mean over the
         phases: they are too narrow where it changes faster than elsewhere."""
@@ -117,8 +119,21 @@ class PhaseResponse(eqx.Module):
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
-    def _waves(self, phase: Curve) -> Float[np.ndarray, "n p"]:
+    def _waves(self, phase: Phases) -> Float[np.ndarray, "n p"]:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
+
+    def _repr_html_(self) -> str:
+        low, high = self.interval(self.phase)
+        drawn = [
+            Curve(self.phase, low, color=COLORS[-1]),
+            Curve(self.phase, high, "95 %", COLORS[-1]),
+            Curve(self.phase, self.plain, "plain regression", COLORS[1]),
+            Curve(self.phase, self.values, "estimated", COLORS[0]),
+        ]
+        first, *lines = repr(self).splitlines()
+        of = first.removeprefix("PhaseResponse(").removesuffix(")")
+        shown = picture(drawn, "phase (cycles)", with_unit("Z", curve_unit(self.input)))
+        return card("PhaseResponse", of, shown, text("\n".join(x.strip() for x in lines)))
 
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])

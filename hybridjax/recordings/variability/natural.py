@@ -11,6 +11,8 @@ from scipy import stats
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability, Seed
 from ..._core.boundary.scalars import Whole
+from ..._core.html.multipliers import complex_number
+from ..._core.html.parts import card, table, text
 from ..._core.progress import working
 from ..data import SectionData
 from .moments import Moments, moments_of
@@ -77,21 +79,32 @@ class NaturalMultipliers(eqx.Module):
         """What the data cannot tell, in plain words."""
         return tuple(_about(self))
 
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, complex_number(z, 3), f"{abs(z):.3f}", f"{low:.3f} to {high:.3f}")
+            for name, values, intervals in self._both()
+            for z, (low, high) in zip(values, intervals, strict=True)
+        ]
+        of = f"{self.cycles} cycles, order {len(self.multipliers)}, blocks of {self.block} cycles"
+        head = ("", "multiplier", "modulus", "95 % interval")
+        return card("NaturalMultipliers", of, table(head, rows), text("\n".join(self.warnings)))
+
+    def _both(self):
+        """Either way to estimate them, with moduli's intervals."""
+        yield "by instruments", self.multipliers, self.interval()
+        yield "least squares", self.plain, self.plain_interval()
+
     def __repr__(self) -> str:
         lines = [
             f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
             f"{self.block} cycles)"
         ]
-        both = (
-            ("by instruments", self.multipliers, self.interval()),
-            ("least squares", self.plain, self.plain_interval()),
-        )
-        for name, values, intervals in both:
+        for name, values, intervals in self._both():
             for z, (low, high) in zip(values, intervals, strict=True):
-                text = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+                value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
                 bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
-                lines.append(f"  {name:15s} {text:>15s}   {bounds}")
-        return "\n".join([*lines, *(f"  {text}" for text in self.warnings)])
+                lines.append(f"  {name:15s} {value:>15s}   {bounds}")
+        return "\n".join([*lines, *(f"  {line}" for line in self.warnings)])
 
 
 @checked
