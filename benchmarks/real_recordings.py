@@ -71,12 +71,24 @@ def neurons(every=2):
         start = time.process_time()
         found = hj.recordings.phase_response(recording, phase, input="current")
         print(found, f"({time.process_time() - start:.0f} CPU s)", sep="\n")
-        print("R2 left out by harmonics:", np.round(found.left_out, 4))
         at = np.array([0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95])
         low, high = found.interval(at)
-        rows = zip(at, found(at), low, high, published[(at * 200).astype(int)], strict=True)
-        for x, z, a, b, other in rows:
-            print(f"  Z({x:.2f}) = {z:.2f} [{a:.2f}, {b:.2f}], published {other:.2f}")
+        place = (at * 200).astype(int)
+        rows = zip(at, found(at), low, high, published[place], found.plain[place], strict=True)
+        for x, z, a, b, other, plain in rows:
+            print(
+                f"  Z({x:.2f}) = {z:.2f} [{a:.2f}, {b:.2f}], published {other:.2f}, "
+                f"plain {plain:.2f}"
+            )
+        low, high = found.interval(found.phase)
+        held, (own, plain) = (
+            (low <= published) & (published <= high),
+            (np.sqrt(np.mean((x - published) ** 2)) for x in (found.values, found.plain)),
+        )
+        print(
+            f"the published curve is in the band at {100 * held.mean():.0f} % of the phases; rms "
+            f"difference {own:.2f}, of plain regression {plain:.2f}"
+        )
         curves = {"estimated": found, "published": published, "flat": [published.mean()]}
         for name, curve in curves.items():
             forecast = hj.recordings.forecast_intervals(
@@ -131,21 +143,25 @@ def robots():
 
 def robot_layout(seeds=40, multiplier=0.6):
     """Twelve records of five cycles with four sections, as the robot's."""
-    print(f"\nThe robot's layout, simulated: multiplier {multiplier}, {seeds} seeds")
+    print(f"\nThe robot's layout, simulated: multiplier {multiplier}, {seeds} draws")
     model = linear_rhythm((multiplier,), 4, 2)
     for label, gain in (("input given", 0.0), ("feedback", 0.6)):
-        hits, values, widths = 0, [], []
-        for seed in range(seeds):
-            rng = np.random.default_rng(seed)
+
+        def one(rng, gain=gain):
             records = [in_loop(model, 5, gain, rng) for _ in range(12)]
             fit = hj.fit_series(records, 1, check=False, distortion=False)
-            hits += bool(fit.contains([multiplier])[0])
-            values.append(fit.multipliers[0].real)
-            widths.append(np.abs(fit.ellipse(0) - fit.multipliers[0]).max())
+            return {
+                "held": int(fit.contains([multiplier])[0]),
+                "value": float(fit.multipliers[0].real),
+                "width": float(np.abs(fit.ellipse(0) - fit.multipliers[0]).max()),
+            }
+
+        found = hj.monte_carlo(one, seeds)
+        off = found.value.values - multiplier
         print(
-            f"{label:12s} mean {np.mean(values):.3f}, rms error "
-            f"{np.sqrt(np.mean((np.array(values) - multiplier) ** 2)):.3f}, median half-width "
-            f"{np.median(widths):.3f}, held in {hits}/{seeds}",
+            f"{label:12s} mean {found.value.values.mean():.3f}, rms error "
+            f"{np.sqrt(np.mean(off**2)):.3f}, median half-width "
+            f"{np.median(found.width):.3f}, held in {int(found.held.sum())}/{seeds}",
             flush=True,
         )
 
@@ -190,30 +206,34 @@ def variability():
             print(f"{n_sections} sections: {found}", flush=True)
 
 
-def walking_layout(seeds=30, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
+def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
     """Records as long as the segments, of a system whose multipliers are known."""
-    print(f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} seeds")
+    print(f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} draws")
     model = linear_rhythm(multipliers, n_sections, outputs)
     for noise in (0.0, 0.3, 0.5):
-        rows = []
-        for seed in range(seeds):
+
+        def one(rng, noise=noise):
             found = hj.recordings.natural_multipliers(
-                variable(model, STRIDES, noise, seed), len(multipliers)
+                variable(model, STRIDES, noise, rng), len(multipliers)
             )
-            inside = [a <= multipliers[0] <= b
-                      for a, b in (found.interval()[0], found.plain_interval()[0])]  # fmt: skip
-            rows.append([abs(found.multipliers[0]), abs(found.plain[0]), *inside])
-        mean = np.mean(rows, axis=0)
+            modulus = np.stack([np.abs(found.multipliers), np.abs(found.plain)])
+            low, high = np.moveaxis([found.interval(), found.plain_interval()], 2, 0)
+            held = (low <= np.array(multipliers)) & (np.array(multipliers) <= high)
+            return {"modulus": modulus, "held": held.astype(float)}
+
+        mean = hj.monte_carlo(one, seeds).mean("draw")
+        modulus, held = mean.modulus.values[:, 0], 100 * mean.held.values
         print(
-            f"noise of {noise:.1f} of each output: by instruments {mean[0]:.3f}, held in "
-            f"{100 * mean[2]:.0f} %; least squares {mean[1]:.3f}, held in {100 * mean[3]:.0f} %",
+            f"noise of {noise:.1f} of each output: by instruments {modulus[0]:.3f}, held in "
+            f"{held[0, 0]:.1f} % (the second in {held[0, 1]:.1f} %); least squares "
+            f"{modulus[1]:.3f}, held in {held[1, 0]:.1f} %",
             flush=True,
         )
 
 
-def variable(model, strides, noise, seed):
+def variable(model, strides, noise, rng):
     """Section data of a linear system that white noise disturbs at every section."""
-    (A, C), rng = model, np.random.default_rng(seed)
+    A, C = model
     N, trials = len(A), []
     for count in strides:
         x, y = np.zeros(len(A[0])), []
@@ -233,25 +253,27 @@ def variable(model, strides, noise, seed):
     )  # fmt: skip
 
 
-def phase_model(seeds=10):
+def phase_model(seeds=20, seconds=3, trials=20):
     """Coverage of the 95 % bands of phase response curves that are known."""
-    x = np.arange(400) / 400
-    curve = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)
-    t, at = np.arange(0, 4.0005, 1 / 2000), np.arange(10) / 10
-    print(f"\nPhase model, simulated: {seeds} seeds")
-    for label, second, jitter, trials in (
-        ("sines, 3 to 97 Hz", 0.25, 0.05, 30),
-        ("noise up to 100 Hz", 0.25, 0.05, 6),
-        ("sines, 3 to 97 Hz", 0.15, 0.1, 30),
+    x, at = np.arange(400) / 400, np.linspace(0.025, 0.975, 20)
+    smooth = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)
+    smooth -= 0.25 * np.cos(4 * np.pi * x)
+    t = np.arange(0, seconds + 5e-4, 1 / 2000)
+    print(f"\nPhase model, simulated: {trials} trials of {seconds} s, {seeds} draws")
+    for label, true, jitter in (
+        ("sines of 3 to 97 Hz, smooth curve", smooth, 0.05),
+        ("noise up to 100 Hz, smooth curve", smooth, 0.08),
+        ("sines of 3 to 97 Hz, smooth curve", smooth, 0.1),
+        ("sines of 3 to 97 Hz, a curve that jumps", 0.2 + 1.6 * x, 0.05),
+        ("noise up to 100 Hz, a curve that jumps", 0.2 + 1.6 * x, 0.08),
     ):
-        true = curve - second * np.cos(4 * np.pi * x)
-        held, off, orders = [], [], []
-        for seed in range(seeds):
-            rng = np.random.default_rng(seed)
+
+        def one(rng, label=label, true=true, jitter=jitter):
+            seed = int(rng.integers(2**31 - trials))
             force = 20 * np.sin(2 * np.pi * np.linspace(3, 97, trials)[:, None] * t)
             if "noise" in label:
                 force = np.stack(
-                    [hj.testing.random_force(4, 2000, 100, rms=15, seed=1000 * seed + k)[:, 0]
+                    [hj.testing.random_force(seconds, 2000, 100, rms=15, seed=seed + k)[:, 0]
                      for k in range(trials)]
                 )  # fmt: skip
                 force = np.pad(force, ((0, 0), (0, 1)), mode="edge")
@@ -262,13 +284,22 @@ def phase_model(seeds=10):
             found = hj.recordings.phase_response(made, hj.AtEvent("beat"), input="u")
             low, high = found.interval(at)
             truth = np.interp(at, x, true)
-            held.append((low <= truth) & (truth <= high))
-            off.append(found(at) - truth)
-            orders.append(found.harmonics)
+            plain = np.interp(at, found.phase, found.plain)
+            return {
+                "held": ((low <= truth) & (truth <= high)).astype(float),
+                "off": np.stack([found(at), plain]) - truth,
+                "detail": found.detail,
+                "excess": found.excess,
+            }
+
+        found = hj.monte_carlo(one, seeds)
+        off = found.off.values
+        rms, bias = np.sqrt(np.mean(off**2, axis=(0, 2))), np.abs(off.mean(axis=0)).max(axis=1)
         print(
-            f"{label}, {trials} trials of 4 s, jitter {jitter:g}: held {100 * np.mean(held):.1f} %"
-            f" of the time; bias up to {np.abs(np.mean(off, axis=0)).max():.3f}, rms error "
-            f"{np.sqrt(np.mean(np.square(off))):.3f}; harmonics {np.bincount(orders)}",
+            f"{label}, jitter {jitter:g}: held {100 * found.held.values.mean():.1f} % of the time; "
+            f"bias up to {bias[0]:.3f}, rms error {rms[0]:.3f} (plain regression {bias[1]:.3f}, "
+            f"{rms[1]:.3f}); detail {found.detail.values.mean():.1f}, excess "
+            f"{found.excess.values.mean():.2f}",
             flush=True,
         )
 

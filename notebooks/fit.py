@@ -49,7 +49,7 @@ design = hj.multisine(SECTIONS, periods=16, band=(0, 3.0), amplitude=0.02, seed=
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
 data = hj.experiments.add_noise(data, snr=20, seed=0)
 estimate = hj.estimate_htf(data, (-1, 0, 1))
-print(estimate)
+estimate
 
 # %% [markdown]
 # The fit starts from a hopper all of whose parameters are wrong. The Jacobian is exact, through
@@ -59,8 +59,9 @@ print(estimate)
 names = ("m", "M", "k", "b", "l0", "a", "g")
 wrong = hj.models.VerticalHopper(m=1.15, M=1.8, k=11.0, b=4.3, l0=2.2, a=18.0, g=2.1)
 fit = hj.fit_model(wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4)
-print(fit)
-print()
+fit
+
+# %%
 print(fit.identifiability)
 
 # %% [markdown]

@@ -64,10 +64,11 @@ figure = hj.plot.phase(phase)
 #
 # With what the data cannot tell, in plain words. R2 is the share of the variance of intervals
 # within trials that is forecast in trials, or parts of them, that the curve was not fitted to.
+# Dashed: plain regression of intervals on the current at phases that grow linearly.
 
 # %%
 found = hj.recordings.phase_response(recording, phase, input="current")
-print(found)
+found
 
 # %%
 figure = hj.plot.phase_response(found)
@@ -77,13 +78,14 @@ panel.errorbar(
     data["measured_phase"], data["cell8_measured"], data["cell8_measured_error"],
     fmt=".", ms=3, lw=0.5, color="gray", label="with noise currents",
 )  # fmt: skip
-legend = panel.legend()
+legend = panel.legend(fontsize="x-small")
 
 # %% [markdown]
-# The published curve is from other stimulation, with noise currents. In the middle of the cycle
-# the two agree; at its ends ours overshoots. What is left of neighboring intervals is correlated,
-# so that one number, the phase, is not all of the neuron's state. The intervals are those of the
-# phase model, which holds only so far.
+# The published curve is from other stimulation, with noise currents. How smooth ours is follows
+# from the data (marginal likelihood). Plain regression takes the phase as growing linearly from
+# spike to spike; a late spike then has regressors of its own, and the curve is another one. What is
+# left of neighboring intervals is correlated, so that one number, the phase, is not all of the
+# neuron's state. The intervals are those of the phase model, which holds only so far.
 #
 # ## Forecasts of the next spike
 #
@@ -99,8 +101,7 @@ for name, curve in {"estimated": found, "published": published, "flat": [publish
 # %% [markdown]
 # ## Where the truth is known
 #
-# The same protocol on a phase model with the estimated rate and jitter, and a curve of two
-# harmonics.
+# The same protocol on a phase model with the estimated rate and jitter, and a known curve.
 
 # %%
 x = np.arange(400) / 400
@@ -109,6 +110,8 @@ force = np.stack([trial.values[::5, 0] for trial in recording.trials])
 made = hj.testing.simulate_beats(true, force, rate=1000, rhythm=52.0, jitter=found.jitter, seed=1)
 again = hj.recordings.phase_response(made, hj.AtEvent("beat"), input="u")
 low, high = again.interval(x)
-print(again)
+again
+
+# %%
 print(f"the band holds the true curve at {100 * np.mean((low <= true) & (true <= high)):.0f} %"
       " of the phases")  # fmt: skip

@@ -128,7 +128,9 @@ print([event.name for event in drop.events[:6]])
 # %%
 apex = hj.Crossing("v", "falling", charts=("flight",))
 cycle = hj.find_limit_cycle(robot, hj.Guess("flight", (0.6, 0.0)), section=apex)
-print(cycle)
+cycle
+
+# %%
 hj.plot.cycle(cycle)
 # %% [markdown]
 # One multiplier: of the two states, one is along the orbit. A hop takes away nearly half of what
@@ -172,7 +174,7 @@ print("largest error, of max |H_0|:", estimate.error(exact))
 hj.plot.bode(estimate, exact)
 # %%
 fit = hj.fit_multipliers(estimate, order=1)
-print(fit.compare(cycle.multipliers))
+fit.compare(cycle.multipliers)
 
 # %% [markdown]
 # ## Which parameter would help?

@@ -118,7 +118,7 @@ for event in trajectory.events[:4]:
 
 # %%
 cycle = hj.find_limit_cycle(hopper, hj.Guess("stance", (2.0, 1.9), time=0.5))
-print(cycle)
+cycle
 
 # %% [markdown]
 # ## Poincaré sections (Secs. III, VI-B)

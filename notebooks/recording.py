@@ -44,7 +44,7 @@ force = np.stack(
 clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
 dirt = hj.testing.Dirt(noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0))
 recording = hj.testing.spoil(clean, ("yM", "vM"), dirt)
-print(recording)
+recording
 
 # %% [markdown]
 # ## The five lines
@@ -57,13 +57,19 @@ angle = hj.KinematicPhase(32, position="yM", velocity="vM")
 phase = hj.recordings.estimate_phase(recording, angle)
 data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"))
 fit = hj.fit_series(data, order=2)
-print(phase, data, fit, sep="\n")
+print(phase)
+data
+
+# %%
+fit
 
 # %% [markdown]
 # The truth lies within the 95 % region.
 
 # %%
-print(fit.compare(cycle.multipliers))
+fit.compare(cycle.multipliers)
+
+# %%
 print("held by the 95 % regions:", fit.contains(cycle.multipliers))
 
 # %% [markdown]
@@ -103,7 +109,9 @@ figure = hj.plot.section_data(data)
 # %%
 print("order:", hj.recordings.choose_order(data))
 held_out = hj.recordings.hold_out(data, order=2)
-print(held_out.validation)
+held_out.validation
+
+# %%
 figure = hj.plot.validation(held_out.validation)
 
 # %% [markdown]
@@ -114,7 +122,9 @@ figure = hj.plot.validation(held_out.validation)
 
 # %%
 advice = hj.recordings.advise(data, fit)
-print(advice)
+advice
+
+# %%
 for strides, errors in zip(advice.strides, advice.expected, strict=True):
     print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
 axes = hj.plot.multiplier_regions(fit, advice.plain)

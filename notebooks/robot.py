@@ -95,4 +95,4 @@ angles = hj.recordings.section_data(
     recording, phase, inputs=(), outputs=("hip", "stance"), n_sections=7, bandwidth=np.inf
 )
 natural = hj.recordings.natural_multipliers(angles)
-print(natural)
+natural

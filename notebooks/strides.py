@@ -79,7 +79,9 @@ print(hj.select_order(estimate))
 
 # %%
 fit = hj.fit_multipliers(estimate, order=2)
-print(fit.compare(truth))
+fit.compare(truth)
+
+# %%
 hj.plot.multipliers(truth, {"20 dB": fit})
 
 # %% [markdown]
@@ -114,7 +116,9 @@ noisy = hj.experiments.add_noise(walk, snr=20)
 y = noisy.y[0].copy()
 y[1000:1100] = np.nan  # a hundred samples were lost
 series = hj.fit_series(hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2)
-print(series)
+series
+
+# %%
 print("error", np.max(np.abs(series.multipliers - truth)))
 
 # %% [markdown]
@@ -126,7 +130,9 @@ print("error", np.max(np.abs(series.multipliers - truth)))
 # %%
 test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
 report = hj.validate(hj.identify.realize(series), test)
-print(report)
+report
+
+# %%
 hj.plot.validation(report)
 
 # %% [markdown]
@@ -137,4 +143,4 @@ hj.plot.validation(report)
 # nothing but noise:
 
 # %%
-print(hj.validate(hj.linearize(cycle, phase, outputs), test))
+hj.validate(hj.linearize(cycle, phase, outputs), test)

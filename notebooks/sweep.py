@@ -45,7 +45,7 @@ k_axis, b_axis = np.linspace(8, 18, POINTS), np.linspace(2.6, 11, POINTS)
 k, b = (jnp.asarray(x.ravel()) for x in np.meshgrid(k_axis, b_axis))
 hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
 cycles = hj.find_limit_cycles(hoppers, guess=cycle)
-print(cycles.summary(limit=2))
+cycles
 
 # %% [markdown]
 # Each hopper has four multipliers, two of which are zero: touchdown forgets the foot. The

@@ -23,6 +23,7 @@
 from pathlib import Path
 
 import numpy as np
+from IPython.display import display
 
 import hybridjax as hj
 
@@ -48,7 +49,10 @@ phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"))
 strides = hj.recordings.section_data(
     recording, phase, inputs=(), outputs=recording.signals, n_sections=16
 )
-print(phase, strides, sep="\n")
+print(phase)
+strides
+
+# %%
 figure = hj.plot.phase(phase)
 
 # %% [markdown]
@@ -59,7 +63,7 @@ figure = hj.plot.phase(phase)
 
 # %%
 for order in (1, 2, 3):
-    print(hj.recordings.natural_multipliers(strides, order))
+    display(hj.recordings.natural_multipliers(strides, order))
 
 # %% [markdown]
 # What does not change with the order can be believed: deviations of joint angles are mostly gone

@@ -141,23 +141,19 @@ def phase_response(
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Left: the curve with its 95 % band, and its mean. Right: the share of the variance that is
-    forecast of intervals left out, by the number of harmonics."""
-    with panels(ax, 1, 2, width=PAGE, height=2.4, width_ratios=(3, 2)) as axes:
-        curve, orders = axes[0]
+    """The curve with its 95 % band, and that of plain regression, which is biased."""
+    with panels(ax, height=2.8) as axes:
+        curve = axes[0, 0]
         low, high = found.interval(found.phase)
         curve.fill_between(found.phase, low, high, color=CYCLE[0], alpha=0.25, lw=0)
         curve.plot(found.phase, found.values, color=CYCLE[0], label="estimated, 95 %")
+        curve.plot(found.phase, found.plain, "--", color=COLORS["gray"], label="plain regression")
         curve.axhline(0, color="black", lw=0.4)
         name = f"response to {label_of(found.input, labels)}"
         curve.set(
             xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
         )
-        orders.plot(found.left_out, "o-", color=COLORS["gray"])
-        orders.plot(found.harmonics, found.left_out[found.harmonics], "o", color=CYCLE[0])
-        orders.set(xlabel="harmonics", ylabel="$R^2$ of intervals left out")
-        orders.xaxis.get_major_locator().set_params(integer=True)
-        letters(axes)
+        curve.legend()
     return Plot(axes)
 
 

@@ -20,6 +20,7 @@ from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.series_fit import SeriesFit
 from ..identify.series.validation import Validation
+from .beats.response import PhaseResponse
 from .data import SectionData
 from .inspection.finding import Finding
 from .spectra import input_band, input_spectrum
@@ -90,13 +91,15 @@ def advise(
     fit: SeriesFit,
     validation: Validation | None = None,
     findings: Sequence[Finding] = (),
+    curve: PhaseResponse | None = None,
 ) -> Advice:
     """Look for what makes a fit to recorded data worth less than it says.
 
     Too few strides for the unknowns, more multipliers than the data carry, inputs without power
     where the multipliers are, outputs that say the same, noise that would bias plain regression,
     intervals that reach the unit circle, an iteration that did not end; and with a `validation` on
-    strides that were held out, what it finds left over. The `findings` of an inspection come first.
+    strides that were held out, what it finds left over. The `findings` of an inspection come first;
+    last, for events alone, what the data cannot tell of their phase response `curve`.
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
@@ -138,6 +141,7 @@ def advise(
         for name, count in zip(data.signals, data.spikes, strict=True)
         if count
     ]
+    warnings += [] if curve is None else curve.warnings
     # Variances go down with the number of strides that the unknowns leave over.
     now = max(sampled - unknown, 1)
     later = np.array([max(n - (R * nu + d + 1), 0) for n in _STRIDES], float)

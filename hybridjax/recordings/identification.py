@@ -12,6 +12,7 @@ from .._core.progress import say, working
 from ..identify.series.fit import fit_series
 from ..identify.series.series_fit import SeriesFit
 from .advice import Advice, advise
+from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .drift import DriftCycles, without_drift
 from .held_out import CYCLES_LOOKED_AT, HeldOut, choose_order, hold_out
@@ -30,7 +31,8 @@ class Identification(eqx.Module):
 
     **Fields:** `recording`, without what `inspect` leaves out; `findings` of the inspection;
     `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the first three
-    quarters, tried on the last; `responses` to pushes; `advice`.
+    quarters, tried on the last; `responses` to pushes; `curve`, the phase response curve of events
+    alone under one input (else None); `advice`.
     """
 
     recording: Recording
@@ -40,6 +42,7 @@ class Identification(eqx.Module):
     fit: SeriesFit
     held_out: HeldOut
     responses: ImpulseResponses
+    curve: PhaseResponse | None
     advice: Advice
 
     def __repr__(self) -> str:
@@ -117,6 +120,7 @@ def identify_recording(
     known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
     say("fit to all")
     fit = fit_series(data, order, check=False, distortion=False if known else None)
+    curve = _curve(recording, found, data)
     return Identification(
         recording=recording,
         findings=findings,
@@ -125,5 +129,14 @@ def identify_recording(
         fit=fit,
         held_out=held,
         responses=impulse_responses(fit, data),
-        advice=advise(data, fit, held.validation, findings),
+        curve=curve,
+        advice=advise(data, fit, held.validation, findings, curve),
     )
+
+
+def _curve(recording: Recording, phase: Phase, data: SectionData) -> PhaseResponse | None:
+    """Of events alone under one input."""
+    of_events = all(w.linear for parts in phase.stretches for w in parts)
+    if data.outputs != ("duration",) or len(data.inputs) != 1 or not of_events:
+        return None
+    return phase_response(recording, phase, input=data.inputs[0])

@@ -279,7 +279,7 @@ def recordings(t):
     data = instance(t.record, t.data)
     yield "advise", hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit), {
         "data": data, "fit": instance(t.structured), "validation": optional(instance(t.data)),
-        "findings": ["x", 3, [3], Other()],
+        "findings": ["x", 3, [3], Other()], "curve": optional(instance(t.design)),
     }  # fmt: skip
     yield "plain_regression", hj.recordings.plain_regression, dict(data=t.record, order=2), {
         "data": [*instance(t.design), [], [3]], "order": FEW,

@@ -7,7 +7,6 @@ import hybridjax as hj
 from .about_data import FEW, SIGNAL
 from .values import (
     CALLABLE,
-    INTEGER,
     LABELS,
     NEW_NAME,
     NONNEGATIVE,
@@ -17,7 +16,6 @@ from .values import (
     Other,
     array,
     instance,
-    optional,
 )
 
 
@@ -36,9 +34,7 @@ def calls(t):
     definition = [None, "x", 3, hj.AtEvent("nope"), hj.ClockPhase(4), Other()]
     about = dict(recording=t.recording, phase=BEAT, input="f")
     wrong = {"recording": instance(t.record), "phase": definition, "input": SIGNAL}
-    yield "phase_response", hj.recordings.phase_response, about, wrong | {
-        "harmonics": optional([*INTEGER, -1, 99]),
-    }  # fmt: skip
+    yield "phase_response", hj.recordings.phase_response, about, wrong
     yield (
         "forecast_intervals",
         hj.recordings.forecast_intervals,

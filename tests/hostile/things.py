@@ -155,9 +155,7 @@ class Things:
 
     @ft.cached_property
     def beats(self):
-        return hj.recordings.phase_response(
-            self.recording, hj.AtEvent("strike"), input="f", harmonics=1
-        )
+        return hj.recordings.phase_response(self.recording, hj.AtEvent("strike"), input="f")
 
     @ft.cached_property
     def found(self):

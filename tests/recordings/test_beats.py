@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.beats.estimation import fit_curve
+from hybridjax.recordings.beats.estimation import WAVES, fit_curve
 from hybridjax.recordings.beats.intervals import intervals_of
-from hybridjax.recordings.beats.phase_model import Table, forecast
+from hybridjax.recordings.beats.phase_model import Table, basis, forecast
 
 
 X = np.arange(200) / 200
@@ -14,10 +14,10 @@ CURVE = 1 - 0.5 * np.cos(2 * np.pi * X) + 0.2 * np.sin(2 * np.pi * X)
 BEAT = hj.AtEvent("beat")
 
 
-def beats(jitter, trials=4, seconds=4, seed=0):
+def beats(jitter, trials=4, seconds=4, seed=0, curve=CURVE):
     t = np.arange(0, seconds + 1e-9, 1e-3)
     force = np.stack([6 * np.sin(2 * np.pi * f * t) for f in np.linspace(2, 17, trials)])
-    return hj.testing.simulate_beats(CURVE, force, rate=1000, rhythm=10.0, jitter=jitter, seed=seed)
+    return hj.testing.simulate_beats(curve, force, rate=1000, rhythm=10.0, jitter=jitter, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,8 @@ def found(noisy):
 
 
 def test_a_rhythm_without_noise_is_found_exactly():
-    exact = hj.recordings.phase_response(beats(0.0), BEAT, input="u", harmonics=1)
-    np.testing.assert_allclose(exact.coefficients, [1, -0.5, 0.2], atol=3e-3)
+    exact = hj.recordings.phase_response(beats(0.0), BEAT, input="u")
+    np.testing.assert_allclose(exact.values, CURVE, atol=0.02)
     np.testing.assert_allclose(exact.rates, 10, atol=5e-3)
     assert exact.r2 > 0.9999 and exact.result == 0 and exact.miscounted == 0
 
@@ -40,7 +40,8 @@ def test_a_rhythm_without_noise_is_found_exactly():
 def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
     low, high = found.interval(X, 0.99)
     assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
-    assert found.harmonics >= 1 and abs(found.jitter - 0.05) < 0.01
+    assert 3 < found.detail < 10 and abs(found.jitter - 0.05) < 0.01 and found.p_flat < 1e-3
+    assert rms(found.values - CURVE) < 0.1 and rms(found.plain - CURVE) < 0.1  # (little jitter)
     flat = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=[1.0], folds=3)
     own = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=found, folds=3)
     true = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=CURVE, folds=3)
@@ -48,9 +49,22 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
     assert "Shape: it adds" in repr(found)
 
 
+def rms(values):
+    return np.sqrt(np.mean(values**2))
+
+
+def test_a_curve_may_jump_at_the_reset_and_be_flat():
+    jump = 0.3 + 1.4 * X
+    found = hj.recordings.phase_response(beats(0.05, trials=8, curve=jump), BEAT, input="u")
+    assert rms(found.values - jump) < 0.1
+    flat = hj.recordings.phase_response(beats(0.05, trials=8, curve=[1.0]), BEAT, input="u")
+    assert flat.p_flat > 0.01 and np.ptp(flat.values) < 0.1
+    assert "nothing is seen of it" in flat.warnings[0]
+
+
 def test_slopes_are_derivatives(noisy):
     intervals = intervals_of(noisy, hj.recordings.estimate_phase(noisy, BEAT), "u")
-    table, a, rates = Table.of(2, 0.05), np.array([1, -0.4, 0.2, 0.1, 0]), np.full(8, 10.0)
+    table, a, rates = Table.of(4, 0.05), np.array([1, -0.4, 0.2, 0.1, 0]), np.full(8, 10.0)
     base = forecast(intervals, table, a, rates)
     for k in range(5):
         moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates, slopes=False)
@@ -63,8 +77,8 @@ def test_slopes_are_derivatives(noisy):
 def test_missed_events_do_not_count(noisy):
     lost = hj.testing.spoil(noisy, "u", hj.testing.Dirt(lost_events=6, seed=1))
     phase = hj.recordings.estimate_phase(lost, BEAT)
-    fit = fit_curve(intervals_of(lost, phase, "u"), 1)
-    assert np.abs(fit.coefficients - [1, -0.5, 0.2]).max() < 0.1
+    fit = fit_curve(intervals_of(lost, phase, "u"), WAVES)
+    assert rms(basis(X, WAVES) @ fit.coefficients - CURVE) < 0.1
     assert phase.missed + (~fit.used).sum() > 20
 
 
@@ -96,7 +110,7 @@ def test_what_is_refused(noisy):
         hj.Recording(t, wave, events={"beat": t[:50] + 20}),
     )
     refuse("too few events", hj.Recording(t, wave, events={"beat": [1.0, 2.0]}))
-    refuse("9 intervals|8 intervals are too few", hj.Recording(t, wave, events=beat), harmonics=4)
+    refuse("8 intervals are too few", hj.Recording(t, wave, events=beat))
     angle = hj.KinematicPhase(4, position="a", velocity="b")
     circle = hj.Recording(t, wave | {"a": np.cos(6 * t), "b": np.sin(6 * t)})
     refuse("must be one of events", circle, hj.recordings.estimate_phase(circle, angle))
@@ -106,3 +120,4 @@ def test_events_alone_are_identified(noisy):
     found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
     assert found.data.outputs == ("duration",) and found.fit.outputs == ("duration",)
     assert np.isfinite(found.fit.numerators).all()
+    assert any("Shape: it adds" in text for text in found.advice.warnings)

@@ -45,6 +45,15 @@ def test_short_records_are_drawn_whole():
     found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
     low, high = found.interval()[0]
     assert high - low > 0.2 and any("Few cycles" in text for text in found.warnings)
+    assert found.block * found.records == found.cycles
+    (alone,) = hj.recordings.natural_multipliers(variable(0.1, strides=(11,))).interval()
+    assert alone[1] - alone[0] > 0.2
+
+
+def test_intervals_of_few_blocks_are_wider_than_percentiles():
+    found = hj.recordings.natural_multipliers(variable(0.3, strides=(39, 40)))
+    plain = np.ptp(np.quantile(np.abs(found.draws[:, 0]), [0.025, 0.975]))
+    assert 1.05 < np.ptp(found.interval()[0]) / plain < 1.2
 
 
 def test_what_is_refused():

@@ -170,7 +170,7 @@ def _about(address: str) -> Mapping[str, Any] | None:
     zarr = package("zarr")
     try:
         group = _group(address, "r")
-    except (FileNotFoundError, zarr.errors.GroupNotFoundError):
+    except FileNotFoundError:
         if _occupied(address):
             raise DefinitionError(
                 f"'{address}' is there, and is no store of results: choose another name."

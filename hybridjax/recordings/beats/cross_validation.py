@@ -15,7 +15,7 @@ from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
 from ..phase.winding import Phase
 from ..recording import Recording
-from .estimation import fit_curve, fit_rates, miscounted
+from .estimation import WAVES, fit_curve, fit_rates, miscounted
 from .intervals import intervals_of
 from .phase_model import Table
 from .response import PhaseResponse, phase_of, share
@@ -65,10 +65,9 @@ def forecast_intervals(
     Each trial is cut into as many parts as there are `folds`; what is forecast of a part is learned
     from the other parts of all trials.
 
-    **Arguments:** `phase`, `input`: as for `phase_response`. `curve`: one that was estimated, of
-    which the number of harmonics is kept and all else is fitted anew without the part that is left
-    out; or values at n equal steps of the phase from 0 on (one value: a flat curve), as they are:
-    then only the rates of the trials are learned.
+    **Arguments:** `phase`, `input`: as for `phase_response`. `curve`: one that was estimated: it
+    is fitted anew without the part that is left out; or values at n equal steps of the phase from 0
+    on (one value: a flat curve), as they are: then only the rates of the trials are learned.
 
     **Raises:** `DefinitionError` as `phase_response`, and for a curve without values.
     """
@@ -82,7 +81,7 @@ def forecast_intervals(
     for k in range(folds):
         out = fold == k
         if isinstance(curve, PhaseResponse):
-            first = fit_curve(intervals, curve.harmonics, first, ~out)
+            first = fit_curve(intervals, WAVES, first, ~out)
             found = first
         else:
             found = fit_rates(intervals, Table.of_curve(np.asarray(curve, float)), ~out)

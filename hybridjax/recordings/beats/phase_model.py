@@ -9,8 +9,10 @@ measured end (whose noise would be part of the regressors).
 
 Noise in the rhythm spreads the phase: after a part $\varphi$ of the cycle its variance is
 $s^2 \varphi$, with s the standard deviation at the end. What acts on the mean phase is the curve
-averaged over that distribution, in which harmonic k is weaker by
-$\exp(-2 \pi^2 k^2 s^2 \varphi)$.
+averaged over that distribution. A phase that has come to 1 has left the interval, and the others
+may not have: the curve goes on beyond 1 as in a mirror. So it is a series of
+$\cos(\pi k \varphi)$, which need not be the same at 0 and at 1, and of which term k is weaker by
+$\exp(-\pi^2 k^2 s^2 \varphi / 2)$.
 """
 
 from typing import NamedTuple
@@ -23,7 +25,7 @@ from .intervals import Intervals
 
 
 # Points in a cycle at which curves are tabulated; linear in between. Doubled: a quarter of the
-# error (1e-5 of the tenth harmonic).
+# error (1e-5 of the twentieth half wave).
 _POINTS = 1024
 # How far tables reach, in cycles: the step in which an interval ends goes beyond 1. Doubled:
 # nothing changes.
@@ -36,14 +38,12 @@ _NEWTON = 4
 
 
 def basis(
-    phase: Float[np.ndarray, " n"], harmonics: int, jitter: float = 0.0
+    phase: Float[np.ndarray, " n"], waves: int, jitter: float = 0.0
 ) -> Float[np.ndarray, "n p"]:
-    """1, cos, sin, cos of twice the angle, ..., as they act on a phase with so much jitter."""
-    k = np.arange(1, harmonics + 1)
-    angle = 2 * np.pi * phase[:, None] * k
-    left = np.exp(-2 * np.pi**2 * jitter**2 * k**2 * phase[:, None])
-    waves = np.stack([left * np.cos(angle), left * np.sin(angle)], axis=2)
-    return np.concatenate([np.ones((len(phase), 1)), waves.reshape(len(phase), -1)], axis=1)
+    """1 and so many half waves, cos(pi k phase), as they act on a phase with so much jitter."""
+    angle = np.pi * np.arange(waves + 1)
+    spread = (jitter * angle) ** 2 / 2
+    return np.cos(angle * phase[:, None]) * np.exp(-spread * phase[:, None])
 
 
 class Table(NamedTuple):
@@ -52,8 +52,8 @@ class Table(NamedTuple):
     basis: Float[np.ndarray, "M p"]
 
     @classmethod
-    def of(cls, harmonics: int, jitter: float) -> "Table":
-        return cls(basis(_grid(), harmonics, jitter))
+    def of(cls, waves: int, jitter: float) -> "Table":
+        return cls(basis(_grid(), waves, jitter))
 
     @classmethod
     def of_curve(cls, curve: Float[np.ndarray, " n"]) -> "Table":

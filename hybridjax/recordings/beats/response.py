@@ -12,7 +12,8 @@ from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
-from ..._core.boundary.scalars import Whole
+from ..._core.html.parts import card, text
+from ..._core.html.svg import COLORS, Curve, picture
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
@@ -22,31 +23,28 @@ from ...sections.crossing import AtEvent, Crossing
 from ..phase.estimation import estimate_phase
 from ..phase.winding import Phase
 from ..recording import Recording
-from .estimation import Accuracy, CurveFit, accuracy_of, fit_curve
+from .estimation import WAVES, CurveFit, accuracy_of, fit_curve
 from .intervals import Intervals, intervals_of
 from .phase_model import basis
+from .plain import plain_curve
 
 
-# Harmonics of a curve, at most. Doubled: curves with finer detail, where jitter allows any.
-_MOST = 8
-# Relative difference of two errors of forecasts that are as good as equal. Doubled: curves are
-# smoother.
-_AS_GOOD = 0.02
-# Harmonics beyond the best number that are tried. Doubled: those that pay only together are found.
-_FURTHER = 2
 # Phases at which a curve is given. Doubled: smoother figures.
 _POINTS = 200
+# Intervals to be had besides one for each trial, half of them. Doubled: more is refused.
+_FEWEST = 10
 # Half of the 95 % band, relative to the mean of the curve, that is wide. Doubled: less is said.
 _WIDE = 0.5
 # Correlation of what is left of neighboring intervals that is said. Doubled: less is.
 _MEMORY = 0.2
 # Share of intervals that are miscounted, and said. Doubled: less is said.
 _MISCOUNTED = 0.01
+# Excess of the variance of sums over blocks that is said. Doubled: less is.
+_EXCESS = 2.0
 # Level of the test for a flat curve. Doubled: more curves have a shape by chance.
 _LEVEL = 0.01
 
-Harmonics = Annotated[int, Whole(0, 50)]
-Curve = Annotated[Numbers, Reals("n")]
+Phases = Annotated[Numbers, Reals("n")]
 
 
 @checked_methods
@@ -58,15 +56,21 @@ class PhaseResponse(eqx.Module):
 
     **Fields:**
 
-    - `coefficients` (2 K + 1,): of 1, cos, sin, cos of twice the angle, ...; `covariance`, and the
-      degrees of `freedom` with which it was estimated.
-    - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors.
+    - `coefficients` (K + 1,): of $\cos(\pi k \varphi)$; `covariance`, and the degrees of `freedom`
+      with which it was estimated. `detail`: how many numbers the data determine, the smoothness of
+      the curve the others.
+    - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors. `plain` (P,):
+      the curve by regression of durations on the input at phases that grow linearly from event to
+      event, which is biased.
     - `rates` (trials,): w, in cycles per second. `trials`: their names.
     - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
-    - `left_out` (orders,): for 0, 1, ... harmonics the share of the variance of durations within
-      trials (R2) that is forecast of blocks of intervals that the curve was not fitted to, by
-      fits to the others to first order. The first is that of a flat curve.
+    - `left_out`: the share of the variance of durations within trials (R2) that is forecast of
+      blocks of intervals that the curve was not fitted to, by fits to the others to first order;
+      `left_out_flat`: by a flat curve.
     - `r2`: the same share for all intervals that count, in the fit itself.
+    - `p_flat`: how probable so much shape is where there is none (likelihood ratio; Self and Liang
+      1987).
+    - `excess`: how many times the variance of independent errors the sums over blocks have.
     - `intervals`: how many there are; `miscounted`: how many of them miss the model by half a
       cycle or more (an event was missed, or one was none), and do not count.
     - `memory`: correlation of what is left of neighboring intervals.
@@ -76,14 +80,19 @@ class PhaseResponse(eqx.Module):
     coefficients: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
     freedom: float = eqx.field(static=True)
+    detail: float = eqx.field(static=True)
     phase: Float[np.ndarray, " P"]
     values: Float[np.ndarray, " P"]
     errors: Float[np.ndarray, " P"]
+    plain: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
     trials: tuple[str, ...] = eqx.field(static=True)
     jitter: float = eqx.field(static=True)
-    left_out: Float[np.ndarray, " orders"]
+    left_out: float = eqx.field(static=True)
+    left_out_flat: float = eqx.field(static=True)
     r2: float = eqx.field(static=True)
+    p_flat: float = eqx.field(static=True)
+    excess: float = eqx.field(static=True)
     intervals: int = eqx.field(static=True)
     miscounted: int = eqx.field(static=True)
     memory: float = eqx.field(static=True)
@@ -95,37 +104,48 @@ class PhaseResponse(eqx.Module):
         """What the data cannot tell, in plain words."""
         return tuple(_about(self))
 
-    @property
-    def harmonics(self) -> int:
-        """K."""
-        return len(self.coefficients) // 2
-
-    def __call__(self, phase: Curve) -> Float[np.ndarray, " n"]:
+    def __call__(self, phase: Phases) -> Float[np.ndarray, " n"]:
         """The curve at some phases, in cycles."""
-        return basis(np.asarray(phase, float), self.harmonics) @ self.coefficients
+        return self._waves(phase) @ self.coefficients
 
     def interval(
-        self, phase: Curve, level: Probability = 0.95
+        self, phase: Phases, level: Probability = 0.95
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Lower and upper bounds that hold the curve at each phase with this probability."""
-        waves = basis(np.asarray(phase, float), self.harmonics)
+        """Lower and upper bounds that hold the curve with this probability, as a mean over the
+        phases: they are too narrow where it changes faster than elsewhere."""
+        waves = self._waves(phase)
         error = np.sqrt(np.einsum("ni,ij,nj->n", waves, self.covariance, waves))
         reach = float(stats.t.ppf((1 + level) / 2, self.freedom)) * error
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
+    def _waves(self, phase: Phases) -> Float[np.ndarray, "n p"]:
+        return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
+
+    def _repr_html_(self) -> str:
+        low, high = self.interval(self.phase)
+        drawn = [
+            Curve(self.phase, low, color=COLORS[-1]),
+            Curve(self.phase, high, "95 %", COLORS[-1]),
+            Curve(self.phase, self.plain, "plain regression", COLORS[1]),
+            Curve(self.phase, self.values, "estimated", COLORS[0]),
+        ]
+        first, *lines = repr(self).splitlines()
+        of = first.removeprefix("PhaseResponse(").removesuffix(")")
+        shown = picture(drawn, "phase (cycles)", with_unit("Z", curve_unit(self.input)))
+        return card("PhaseResponse", of, shown, text("\n".join(x.strip() for x in lines)))
+
     def __repr__(self) -> str:
         mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
         unit = with_unit("Z", curve_unit(self.input))
         lines = [
-            f"PhaseResponse({self.harmonics} harmonics, {self.intervals} intervals of "
+            f"PhaseResponse(detail of {self.detail:.1f} numbers, {self.intervals} intervals of "
             f"{len(self.trials)} trials, {self.miscounted} of them miscounted)",
             f"  mean {unit}  {mean:.4g} +- {error:.2g}; from {self.values.min():.4g} to "
             f"{self.values.max():.4g}",
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
             f"{100 * self.jitter:.2g} % of a cycle",
-            f"  R2 left out  {self.left_out[self.harmonics]:.3f}; of a flat curve "
-            f"{self.left_out[0]:.3f}",
+            f"  R2 left out  {self.left_out:.3f}; of a flat curve {self.left_out_flat:.3f}",
         ]
         return "\n".join([*lines, *(f"  {text}" for text in self.warnings)])
 
@@ -142,15 +162,15 @@ def phase_response(
     phase: Phase | AtEvent | Crossing,
     *,
     input: str,
-    harmonics: Harmonics | None = None,
 ) -> PhaseResponse:
     r"""The phase response curve of spikes, heartbeats, taps or steps under a known input.
 
     The phase model is integrated from each event until its phase is 1, and the durations that this
-    gives are fitted to those measured by least squares, over the curve (a Fourier series) and the
-    rate of each trial. The end of an interval depends on the input, so that a regression of
-    measured intervals on the input at a linear phase is biased; this is not. The averaging of the
-    curve by the jitter of the rhythm is undone: see `docs/mathematics.md`.
+    gives are fitted to those measured by least squares, over the curve and the rate of each trial.
+    The curve is as smooth as makes the data most probable, and need not be the same just after an
+    event and just before the next. The end of an interval depends on the input, so that a
+    regression of measured intervals on the input at a linear phase is biased; this is not. The
+    averaging of the curve by the jitter of the rhythm is undone: see `docs/mathematics.md`.
 
     **Arguments:**
 
@@ -158,10 +178,6 @@ def phase_response(
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback).
-    - `harmonics`: K. By default one more (so that what is left of higher ones is small beside the
-      errors) than the smallest number whose forecasts of what was left out are within 2 % of the
-      best, and not beyond 1/(pi jitter): the spread of the phase at the end of a cycle hides what
-      is finer.
 
     Standard errors are those of blocks of intervals, whose errors may depend on each other: trials
     if there are thirty or more, else parts of them.
@@ -171,37 +187,36 @@ def phase_response(
     """
     intervals = intervals_of(recording, phase_of(recording, phase), input)
     total = len(intervals.start)
-    most = _MOST if harmonics is None else harmonics
-    if total < 2 * (2 * (harmonics or 0) + 1 + intervals.trials):
+    if total < 2 * (_FEWEST + intervals.trials):
         raise DefinitionError(
-            f"{total} intervals are too few for {harmonics or 0} harmonics and the rates of "
-            f"{intervals.trials} trials: record more."
+            f"{total} intervals are too few for a curve and the rates of {intervals.trials} "
+            "trials: record more."
         )
-    fits: list[tuple[CurveFit, Accuracy]] = []
-    for k in range(most + 1):
-        say(f"{k} harmonics")
-        fit = fit_curve(intervals, k, fits[-1][0] if fits else None)
-        fits.append((fit, accuracy_of(intervals, fit)))
-        if harmonics is None and k > min(_best(fits) + _FURTHER, _resolved(fit.jitter)):
-            break
-    chosen = min(_best(fits) + 1, _resolved(fits[-1][0].jitter), len(fits) - 1)
-    chosen = chosen if harmonics is None else harmonics
-    fit, accuracy = fits[chosen]
-    x = np.arange(_POINTS) / _POINTS
-    waves = basis(x, chosen)
+    say("flat")
+    flat = fit_curve(intervals, 0)
+    say("smooth")
+    fit = fit_curve(intervals, WAVES, flat)
+    accuracy = accuracy_of(intervals, fit)
     matrix = accuracy.covariance.matrix
+    x = np.arange(_POINTS) / _POINTS
+    waves = basis(x, WAVES)
     return PhaseResponse(
         coefficients=fit.coefficients,
         covariance=matrix,
         freedom=max(accuracy.covariance.freedom, 1.0),
+        detail=accuracy.detail,
         phase=x,
         values=waves @ fit.coefficients,
         errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
+        plain=waves @ plain_curve(intervals, fit),
         rates=fit.rates,
         trials=intervals.names,
         jitter=fit.jitter,
-        left_out=np.array([share(intervals, f.used, a.left_out.sum()) for f, a in fits]),
+        left_out=share(intervals, fit.used, accuracy.left_out.sum()),
+        left_out_flat=share(intervals, flat.used, accuracy_of(intervals, flat).left_out.sum()),
         r2=share(intervals, fit.used, (fit.residual[fit.used] ** 2).sum()),
+        p_flat=float(stats.chi2.sf(fit.smoothness.evidence, 1) / 2),
+        excess=fit.smoothness.excess,
         intervals=total,
         miscounted=int((~fit.used).sum()),
         memory=_memory(intervals, fit),
@@ -223,18 +238,6 @@ def share(intervals: Intervals, used: Bool[np.ndarray, " L"], left: int | float)
     return float(1 - left / whole) if whole > 0 else 0.0
 
 
-def _resolved(jitter: float) -> int:
-    """The highest harmonic of which the spread of the phase leaves a seventh at the end of a
-    cycle."""
-    return max(1, round(1 / (np.pi * max(jitter, 1e-6))))
-
-
-def _best(fits: list[tuple[CurveFit, Accuracy]]) -> int:
-    """The smallest number of harmonics that forecasts what was left out as well as any."""
-    missed = np.sqrt([accuracy.left_out.sum() for _, accuracy in fits])
-    return int(np.argmax(missed <= missed.min() * (1 + _AS_GOOD)))
-
-
 def _memory(intervals: Intervals, fit: CurveFit) -> float:
     """Correlation of what is left of intervals that follow each other."""
     missed, end = fit.residual * fit.forecast.rate, intervals.start + intervals.duration
@@ -247,21 +250,16 @@ def _memory(intervals: Intervals, fit: CurveFit) -> float:
 
 def _about(r: PhaseResponse) -> Iterator[str]:
     """What the data cannot tell."""
-    K, mean = r.harmonics, abs(r.coefficients[0])
-    if K:
-        a, C = r.coefficients[1:], r.covariance[1:, 1:]
-        p = float(stats.f.sf(a @ np.linalg.lstsq(C, a)[0] / len(a), len(a), r.freedom))
-    if not K or p > _LEVEL:
-        test = f" ({p_value(p)} for a flat one)" if K else ""
+    mean, p = abs(r.coefficients[0]), p_value(r.p_flat)
+    if r.p_flat > _LEVEL:
         yield (
-            f"Shape: nothing is seen of it{test}; R2 of intervals left out is {r.left_out[0]:.3f} "
-            "with the mean alone."
+            f"Shape: nothing is seen of it ({p} for a flat one); R2 of intervals left out is "
+            f"{r.left_out_flat:.3f} with the mean alone."
         )
     else:
-        gain = r.left_out[K] - r.left_out[0]
         yield (
-            f"Shape: it adds {gain:.3f} to the R2 of intervals left out; a flat curve has "
-            f"{r.left_out[0]:.3f} of {r.left_out[K]:.3f}."
+            f"Shape: it adds {r.left_out - r.left_out_flat:.3f} to the R2 of intervals left out; a "
+            f"flat curve has {r.left_out_flat:.3f} of {r.left_out:.3f}."
         )
     low, high = r.interval(r.phase)
     half = (high - low) / 2
@@ -271,10 +269,23 @@ def _about(r: PhaseResponse) -> Iterator[str]:
             f"Wide: at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
             f"either side, {100 * half[worst] / max(mean, 1e-300):.0f} % of the mean."
         )
+    off = np.sqrt(np.mean((r.plain - r.values) ** 2))
+    if off > np.sqrt(np.mean(r.errors**2)):
+        yield (
+            f"Plain regression at phases that grow linearly would be off by {off:.2g} (rms, of a "
+            f"mean of {mean:.2g}); do not use it here."
+        )
+    finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
     yield (
         f"Resolution: the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than "
-        f"harmonic {_resolved(r.jitter)} at the end of a cycle."
+        f"harmonic {finest} at the end of a cycle."
     )
+    if r.excess > _EXCESS:
+        yield (
+            f"Misfit: what is left of a block of intervals adds up to {r.excess:.1f} times the "
+            "variance of independent errors: the phase model lacks something. Intervals allow for "
+            "that, but do not know what it does to the curve."
+        )
     if abs(r.memory) > _MEMORY:
         yield (
             f"Memory: what is left of neighboring intervals is correlated by {r.memory:.2f}: one "

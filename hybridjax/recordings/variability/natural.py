@@ -6,10 +6,13 @@ from typing import Annotated
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy import stats
 
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability, Seed
 from ..._core.boundary.scalars import Whole
+from ..._core.html.multipliers import complex_number
+from ..._core.html.parts import card, table, text
 from ..._core.progress import working
 from ..data import SectionData
 from .moments import Moments, moments_of
@@ -20,7 +23,8 @@ _DRAWS = 1000
 # Cycles of a block: the third root of their number, and not less than this. Doubled: longer memory
 # of what disturbs the rhythm is allowed for, by fewer blocks.
 _SHORTEST_BLOCK = 4
-# Blocks in a record, below which whole records are drawn. Doubled: longer ones are, too.
+# Blocks in a record, below which whole records are drawn, if there are as many. Doubled: longer
+# ones are, too.
 _BLOCKS = 3
 # Share of the states' variance that instruments must explain, below which they are weak. Doubled:
 # more is said.
@@ -43,7 +47,7 @@ class NaturalMultipliers(eqx.Module):
     - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles.
     - `strength`: the share of the states' variance that the instruments explain.
     - `cycles`: how many were used, that are followed by another one, of so many `records`.
-      `block`: cycles of a block.
+      `block`: cycles of a block; those of a record, where whole records are drawn.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -57,33 +61,50 @@ class NaturalMultipliers(eqx.Module):
 
     def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
         """Bounds that hold the modulus of each multiplier with this probability, in the order of
-        moduli: percentiles of the bootstrap."""
-        return _interval(self.draws, level)
+        moduli: percentiles of the bootstrap, further out by what Student's distribution is beyond
+        the normal one for so many blocks (Hesterberg, *Am. Stat.* 69, 2015)."""
+        return self._interval(self.draws, level)
 
     def plain_interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
         """The same for least squares."""
-        return _interval(self.plain_draws, level)
+        return self._interval(self.plain_draws, level)
+
+    def _interval(self, draws: Complex[np.ndarray, "B d"], level: float):
+        n = max(self.cycles / self.block, 2.0)
+        reach = np.sqrt(n / (n - 1)) * stats.t.ppf((1 + level) / 2, n - 1)
+        return np.quantile(np.abs(draws), stats.norm.cdf([-reach, reach]), axis=0).T
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the data cannot tell, in plain words."""
         return tuple(_about(self))
 
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, complex_number(z, 3), f"{abs(z):.3f}", f"{low:.3f} to {high:.3f}")
+            for name, values, intervals in self._both()
+            for z, (low, high) in zip(values, intervals, strict=True)
+        ]
+        of = f"{self.cycles} cycles, order {len(self.multipliers)}, blocks of {self.block} cycles"
+        head = ("", "multiplier", "modulus", "95 % interval")
+        return card("NaturalMultipliers", of, table(head, rows), text("\n".join(self.warnings)))
+
+    def _both(self):
+        """Either way to estimate them, with moduli's intervals."""
+        yield "by instruments", self.multipliers, self.interval()
+        yield "least squares", self.plain, self.plain_interval()
+
     def __repr__(self) -> str:
         lines = [
             f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
             f"{self.block} cycles)"
         ]
-        both = (
-            ("by instruments", self.multipliers, self.interval()),
-            ("least squares", self.plain, self.plain_interval()),
-        )
-        for name, values, intervals in both:
+        for name, values, intervals in self._both():
             for z, (low, high) in zip(values, intervals, strict=True):
-                text = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+                value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
                 bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
-                lines.append(f"  {name:15s} {text:>15s}   {bounds}")
-        return "\n".join([*lines, *(f"  {text}" for text in self.warnings)])
+                lines.append(f"  {name:15s} {value:>15s}   {bounds}")
+        return "\n".join([*lines, *(f"  {line}" for line in self.warnings)])
 
 
 @checked
@@ -119,9 +140,11 @@ def natural_multipliers(
     moments = moments_of(data, order)
     K = len(moments.records)
     every = np.ones((1, K))
-    block = max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
+    counts = np.unique(moments.records, return_counts=True)[1]
+    length, block = K / len(counts), max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
+    if np.median(counts) < _BLOCKS * block and len(counts) >= _BLOCKS:
+        block = int(counts.max())
     rng = np.random.default_rng(seed)
-    length = K / len(np.unique(moments.records))
     weights = np.stack([_resampled(moments, block, rng) for _ in range(_DRAWS)])
     return NaturalMultipliers(
         multipliers=_corrected(_multipliers(moments.by_instruments(every)), length)[0],
@@ -130,7 +153,7 @@ def natural_multipliers(
         plain_draws=_multipliers(moments.plain(weights)),
         strength=moments.strength(),
         cycles=K,
-        records=len(np.unique(moments.records)),
+        records=len(counts),
         block=block,
     )
 
@@ -161,11 +184,10 @@ def _corrected(z: Complex[np.ndarray, "B d"], length: float) -> Complex[np.ndarr
 
 
 def _resampled(moments: Moments, block: int, rng: np.random.Generator) -> Float[np.ndarray, " K"]:
-    """How often each cycle was drawn: blocks of each record, or whole records where these are
-    short."""
+    """How often each cycle was drawn: blocks of each record, or whole records."""
     weights = np.zeros(len(moments.records))
     names, counts = np.unique(moments.records, return_counts=True)
-    if np.median(counts) < _BLOCKS * block:
+    if block == counts.max():
         for record in rng.choice(names, len(names)):
             weights[moments.records == record] += 1.0
         return weights
@@ -178,17 +200,12 @@ def _resampled(moments: Moments, block: int, rng: np.random.Generator) -> Float[
     return weights
 
 
-def _interval(draws: Complex[np.ndarray, "B d"], level: float) -> Float[np.ndarray, "d 2"]:
-    tail = (1 - level) / 2
-    return np.quantile(np.abs(draws), [tail, 1 - tail], axis=0).T
-
-
 def _about(found: NaturalMultipliers) -> Iterator[str]:
     """What the data cannot tell."""
     low, high = found.interval()[0]
     yield (
-        f"Width: 95 % of resamplings put the largest modulus between {low:.2f} and {high:.2f}, "
-        f"from {found.cycles} cycles; four times as many would halve that."
+        f"Width: the largest modulus lies between {low:.2f} and {high:.2f} (95 %), from "
+        f"{found.cycles} cycles; four times as many would halve that."
     )
     each = found.cycles / found.records
     if each < _FEW:
