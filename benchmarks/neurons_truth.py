@@ -23,7 +23,7 @@ def adex(v, w):
     current = 1000.0 + 200.0 * hy.cos(2 * math.pi / 40.0 * hy.time)
     leak = 30.0 * (-70.6 - v + 2.0 * hy.exp((v + 50.4) / 2.0))
     fields = [(v, (leak - w + current) / 281.0), (w, (4.0 * (v + 70.6) - w) / 144.0)]
-    return fields, 0.0, -70.6, 80.5, 40.0, (-60.0, 200.0)
+    return fields, -30.0, -70.6, 80.5, 40.0, (-60.0, 200.0)
 
 
 class Neuron:

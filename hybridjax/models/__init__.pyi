@@ -17,6 +17,7 @@ from .oscillators.mathieu import Mathieu as Mathieu
 from .oscillators.vanderpol import VanDerPol as VanDerPol
 from .pair import HopperPair as HopperPair
 from .slip import SLIPRunner as SLIPRunner
+from .trot import TrottingQuadruped as TrottingQuadruped
 from .walkers.biped import FiveLinkBiped as FiveLinkBiped
 from .walkers.compass import CompassGait as CompassGait
 from .walkers.torso_walker import TorsoWalker as TorsoWalker

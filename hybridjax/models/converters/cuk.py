@@ -7,8 +7,6 @@ C. Y. Chan, Chaos from a current-programmed Ćuk converter, Int. J. Circuit Theo
 """
 
 import equinox as eqx
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float
 
 from ...systems.chart import Chart
 from ...systems.system import Guess, HybridSystem, Parameter, parameter
@@ -50,17 +48,14 @@ class CukConverter(HybridSystem):
     Iref: Parameter = parameter(2.0, unit="A", doc="reference for i1 + i2")
     T: Parameter = parameter(100e-6, unit="s", doc="period of the clock")
 
-    def margin(self, t: ArrayLike, q: Float[Array, "4"], u: Float[Array, "1"]) -> Array:
-        """The current that is left until the switch opens."""
-        return self.Iref + u[0] - q[0] - q[2]
-
     def charts(self):
         return {"open": Circuit(self, False), "closed": Circuit(self, True)}
 
     def transitions(self):
         tick = Scheduled(self.T)
+        left = lambda t, q, u: self.Iref + u[0] - q[0] - q[2]  # noqa: E731
         return (
-            Transition("switch off", "closed", "open", self.margin),
+            Transition("switch off", "closed", "open", left),
             Transition("switch on", "open", "closed", tick),
             Transition("stays on", "closed", "closed", tick),
         )

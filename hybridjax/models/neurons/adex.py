@@ -45,7 +45,7 @@ class AdExNeuron(HybridSystem):
     tau: Parameter = parameter(144.0, unit="ms", doc="time constant of the adaptation")
     a: Parameter = parameter(4.0, unit="nS", doc="adaptation below the threshold")
     b: Parameter = parameter(80.5, unit="pA", doc="step of the adaptation at a spike")
-    peak: Parameter = parameter(0.0, unit="mV", doc="potential of a spike")
+    peak: Parameter = parameter(-30.0, unit="mV", doc="potential of a spike")
     current: Parameter = parameter(1000.0, unit="pA", doc="mean of I(t)")
     amplitude: Parameter = parameter(200.0, unit="pA", doc="amplitude of I(t)")
     T: Parameter = parameter(40.0, unit="ms", doc="period of I(t)")

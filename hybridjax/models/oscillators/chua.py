@@ -18,7 +18,9 @@ class Slab(Chart):
     def field(self, t, q, u):
         p = self.circuit
         x, y, z = q
-        resistor = p.inner * x if self.side == 0 else p.outer * (x - self.side) + p.inner * self.side
+        resistor = (
+            p.inner * x if self.side == 0 else p.outer * (x - self.side) + p.inner * self.side
+        )
         return p.alpha * (y - resistor) + u[0], x - y + z, -p.beta * y
 
 
@@ -48,4 +50,4 @@ class ChuaCircuit(HybridSystem):
         )
 
     def guess(self):
-        return Guess("right", (2.0, 0.0, -1.5))
+        return Guess("right", (2.1, 0.1, -3.0))
