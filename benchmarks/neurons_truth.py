@@ -1,10 +1,10 @@
-"""Truth for the neurons under a periodic current, apart from hybridjax: heyoka's Taylor integrators.
+"""Truth for the neurons under a periodic current, apart from hybridjax: by heyoka.
 
     python benchmarks/neurons_truth.py        # some seconds
 
-Spikes are terminal events of an integration to machine precision. Cycles by Newton's method with
-the return map's central differences of fourth order, multipliers by those too. Printed: the state
-half a period after the maximum of the current, the time of the spike, multipliers, residual.
+Taylor integrators to machine precision, with spikes as terminal events. Cycles and multipliers by
+central differences of fourth order. Printed: the state half a period after the maximum of the
+current, the time of the spike, multipliers, residual.
 """
 
 import math

@@ -34,7 +34,7 @@ def flow(t, end, x, down, thrust, events=True):
     """State, and feet that stand, at the time `end`; `events=False` keeps the feet."""
     down = np.array(down)
     while True:
-        moving = lambda t, x: field(t, x, down, thrust)  # noqa: E731
+        moving = lambda t, x, down=down: field(t, x, down, thrust)  # noqa: E731
         guards = [lambda t, x, i=i: lengths(t, x)[0][i] for i in (0, 1)]
         for i, guard in enumerate(guards):
             guard.direction, guard.terminal = (1 if down[i] else -1), True

@@ -96,5 +96,5 @@ class HopperPair(VerticalHopper):
         return Transition(name, _CHARTS[down], _CHARTS[after], guard, reset=reset)
 
     def guess(self):
-        """Each as if it were alone, when the first is about to lift off and the other comes down."""
+        """Each as if it were alone: the first is about to lift off, the other comes down."""
         return Guess("first", (2.0, 1.9, 1.6, -0.2, 0.55, -2.7), 0.5)

@@ -1,4 +1,4 @@
-"""Two hoppers with two inputs; multipliers to 18 digits by `python benchmarks/circuits_truth.py`."""
+"""Two hoppers with two inputs. Truth: `python benchmarks/circuits_truth.py`."""
 
 import numpy as np
 import pytest

@@ -30,10 +30,10 @@ class Circuit(Chart):
 class CukConverter(HybridSystem):
     """A clock closes the switch, and the sum of both coils' currents opens it at a reference.
 
-    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that carries energy
-    over, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign to the
-    supply, here counted as positive). The diode conducts while the switch is open (continuous
-    conduction). Input `u` is added to the reference current.
+    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that carries the
+    energy over, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign
+    to the supply, here counted as positive). While the switch is open the diode conducts, to the
+    end (continuous conduction). Input `u` is added to the reference current.
     """
 
     input_units = ("A",)

@@ -1,7 +1,8 @@
 """The adaptive exponential integrate-and-fire neuron, driven by a periodic current.
 
 R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective description of
-neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are.
+neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but for
+`peak`.
 """
 
 import jax.numpy as jnp
@@ -26,12 +27,13 @@ class Membrane(Chart):
 
 
 class AdExNeuron(HybridSystem):
-    """C v' = gL (EL - v + slope exp((v - threshold) / slope)) - w + I(t) + u, tau w' = a (v - EL) - w,
-    reset to v = EL, w + b at v = peak.
+    """C v' = gL (EL - v + slope exp((v - threshold) / slope)) - w + I(t) + u and
+    tau w' = a (v - EL) - w, reset to v = EL, w + b at v = peak.
 
-    States: potential `v` of the membrane, and the adaptation current `w`. The current I(t) = current
-    + amplitude cos(2 pi t / T) calls for one spike a period. Once the exponential has taken over, v
-    grows without bound in no time: at 0 mV, 1e-10 ms are left of it.
+    States: potential `v` of the membrane, and adaptation current `w`. The current I(t) = current +
+    amplitude cos(2 pi t / T) calls for one spike a period. Once the exponential has taken over, v
+    would be infinite after C / gL exp(-(v - threshold) / slope): 3.5e-4 ms from `peak` on. (The
+    paper's peak of 20 mV comes so late in it that double precision does not tell its time.)
     """
 
     input_units = ("pA",)

@@ -34,7 +34,7 @@ class ChuaCircuit(HybridSystem):
 
     alpha: Parameter = parameter(8.0, doc="ratio of the capacitors")
     beta: Parameter = parameter(100 / 7, doc="of a capacitor to the coil")
-    inner: Parameter = parameter(-1 / 7, doc="slope of y - h for small voltages, less 1")
+    inner: Parameter = parameter(-1 / 7, doc="slope of h for small voltages")
     outer: Parameter = parameter(2 / 7, doc="the same for large ones")
 
     def charts(self):
