@@ -1,8 +1,7 @@
 """The adaptive exponential integrate-and-fire neuron, driven by a periodic current.
 
 R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective description of
-neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but for
-`peak`.
+neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but for `peak`.
 """
 
 import jax.numpy as jnp
