@@ -40,13 +40,15 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
         section=case.section,
         multiplicity=case.multiplicity,
         conserved=case.conserved,
+        max_period=case.max_period,
     )
     placed = hj.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
-        N, PERIODS, band=(0, min(4.0, N / 2)), amplitude=case.amplitude or 1.0, lines="odd"
-    )
+        N, PERIODS, band=(0, min(4.0, N / 2)), amplitude=case.amplitude or 1.0, lines="odd",
+        inputs=case.system.inputs,
+    )  # fmt: skip
     estimate = None
     if case.amplitude:
         data = hj.run_experiments(
@@ -63,13 +65,14 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
     """What the table says."""
     multipliers = cycle.multipliers
     truth = np.asarray(case.truth, complex)
+    size = np.max(np.abs(truth), initial=0.0) or 1.0
     return {
         "title": case.title,
         "period": float(cycle.period),
         "events": [e.name for e in cycle.trajectory().events],
         "sections": exact.n_sections,
         "multipliers": [[z.real, z.imag] for z in multipliers],
-        "multiplier error": float(np.max(np.abs(multipliers - truth)) / np.max(np.abs(truth))),
+        "multiplier error": float(np.max(np.abs(multipliers - truth), initial=0.0) / size),
         "source": case.source,
         "channel": f"{case.push} to {case.output}",
         "largest H_0": float(np.max(np.abs(exact.harmonic(0)))),
@@ -143,7 +146,7 @@ def table(rows: dict[str, dict]) -> str:
     ]
     for row in rows.values():
         values = [complex(*z) for z in row["multipliers"]]
-        shown = ", ".join(_text(z) for z in values if z.imag >= 0)
+        shown = ", ".join(_text(z) for z in values if z.imag >= 0) or "0"
         error = "-" if row["HTF error"] is None else f"{row['HTF error']:.0e}"
         lines.append(
             f"| {row['title']} | {row['period']:.8g} | {row['sections']} | {shown} "

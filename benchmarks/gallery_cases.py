@@ -22,7 +22,8 @@ class Case(NamedTuple):
 
     `sections` are for linearization and experiments, `output` and `input` name what is measured and
     pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An experiment
-    begins in the predicted periodic response, or where there is none, on the cycle (`start`).
+    begins in the predicted periodic response, or where there is none, on the cycle (`start`); where
+    the amplitude is zero there are no experiments.
     """
 
     title: str
@@ -39,6 +40,7 @@ class Case(NamedTuple):
     multiplicity: int | None = None
     conserved: dict[str, float] | None = None
     start: str = "periodic"
+    max_period: float | None = None
 
 
 def _pair(z: complex) -> list[complex]:
@@ -55,6 +57,7 @@ _APEX = hj.Crossing("vM", "falling")
 _MPMATH = "mpmath"
 _CLOSED = "closed form"
 _BUCK = ("v", "i")
+_STIFF = "scipy (Radau)"
 
 CASES: dict[str, Callable[[], Case]] = {
     "hopper": lambda: Case(
@@ -66,11 +69,32 @@ CASES: dict[str, Callable[[], Case]] = {
         hj.ClockPhase(32, anchor=_APEX), "yM", "force", 5e-4,
         _pair(-0.317897006349938 + 0.694628822735891j), _MPMATH, ("yM", "vM"),
     ),
+    "compliant hopper": lambda: Case(
+        "hopper on a compliant ground", m.CompliantHopper(), hj.ClockPhase(32, anchor=_APEX), "yM",
+        "force", 5e-4,
+        [*_pair(-0.24885118328047069434 + 0.69922500780850327787j), 1.6159409134125691e-4],
+        _MPMATH, ("yM", "vM"),
+    ),
+    "two hoppers": lambda: Case(
+        "two coupled hoppers", m.HopperPair(), hj.ClockPhase(16, anchor=0.5), "yM1",
+        "both forces", 5e-4,
+        [*_pair(-0.439196992225001708 + 0.611321029449368104j),
+         *_pair(-0.248558676124545596 + 0.697949554160020074j),
+         2.05187165619280217e-9, 1.16996080957107642e-15],
+        _MPMATH, ("yM1", "yM2"),
+    ),
     "bar": lambda: Case(
         "two-legged bar", m.TwoLeggedBar(), hj.ClockPhase(16), "y", "force", 1e-4,
         [*_pair(-0.153520955429110 + 0.361043052961495j),
          *_pair(0.151655665357578 + 0.227749294883360j)],
         _MPMATH, ("y", "v"),
+    ),
+    "trot": lambda: Case(
+        "trotting quadruped", m.TrottingQuadruped(), hj.ClockPhase(16, anchor=0.1), "y", "force",
+        0.0,
+        [*_pair(-0.08768800113731487 + 0.4750481690903344j),
+         *_pair(0.18391330048481577 + 0.35828647799688856j)],
+        "scipy", ("y", "v"),
     ),
     "wheel": lambda: Case(
         "rimless wheel", m.RimlessWheel(), _levels("impact", "th", "rising", -0.25, 0.4), "w",
@@ -115,6 +139,36 @@ CASES: dict[str, Callable[[], Case]] = {
         "v", "reference voltage", 2e-6, _pair(0.613891423607179 + 0.290590765487630j), _MPMATH,
         _BUCK, guess=hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2,
     ),
+    "Cuk": lambda: Case(
+        "Ćuk converter", m.CukConverter(), hj.ClockPhase(8, anchor=5e-6), "v2", "reference current",
+        1e-5,
+        [*_pair(0.847302228159268509 + 0.427350687398246989j), -0.694479389634475538,
+         0.643345392432610566],
+        _MPMATH, ("v1", "i1"),
+    ),
+    "Chua": lambda: Case(
+        "Chua's circuit, alpha = 8", m.ChuaCircuit(),
+        hj.KinematicPhase(
+            16, position="x", velocity="z", center=(1.3, -1.5), scale=(0.9, 1.3),
+            anchor=hj.Crossing("x", "falling", 1.5),
+        ),
+        "x", "added to x'", 1e-4, [-0.677312642613658609, -0.0195673404468831832], _MPMATH,
+        ("x", "z"), section=hj.AtEvent("in from the right"),
+    ),
+    "belt": lambda: Case(
+        "block on a belt", m.BeltOscillator(),
+        [hj.AtEvent("sticks to behind"), hj.Crossing("x", "falling", charts=("behind",)),
+         hj.AtEvent("behind to sticks"), hj.Crossing("x", "rising", charts=("sticks",))],
+        "x", "force", 1e-4, [], _CLOSED, ("x", "v"), section=hj.AtEvent("sticks to behind"),
+    ),
+    "Izhikevich": lambda: Case(
+        "Izhikevich's neuron", m.IzhikevichNeuron(), hj.ClockPhase(16), "w", "current", 1e-3,
+        [0.48958210923116263, -1.1522394149920956e-11], "heyoka", ("v", "w"),
+    ),
+    "AdEx": lambda: Case(
+        "adaptive exponential neuron", m.AdExNeuron(), hj.ClockPhase(16), "w", "current", 1e-2,
+        [0.7474603512727481, 0.17911718353780215], "heyoka", ("v", "w"),
+    ),
     "Hopf": lambda: Case(
         "Hopf normal form", m.HopfOscillator(),
         hj.KinematicPhase(16, position="x", velocity="y", anchor=hj.Crossing("y", "rising")),
@@ -132,6 +186,22 @@ CASES: dict[str, Callable[[], Case]] = {
         hj.KinematicPhase(16, position="x", velocity="v", anchor=hj.Crossing("v", "falling")),
         "x", "force", 1e-3, [6.98947562607979e-16], _MPMATH, ("x", "v"),
         section=hj.Crossing("v", "falling"),
+    ),
+    "van der Pol, 100": lambda: Case(
+        "van der Pol, mu = 100", m.VanDerPol(mu=100.0, solver=hj.Radau()),
+        [hj.Crossing("x", "falling", 1.5), hj.Crossing("x", "falling"),
+         hj.Crossing("x", "rising", -1.5), hj.Crossing("x", "rising")],
+        "x", "force", 0.0, [0.0], _STIFF, ("x", "v"),
+        section=hj.Crossing("v", "falling"), max_period=500.0,
+    ),
+    "FitzHugh-Nagumo": lambda: Case(
+        "FitzHugh-Nagumo, eps = 0.01", m.FitzHughNagumo(),
+        hj.KinematicPhase(
+            16, position="v", velocity="w", center=(0.0, 0.5), scale=(2.0, 0.6),
+            anchor=hj.Crossing("v", "rising"),
+        ),
+        "v", "current", 0.0, [1.9834880445450845e-134], _STIFF, ("v", "w"),
+        section=hj.Crossing("v", "rising"),
     ),
     "rotor flap": lambda: Case(
         "rotor flap", m.RotorFlap(), hj.ClockPhase(16), "b", "moment", 1e-2,

@@ -25,7 +25,7 @@ _CHARTS = {(): "air", ("hind",): "hind", ("front",): "front", ("hind", "front"):
 Leg = Literal["hind", "front"]
 
 
-class _Standing(Chart):
+class Standing(Chart):
     states = ("y", "v", "q", "p")
     units = ("m", "m/s", "rad", "rad/s")
     bar: "TwoLeggedBar"
@@ -85,7 +85,7 @@ class TwoLeggedBar(HybridSystem):
         return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
 
     def charts(self):
-        return {name: _Standing(self, legs) for legs, name in _CHARTS.items()}
+        return {name: Standing(self, legs) for legs, name in _CHARTS.items()}
 
     def transitions(self):
         found = []

@@ -121,6 +121,54 @@ CASES = {
         400e-6,
         [-1.09293543528951, -0.621440982876560],
     ),
+    # benchmarks/circuits_truth.py
+    "Cuk": lambda: Case(
+        m.CukConverter(), None, {}, 1e-4,
+        [*pair(0.847302228159268509 + 0.427350687398246989j), -0.694479389634475538,
+         0.643345392432610566],
+    ),
+    "Chua": lambda: Case(
+        m.ChuaCircuit(),
+        hj.AtEvent("in from the right"),
+        {"y": -0.353955823706872261, "z": -1.30745627116776352},
+        2.24999942882252869,
+        [-0.677312642613658609, -0.0195673404468831832],
+    ),
+    "two hoppers": lambda: Case(
+        m.HopperPair(),
+        None,
+        {"yM1": 1.97213079107715757, "vM1": 1.90755608702683041, "yM2": 1.60275702526714838,
+         "ym2": 0.551874314166019861, "vm2": -2.70537524360854137},
+        1.0,
+        [*pair(-0.439196992225001708 + 0.611321029449368104j),
+         *pair(-0.248558676124545596 + 0.697949554160020074j),
+         2.05187165619280217e-9, 1.16996080957107642e-15],
+    ),
+    # benchmarks/neurons_truth.py
+    "Izhikevich": lambda: Case(
+        m.IzhikevichNeuron(),
+        None,
+        {"v": -74.45966208977282, "w": -4.641986302955417},
+        40.0,
+        [0.48958210923116263, -1.1522394149920956e-11],
+    ),
+    "AdEx": lambda: Case(
+        m.AdExNeuron(),
+        None,
+        {"v": -52.90902649296591, "w": 350.66438388017474},
+        40.0,
+        [0.7474603512727481, 0.17911718353780215],
+    ),
+    # benchmarks/trot_truth.py: multipliers by differences.
+    "trot": lambda: Case(
+        m.TrottingQuadruped(),
+        None,
+        {"y": 0.376873156491, "v": -0.971912849051},
+        1.0,
+        [*pair(-0.08768800113731487 + 0.4750481690903344j),
+         *pair(0.18391330048481577 + 0.35828647799688856j)],
+        accuracy=1e-7,
+    ),
     "flap, 12": lambda: Case(
         m.RotorFlap(), None, {}, 2 * np.pi, [-0.0215994758114450, -0.00373617944596341]
     ),
@@ -145,7 +193,9 @@ CASES = {
 
 
 # The others compile for as long again.
-QUICK = {"wheel, 8 spokes", "walker, long gait", "compass gait", "juggler", "buck, 20 V"}
+QUICK = {
+    "wheel, 8 spokes", "walker, long gait", "compass gait", "juggler", "buck, 20 V", "Cuk", "AdEx",
+}  # fmt: skip
 
 
 def marks(name):

@@ -8,9 +8,9 @@ import equinox as eqx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..systems.chart import Chart
-from ..systems.system import Guess, HybridSystem, Parameter, parameter
-from ..systems.transition import Scheduled, Transition
+from ...systems.chart import Chart
+from ...systems.system import Guess, HybridSystem, Parameter, parameter
+from ...systems.transition import Scheduled, Transition
 
 
 class Circuit(Chart):
