@@ -32,7 +32,7 @@ from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
-from .stiffness import stiff_charts
+from .stiffness import slow_time, stiff_charts
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the
@@ -89,7 +89,8 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton begins, so that transients die out (the paper
         takes 60 s). No help where the cycle is unstable.
     - `max_period`: for autonomous systems: give up if no return is seen in this time, by default a
-        thousand times that in which the states change at the guess.
+        thousand times that in which the states change at the guess (in charts with an implicit
+        method, the slowest of them).
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
         do not depend on units (under a JAX transformation, on the guess).
@@ -151,7 +152,8 @@ def find_limit_cycle(
         charts = np.arange(len(s.charts))
         times = np.full(len(charts), float(np.asarray(lane.t)[0]))
         check_times(system, times, charts, near.points.T, settings.scale, near.time)
-        max_period = _PATIENCE * near.time if max_period is None else max_period
+        if max_period is None:
+            max_period = _PATIENCE * max(near.time, slow_time(s, times[0], near.points))
         anchor, base, expected = begin(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
         )

@@ -140,7 +140,7 @@ def begin(
         where = "through the guess, across the flow" if by_default else str(section)
         advice = _other_section(s) if by_default else ""
         if moved.result[0] == Result.SECTION_MISSED:
-            advice += f"Or allow more time than {max_period:.3g}, by `max_period`. "
+            advice += f"Allow more time than {max_period:.3g}, by `max_period`. "
         _require(moved, f"{doing} ({where})", s, advice)
         return moved.lanes
 
