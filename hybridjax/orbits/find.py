@@ -24,20 +24,23 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
-from .coincidence import coincidences
+from .coincidence import coincident, commutes, events_of
 from .conserved import check_conserved
 from .cycle import LimitCycle
-from .explain import coincident, events_of, explain
+from .explain import explain
 from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
-from .stiffness import slow_time, stiff_charts
+from .stiffness import has_implicit, slow_time, stiff_charts
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the
 # states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
 _PATIENCE = 1000.0
+# With an implicit method, a piece of a turn may take so many steps at least: there may be a fast jump
+# in it (of van der Pol's oscillator at mu = 1000, 400 steps). Doubled, so may twice as fast ones.
+_JUMP = 1024
 # A cycle is computed anew in the sizes that states have on it if a rough one was larger by more
 # than this factor. Doubled, errors may be twice as large.
 _OFF = 4.0
@@ -123,6 +126,8 @@ def find_limit_cycle(
         check_system(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
+    if has_implicit(s):
+        settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, _JUMP))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     check_section(s, section)
@@ -165,8 +170,8 @@ def find_limit_cycle(
     s.resolve_outputs(tuple(conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     map, solution = _in_own_sizes(map, _solve(map), given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    if int(solution.result) == Result.OK and coincident(solution.turn):
-        if all(group.commute for group in coincidences(cycle)):
+    if int(solution.result) == Result.OK and coincident(map, solution.turn):
+        if commutes(cycle):
             say("events coincide, in either order with the same outcome")
         else:
             code = jax.device_put(np.int32(Result.COINCIDENCE))

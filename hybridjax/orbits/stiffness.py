@@ -40,6 +40,12 @@ def fastest(
     return np.maximum(rates.max(axis=1, initial=0.0), 0.0)
 
 
+def has_implicit(s: Structure) -> bool:
+    """Whether an implicit method goes through a chart."""
+    methods = map(s.method, range(len(s.charts)))
+    return any(method is not None and method.implicit for method in methods)
+
+
 def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float:
     """The time in which the slowest mode changes, of the charts with implicit methods: steps of
     these need not be as short as the fastest one. 0 where there are none.
@@ -50,7 +56,9 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     for a, state in enumerate(states):
         q = state[: s.dims[a], None]
         if (method := s.method(a)) and method.implicit and np.isfinite(q).all():
-            derivative = kernels.field(s, a, np.array([t]), q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q), 0]
+            derivative = kernels.field(s, a, np.array([t]), q, np.zeros((s.nu, 1)))[
+                :, 2 : 2 + len(q), 0
+            ]
             rates = np.abs(np.linalg.eigvals(derivative))
             moving = rates[rates > _ROUNDING * rates.max()]
             slowest = max(slowest, 1 / moving.min(initial=np.inf))

@@ -5,17 +5,34 @@ the threads of its pool. Two such programs in threads of their own can wait for 
 """
 
 import contextlib
+import io
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any
+
+from .compile import kind
 
 
 _turn = threading.Lock()
+_known: dict[Hashable, bool] = {}
 
 
-def calls_lapack(code: bytes) -> bool:
-    """Whether a program that was lowered, as bytes, calls LAPACK."""
-    return b"lapack_" in code
+def calls_lapack(module: Any) -> bool:
+    """Whether a program that was lowered, as a module of MLIR, calls LAPACK."""
+    module.operation.write_bytecode(code := io.BytesIO())
+    return b"lapack_" in code.getvalue()
+
+
+def is_left_to_lapack(program: Callable, *arguments: Any) -> bool:
+    """Whether a program calls LAPACK for arguments of this kind.
+
+    **Arguments:** `program`, as `quick_jit` and `equinox.filter_jit` make it.
+    """
+    name = program, kind(arguments)
+    if name not in _known:
+        _known[name] = calls_lapack(program.lower(*arguments).lowered.compiler_ir())
+    return _known[name]
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
 """Compiled programs, and such that are still to be compiled, as bytes for another process."""
 
 import dataclasses
-import io
 import pickle
 import uuid
 from collections.abc import Callable
@@ -123,8 +122,7 @@ def compiled(lowered: jax.stages.Lowered, options: dict[str, Any], structure: An
     module = lowered.compiler_ir()
     with module.context:
         PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
-        module.operation.write_bytecode(code := io.BytesIO())
-    factorizes = calls_lapack(code.getvalue())
+        factorizes = calls_lapack(module)
     return Executable(lowered.compile(compiler_options=options), structure, factorizes)
 
 
