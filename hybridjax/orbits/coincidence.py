@@ -7,16 +7,26 @@ piecewise-differentiable flows, SIAM J. Applied Dynamical Systems 15, 2016). Whe
 as for events that have nothing to do with each other, it is differentiable after all.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.executor import to_host
+from .._core.compilation.compile import at_ease, host_first
+from .._core.executor import namespace, to_host
+from .._core.results import Result
 from ..engine import kernels
+from ..engine.chain import chain
+from ..engine.events import start_lanes
+from ..engine.move import record
+from ..engine.target import toward, until
+from ..engine.watch import watch
+from ..errors import ComputationError
 from ..sections.crossing import AtEvent
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
@@ -35,6 +45,13 @@ _DUE = 1e-8
 _COMMUTE = 1e-6
 
 
+# A turn is followed up to this part of the period before the events, and continued by the field
+# there; the error is its cube. Doubled, that grows by 8, but events half as close are told apart.
+_SHORT = 1e-5
+# Steps of a turn at most. Doubled, turns of twice as many are followed.
+_STEPS = 20_000
+
+
 class Coincidence(NamedTuple):
     """Events of a cycle that happen at the same time."""
 
@@ -47,6 +64,10 @@ class Coincidence(NamedTuple):
     this order."""
     commute: bool
     """Whether all orders lead to the same state, with the same derivative."""
+    multipliers: tuple[Complex[np.ndarray, " r"], ...]
+    """For each order, the largest first: those that the cycle would have if all its neighbors met
+    the events in this order; none where it leads to another state than the cycle's. (Neighbors may
+    change from one order to the other, so that they need not tell whether a cycle is stable.)"""
 
 
 class _Way(NamedTuple):
@@ -81,7 +102,9 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
             n = s.dims[a]
             here = _Way((), a, way.before[k, :n], np.eye(n))
             ways = list(_ways(s, t, here, len(events), _DUE * period))
-            found.append(_coincidence(s, t, a, ways, cycle.settings.scale))
+            end = at[after - 1]
+            goes_on = int(way.chart[end]), way.after[end]
+            found.append(_coincidence(cycle, t, a, ways, goes_on))
     return found
 
 
@@ -152,21 +175,51 @@ def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     return abs(turns - round(turns)) * float(schedule.period) <= within
 
 
-def _coincidence(s: Structure, t: float, a: int, ways: list[_Way], scale) -> Coincidence:
+def _coincidence(cycle: LimitCycle, t: float, a: int, ways: list[_Way], goes_on) -> Coincidence:
+    """`goes_on`: the chart and state in which the cycle does."""
+    s, values = Structure(cycle.system), tuple(_multipliers(cycle, t, a, ways, *goes_on))
+    scale, derivatives = np.asarray(cycle.settings.scale), tuple(way.derivative for way in ways)
     names = tuple(tuple(s.transitions[g].name for g in way.events) for way in ways)
     if len(ways) < 2:  # in the other order one of them does not happen
-        return Coincidence(t, names, tuple(way.derivative for way in ways), False)
+        return Coincidence(t, names, derivatives, False, values)
     size, one, commute = scale[a, : s.dims[a]], ways[0], True
     m = len(one.state)
     for other in ways[1:]:
         if other.chart != one.chart:
             commute = False
             break
-        own = scale[one.chart, :m]
-        apart = np.abs(other.state - one.state) / own
-        tilted = np.abs(other.derivative - one.derivative) * size / own[:, None]
+        after = scale[one.chart, :m]
+        apart = np.abs(other.state - one.state) / after
+        tilted = np.abs(other.derivative - one.derivative) * size / after[:, None]
         commute = commute and max(apart.max(), tilted.max()) < _COMMUTE
-    return Coincidence(t, names, tuple(way.derivative for way in ways), bool(commute))
+    return Coincidence(t, names, derivatives, bool(commute), values)
+
+
+def _multipliers(cycle, t, a, ways, chart: int, state) -> Iterator[np.ndarray]:
+    """The multipliers of each order; the cycle goes on in this chart and state."""
+    s, period = Structure(cycle.system), float(cycle.period)
+    n, m, u = s.dims[a], s.dims[chart], np.zeros((s.nu, 1))
+    # (Steps of an explicit method end shortly before the events.)
+    short, last = _SHORT * period, t + (1 - _SHORT) * period
+    lanes = start_lanes(s, np.array([t]), np.array([chart], np.int32), state[:, None])
+    target = toward(np.array([last]), -1, np.array([t + 2 * period]))
+    settings = dataclasses.replace(cycle.settings, max_steps=_STEPS)
+    with at_ease():
+        moved, tape = record(s, lanes, u, target, settings, tangents=True)
+        around, _ = chain(s, lanes, target, tape, of_states=True)
+    before = moved.lanes.q[:n]
+    field = kernels.field(s, a, np.array([last]), before, u)[:, 2 : 2 + n, 0]
+    rest = np.eye(n) + short * field + short**2 / 2 * field @ field
+    for way in ways:
+        size = np.asarray(cycle.settings.scale)[chart, :m]
+        same = way.chart == chart and np.max(np.abs(way.state - state[:m]) / size) < _COMMUTE
+        if not same or moved.result[0] != Result.OK or moved.lanes.chart[0] != a:
+            yield np.zeros(0, complex)
+            continue
+        values = np.linalg.eigvals(rest @ around[0, 1 : 1 + n, :m] @ way.derivative).astype(complex)
+        if not cycle.clocked:  # less that of the flow's own direction
+            values = np.delete(values, np.argmin(np.abs(values - 1)))
+        yield values[np.argsort(-np.abs(values), kind="stable")]
 
 
 def _ways(s: Structure, t: float, way: _Way, left: int, due: float) -> Iterator[_Way]:
@@ -202,3 +255,35 @@ def _ways(s: Structure, t: float, way: _Way, left: int, due: float) -> Iterator[
         rate = row[1] + slope @ field
         if rate < 0 and abs(value) <= -due * rate:
             yield from after(g, slope, rate)
+
+
+def check_begin(map: ReturnMap) -> None:
+    """**Raises:** `ComputationError` where turns begin at an event that may or may not belong to
+    them."""
+    s, at_event = map.structure, isinstance(map.base, AtEvent)
+    if not (at_event or map.base is None):
+        return
+    guards, rates = jax.device_get(_at_anchor(map))
+    due = (rates < 0) & (np.abs(guards) <= -TOGETHER * float(map.expected) * rates)
+    if at_event:
+        due[s.transition_index(map.base.name)] = False
+    if due.any():
+        name = s.transitions[int(np.argmax(due))].name
+        if at_event:
+            raise ComputationError(
+                f"the event '{name}' coincides with '{map.base.name}', at which every turn begins "
+                "and ends, so that it may or may not belong to the turn: take another section."
+            )
+        raise ComputationError(
+            f"the search begins exactly at the event '{name}', which may or may not belong to the "
+            "turn: give a guess at another time."
+        )
+
+
+@host_first
+def _at_anchor(map: ReturnMap):
+    """The guards (G,) at the anchor, and their rates."""
+    s, anchor, xp = Structure(map.system), map.anchor, namespace(map.expected)
+    u = xp.zeros((s.nu, 1))
+    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
+    return seen.value[:-1, 0], seen.rate[:-1, 0]

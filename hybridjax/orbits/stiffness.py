@@ -52,17 +52,29 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
 
     **Arguments:** `states`, one in every chart; NaN where none is known.
     """
-    slowest = 0.0
+    times = [0.0]
     for a, state in enumerate(states):
-        q = state[: s.dims[a], None]
+        q = state[: s.dims[a]]
         if (method := s.method(a)) and method.implicit and np.isfinite(q).all():
-            derivative = kernels.field(s, a, np.array([t]), q, np.zeros((s.nu, 1)))[
-                :, 2 : 2 + len(q), 0
-            ]
-            rates = np.abs(np.linalg.eigvals(derivative))
-            moving = rates[rates > _ROUNDING * rates.max()]
-            slowest = max(slowest, 1 / moving.min(initial=np.inf))
-    return slowest
+            times.append(1 / _slowest_and_fastest(s, a, t, q)[0])
+    return max(times)
+
+
+def stiff_mode(s: Structure, a: int, t: float, q: Float[np.ndarray, " n"]) -> float | None:
+    """The rate of the fastest mode of a chart with an explicit method, if the slowest one is slower
+    by far."""
+    method = s.method(a)
+    slowest, fastest = _slowest_and_fastest(s, a, t, q)
+    stiff = fastest > _STIFF * slowest > 0 and not (method and method.implicit)
+    return fastest if stiff else None
+
+
+def _slowest_and_fastest(s: Structure, a: int, t: float, q) -> tuple[float, float]:
+    """Rates of the modes at a state, without those that stand still."""
+    derivative = kernels.field(s, a, np.array([t]), q[:, None], np.zeros((s.nu, 1)))
+    rates = np.abs(np.linalg.eigvals(derivative[:, 2 : 2 + len(q), 0]))
+    moving = rates[rates > _ROUNDING * rates.max()]
+    return float(moving.min(initial=np.inf)), float(moving.max(initial=0.0))
 
 
 def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
