@@ -169,19 +169,25 @@ class LDTP(eqx.Module):
         return self.A.shape[0]
 
     def __repr__(self) -> str:
-        dims = "traced" if is_traced(self.dims) else _summary(np.asarray(self.dims))
-        return (
-            f"LDTP({self.n_sections} sections, dimension {dims}: {listed(self.inputs)} -> "
-            f"{listed(self.outputs)})"
-        )
+        ports = f"{listed(self.inputs)} -> {listed(self.outputs)}"
+        return f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})"
+
+    def _dimension(self) -> str:
+        if is_traced(self.dims):
+            return "traced"
+        low, high = np.min(self.dims), np.max(self.dims)
+        one = self.A.ndim == 3 and not is_traced(self)  # not a batch of them
+        lost = int(low) - self.rank() if one else 0
+        besides = f" (multipliers zero or below resolution: {lost})" if lost else ""
+        return f"{low}{'' if low == high else f' to {high}'}{besides}"
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        known = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
-        known["dimension"] = _summary(np.asarray(self.dims))
+        names = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
+        known = facts({**names, "dimension": self._dimension()})
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        return card("LDTP", f"{self.n_sections} sections", facts(known), *multipliers)
+        return card("LDTP", f"{self.n_sections} sections", known, *multipliers)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
@@ -256,8 +262,8 @@ class LDTP(eqx.Module):
         Their product is never formed, so that multipliers far below `1e-16` of the largest keep
         their digits. Zeros are not found by size: they are counted from the dimensions and the
         ranks of the factors (as by `rank`). A direction that contracts to less than `1e-12` of the
-        others between two neighboring sections is counted with them: more sections show it, and so
-        does `LimitCycle.multipliers`. What is too small for a number, below 1e-308, is given as 0.
+        others between neighboring sections counts with them, as the print of the model says: more
+        sections show it, or `LimitCycle.multipliers`. Below 1e-308 they are given as 0.
 
         **Returns:** (r,) by decreasing modulus, then imaginary part; conjugate pairs are exact.
         """
@@ -392,8 +398,3 @@ def _check_padding(ldtp):
                 f"`{name}[{bad[0][0]}]` has entries outside its valid block (`dims` is {dims}); "
                 "they must be zero."
             )
-
-
-def _summary(dims):
-    low, high = dims.min(), dims.max()
-    return f"{low}" if low == high else f"{low} to {high}"

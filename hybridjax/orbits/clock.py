@@ -1,7 +1,8 @@
 """Whether a system has the clock that it states: its functions are the same one period later, and
 those of a system that states none are the same at all times."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -43,6 +44,23 @@ def check_clock(system: HybridSystem) -> None:
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise no turn is like the last one."
                 )
+    for a in range(len(s.charts)):
+        _check_schedules(s, a, period)
+
+
+def _check_schedules(s: Structure, a: int, period: float | None) -> None:
+    """**Raises:** `DefinitionError` for two events of a chart that are scheduled for one time."""
+    times: dict[str, np.ndarray] = {}
+    for x in (s.transitions[g] for g in s.schedules(a)):
+        every, offset = float(x.guard.period), float(x.guard.offset)
+        times[x.name] = (offset + every * np.arange(round(period / every))) % period
+    for (one, first), (other, second) in itertools.combinations(times.items(), 2):
+        apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
+        if np.min(np.abs(apart)) < _WHOLE * period:
+            raise DefinitionError(
+                f"'{one}' and '{other}' are scheduled for the same time in chart '{s.names[a]}': "
+                "write them as one event, or let one lead to a chart that the other leaves."
+            )
 
 
 def check_times(
@@ -53,7 +71,7 @@ def check_times(
     scale: Float[Array, "A d"],
     time: float,
 ) -> None:
-    """Compare fields, guards and resets at different times, at some points.
+    """Compare fields, guards, resets, predicates and outputs at different times, at some points.
 
     **Arguments:** `scale`, sizes of the states by chart; `time`, the period, as far as it is known.
 
@@ -91,6 +109,22 @@ def _functions(s: Structure, a: int) -> Iterator:
     for g in s.guards(a) + s.schedules(a):
         reset = lambda t, q, g=g: kernels.reset(s, s.member(g), t, q, u)  # noqa: E731
         yield f"the reset of '{s.transitions[g].name}'", reset
+        if s.transitions[g].enabled is not None:
+            yield f"the predicate of '{s.transitions[g].name}'", _predicate(s, g, u)
+    for output in s.system.outputs():
+        if s.resolve_outputs(output).defined(a):
+            value = lambda t, q, x=output: kernels.outputs(s, a, (x.name,), t, q, u)  # noqa: E731
+            yield f"the output '{output.name}'", value
+
+
+def _predicate(s: Structure, g: int, u) -> Callable:
+    """1 where transition g may happen, else 0, as a function whose derivatives are zero."""
+
+    def holds(t, q):
+        value = kernels.enabled(s, g, t, q, u) * 1.0
+        return np.concatenate([value[None], np.zeros((1 + len(q), len(t)))])[None]
+
+    return holds
 
 
 def _no_period(system: HybridSystem, what: str) -> str:

@@ -26,7 +26,7 @@ from .liouville import log_determinant
 from .picture import orbit_picture
 from .return_map import ReturnMap
 from .scale import sizes_of
-from .stiffness import stiff_charts
+from .stiffness import has_implicit, stiff_charts
 
 
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
@@ -131,8 +131,7 @@ class LimitCycle(eqx.Module):
     @property
     def _implicit(self) -> bool:
         """Whether an implicit method goes through a chart, which forgets what decays fast."""
-        methods = [Structure(self.system).method(a) for a in range(len(self.system.charts()))]
-        return any(method is not None and method.implicit for method in methods)
+        return has_implicit(Structure(self.system))
 
     @remembered
     def log_multipliers(self) -> Float[np.ndarray, " r"]:

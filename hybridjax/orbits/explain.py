@@ -1,14 +1,12 @@
 """Why a search for a limit cycle failed, in words."""
 
-import itertools
-
 import numpy as np
 
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.trajectory import simulate
 from ..systems.structure import Structure
-from .coincidence import TOGETHER
+from .coincidence import coincident, events_of
 from .conserved import conserved_outputs
 from .cycle import LimitCycle
 from .return_map import LEGS, Turn
@@ -20,24 +18,10 @@ from .stiffness import fastest, points
 _STIFF = 20.0
 
 
-def events_of(turn: Turn) -> list[tuple[int, float]]:
-    """The transitions of a turn by index, with their times."""
-    codes, times = (np.ravel(x) for x in (turn.codes, turn.times))
-    return [(int(g), float(t)) for g, t in zip(codes, times, strict=True) if g >= 0]
-
-
-def coincident(turn: Turn) -> tuple[int, int] | None:
-    """Two transitions of a turn, by index, that happen at the same time."""
-    for (g, t), (other, later) in itertools.pairwise(events_of(turn)):
-        if later - t <= TOGETHER * float(turn.period):
-            return g, other
-    return None
-
-
 def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
     """What is wrong with a cycle whose result is not OK, in a search that expected this period."""
     name, code = type(cycle.system).__name__, Result(int(cycle.result))
-    if (pair := coincident(turn)) and code == Result.COINCIDENCE:
+    if code == Result.COINCIDENCE and (pair := coincident(cycle.return_map, turn)):
         first, second = (Structure(cycle.system).transitions[g].name for g in pair)
         return (
             f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "

@@ -9,44 +9,41 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.compilation.compile import host_first
-from .._core.executor import namespace, to_host
+from .._core.executor import to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.settings import LIMIT_CYCLE, Settings
-from ..engine.target import until
-from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
 from ..sections.crossing import AtEvent, Crossing
 from ..systems.solver import Radau
 from ..systems.structure import Structure, check_system
 from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
-from .coincidence import coincidences
+from .coincidence import check_begin, coincident, commutes, events_of
 from .conserved import check_conserved
 from .cycle import LimitCycle
-from .explain import coincident, events_of, explain
+from .explain import explain
 from .guess import begin, check_section, guessed_lane
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
-from .stiffness import stiff_charts
+from .stiffness import has_implicit, slow_time, stiff_charts
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the
 # states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
 _PATIENCE = 1000.0
+# With an implicit method, a piece of a turn may take so many steps at least, since there may be a
+# fast jump in it. Doubled, faster ones than that of van der Pol's oscillator at mu = 1000.
+_JUMP = 1024
 # A cycle is computed anew in the sizes that states have on it if a rough one was larger by more
 # than this factor. Doubled, errors may be twice as large.
 _OFF = 4.0
 # A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
 # Doubled, so do states that move twice as far.
 _VANISHING = 1e-6
-# An event is due at the anchor if it would come within this part of the period. Doubled, guesses
-# twice as far from an event are refused.
-_DUE = 1e-9
 
 
 @checked
@@ -89,7 +86,8 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton begins, so that transients die out (the paper
         takes 60 s). No help where the cycle is unstable.
     - `max_period`: for autonomous systems: give up if no return is seen in this time, by default a
-        thousand times that in which the states change at the guess.
+        thousand times that in which the states change at the guess (in charts with an implicit
+        method, the slowest of them).
     - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
         them do not matter. By default each state's largest modulus on the cycle, so that results
         do not depend on units (under a JAX transformation, on the guess).
@@ -122,6 +120,8 @@ def find_limit_cycle(
         check_system(system)
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
+    if has_implicit(s):
+        settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, _JUMP))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     check_section(s, section)
@@ -151,7 +151,8 @@ def find_limit_cycle(
         charts = np.arange(len(s.charts))
         times = np.full(len(charts), float(np.asarray(lane.t)[0]))
         check_times(system, times, charts, near.points.T, settings.scale, near.time)
-        max_period = _PATIENCE * near.time if max_period is None else max_period
+        if max_period is None:
+            max_period = _PATIENCE * max(near.time, slow_time(s, times[0], near.points))
         anchor, base, expected = begin(
             system, lane, section, multiplicity, settle, max_period, settings, near.time
         )
@@ -161,10 +162,13 @@ def find_limit_cycle(
     if traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
     s.resolve_outputs(tuple(conserved)).require(int(np.asarray(map.anchor.chart)[0]))
+    if isinstance(map.base, AtEvent):
+        check_begin(map)
     map, solution = _in_own_sizes(map, _solve(map), given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    if int(solution.result) == Result.OK and coincident(solution.turn):
-        if all(group.commute for group in coincidences(cycle)):
+    found = int(solution.result) in (Result.OK, Result.SINGULAR)
+    if found and coincident(map, solution.turn):
+        if commutes(cycle):
             say("events coincide, in either order with the same outcome")
         else:
             code = jax.device_put(np.int32(Result.COINCIDENCE))
@@ -172,8 +176,7 @@ def find_limit_cycle(
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
     check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
-        if cycle.clocked:
-            _check_begin(cycle)
+        check_begin(cycle.return_map)
         if conserved:
             check_conserved(cycle)
     if throw and code != Result.OK:
@@ -273,24 +276,3 @@ def _check_fits(
             "the search begins on the cycle that is the guess, and knows its period: leave out "
             "`settle` and `max_period`, or give a Guess."
         )
-
-
-def _check_begin(cycle: LimitCycle) -> None:
-    """Raise where the cycle of a clocked system begins at an event."""
-    guards, rates = jax.device_get(_at_anchor(cycle))
-    due = (rates < 0) & (np.abs(guards) <= -_DUE * float(cycle.period) * rates)
-    if due.any():
-        name = Structure(cycle.system).transitions[int(np.argmax(due))].name
-        raise ComputationError(
-            f"the search begins exactly at the event '{name}', which may or may not belong to the "
-            "turn: give a guess at another time."
-        )
-
-
-@host_first
-def _at_anchor(cycle: LimitCycle):
-    """The guards (G,) at the anchor, and their rates."""
-    s, anchor, xp = Structure(cycle.system), cycle.anchor, namespace(cycle.period)
-    u = xp.zeros((s.nu, 1))
-    seen = watch(s, anchor.t, anchor.chart, anchor.q, u, until(anchor.t), xp.ones(1, bool))
-    return seen.value[:-1, 0], seen.rate[:-1, 0]

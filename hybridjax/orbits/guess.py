@@ -25,6 +25,7 @@ from ..sections.crossing import AtEvent, Crossing
 from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
+from .stiffness import stiff_mode
 
 
 # A guess lies on the section if it would meet it within this part of the time in which the states
@@ -140,7 +141,12 @@ def begin(
         where = "through the guess, across the flow" if by_default else str(section)
         advice = _other_section(s) if by_default else ""
         if moved.result[0] == Result.SECTION_MISSED:
-            advice += f"Or allow more time than {max_period:.3g}, by `max_period`. "
+            advice += f"Allow more time than {max_period:.3g}, by `max_period`. "
+            if rate := stiff_mode(s, a, float(np.asarray(lanes.t)[0]), q):
+                advice += (
+                    f"The system is stiff: a mode decays in a time of {1 / rate:.2g}; "
+                    '`settings=Settings(solver="auto")` waits for the slow ones. '
+                )
         _require(moved, f"{doing} ({where})", s, advice)
         return moved.lanes
 

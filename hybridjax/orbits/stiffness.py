@@ -14,6 +14,9 @@ from ..systems.structure import Structure
 # method, stable for about 4 of them in a step, then takes hundreds of steps wherever the motion is
 # slow. Doubled, charts are called stiff from twice as many steps on.
 _STIFF = 1000.0
+# Modes that are slower than the fastest one by more than this stand still, up to rounding. Doubled,
+# a search waits half as long at most.
+_ROUNDING = 1e-9
 
 
 def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
@@ -35,6 +38,43 @@ def fastest(
     derivative = kernels.field(s, a, t, q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q)]
     rates = -np.linalg.eigvals(np.moveaxis(derivative, -1, 0)).real
     return np.maximum(rates.max(axis=1, initial=0.0), 0.0)
+
+
+def has_implicit(s: Structure) -> bool:
+    """Whether an implicit method goes through a chart."""
+    methods = map(s.method, range(len(s.charts)))
+    return any(method is not None and method.implicit for method in methods)
+
+
+def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float:
+    """The time in which the slowest mode changes, of the charts with implicit methods: steps of
+    these need not be as short as the fastest one. 0 where there are none.
+
+    **Arguments:** `states`, one in every chart; NaN where none is known.
+    """
+    times = [0.0]
+    for a, state in enumerate(states):
+        q = state[: s.dims[a]]
+        if (method := s.method(a)) and method.implicit and np.isfinite(q).all():
+            times.append(1 / _slowest_and_fastest(s, a, t, q)[0])
+    return max(times)
+
+
+def stiff_mode(s: Structure, a: int, t: float, q: Float[np.ndarray, " n"]) -> float | None:
+    """The rate of the fastest mode of a chart with an explicit method, if the slowest one is slower
+    by far."""
+    method = s.method(a)
+    slowest, fastest = _slowest_and_fastest(s, a, t, q)
+    stiff = fastest > _STIFF * slowest > 0 and not (method and method.implicit)
+    return fastest if stiff else None
+
+
+def _slowest_and_fastest(s: Structure, a: int, t: float, q) -> tuple[float, float]:
+    """Rates of the modes at a state, without those that stand still."""
+    derivative = kernels.field(s, a, np.array([t]), q[:, None], np.zeros((s.nu, 1)))
+    rates = np.abs(np.linalg.eigvals(derivative[:, 2 : 2 + len(q), 0]))
+    moving = rates[rates > _ROUNDING * rates.max()]
+    return float(moving.min(initial=np.inf)), float(moving.max(initial=0.0))
 
 
 def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:

@@ -127,6 +127,7 @@ def test_names_and_repr(synthetic, hopper):
     ldtp = hj.LDTP(np.zeros((2, 1, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)), outputs="height")
     assert (ldtp.inputs, ldtp.outputs) == (("u",), ("height",))
     assert ldtp.multipliers.shape == (0,)
+    assert "dimension 1 (multipliers zero or below resolution: 1)" in repr(ldtp)
 
 
 GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1, 3))}

@@ -111,3 +111,25 @@ def test_a_force_that_jumps_with_the_clock():
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
     x = 1 + (x - 1) * np.exp(-0.25)
     np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-6)
+
+
+class Told(Oscillator):
+    """An oscillator that is told of what depends on time, and obeys nothing of it."""
+
+    def transitions(self):
+        late = lambda t, q, u: jnp.sin(t) > 0.0  # noqa: E731
+        return [hj.Transition("never", "a", "a", lambda t, q, u: q[0] + 9.0, enabled=late)]
+
+
+class Seen(Oscillator):
+    def outputs(self):
+        return [hj.Output("turned", lambda t, q, u: q[0] * jnp.cos(t))]
+
+
+@pytest.mark.parametrize(
+    "kind, message",
+    [(Told, "predicate of 'never' depends on t"), (Seen, "output 'turned' depends on t")],
+)
+def test_predicates_and_outputs(kind, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        find(kind(lambda t, x: 0.0))

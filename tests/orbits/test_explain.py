@@ -108,6 +108,10 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     y, v = way.before[k, :2]
     start = np.array([y - v * 0.05 - 9.81 * 0.05**2 / 2, v + 9.81 * 0.05] * 2)
     ends = lambda q: hj.simulate(system, "air", q, dt, time=t0).after[-1]  # noqa: E731
+    turn = np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]])  # free flight
+    for found, derivative in zip(both.multipliers, both.derivatives, strict=True):
+        expected = np.linalg.eigvals(turn @ derivative)
+        assert np.abs(found[:, None] - expected).min(axis=0).max() < 1e-7
     for order, derivative in zip(both.orders, both.derivatives, strict=True):
         early = int(order[0][-1])
         step = np.zeros(4)
@@ -154,7 +158,12 @@ def test_a_field_that_jumps_is_told_from_one_that_blows_up():
 
 
 def test_a_section_that_is_not_met_again_in_time():
-    with pytest.raises(hj.ComputationError, match="allow more time than 1, by `max_period`"):
+    with pytest.raises(hj.ComputationError, match="Allow more time than 1, by `max_period`"):
         hj.find_limit_cycle(
             hj.models.VanDerPol(), section=hj.Crossing("v", "falling"), max_period=1.0
         )
+
+
+def test_a_time_that_is_too_short_for_a_stiff_system():
+    with pytest.raises(hj.ComputationError, match='`max_period`. The system is stiff.*"auto"'):
+        hj.find_limit_cycle(hj.models.VanDerPol(1000.0), section=hj.Crossing("v", "falling"))

@@ -14,6 +14,7 @@ from jaxlib.mlir.passmanager import PassManager
 
 from ..executor import Array
 from .fingerprint import IndescribableError
+from .lapack import calls_lapack, in_turn
 
 
 class Portable(NamedTuple):
@@ -40,24 +41,27 @@ class Portable(NamedTuple):
 class Executable:
     """A compiled program of a flat list of arrays."""
 
-    def __init__(self, compiled: jax.stages.Compiled, structure: Any):
+    def __init__(self, compiled: jax.stages.Compiled, structure: Any, factorizes: bool):
         self._compiled = compiled
         self._structure = structure
+        self._factorizes = factorizes
 
     def __call__(self, *arrays: Array) -> Any:
-        results = iter(self._compiled(*arrays))
+        with in_turn(self._factorizes):
+            results = self._compiled(*arrays)
+            results = iter(jax.block_until_ready(results) if self._factorizes else results)
         return jax.tree_util.tree_map(lambda _: next(results), self._structure)
 
     def to_bytes(self) -> bytes:
         payload, given, returned = serialize_executable.serialize(self._compiled)
         counts = given.num_leaves, returned.num_leaves
-        return pickle.dumps((payload, *counts, self._structure))
+        return pickle.dumps((payload, *counts, self._structure, self._factorizes))
 
     @staticmethod
     def from_bytes(data: bytes) -> "Executable":
         """**Raises:** whatever JAX raises for what it cannot load. (Bytes are executed: they must
         come from a trusted place.)"""
-        payload, given, returned, structure = pickle.loads(data)
+        payload, given, returned, structure, factorizes = pickle.loads(data)
         form = jax.tree_util.tree_structure
         compiled = serialize_executable.deserialize_and_load(
             payload,
@@ -66,7 +70,7 @@ class Executable:
             backend="cpu",
             execution_devices=jax.local_devices(backend="cpu")[:1],
         )
-        return Executable(compiled, structure)
+        return Executable(compiled, structure, factorizes)
 
 
 def trace(function: Callable, arrays: list[Array]) -> Portable:
@@ -118,7 +122,8 @@ def compiled(lowered: jax.stages.Lowered, options: dict[str, Any], structure: An
     module = lowered.compiler_ir()
     with module.context:
         PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
-    return Executable(lowered.compile(compiler_options=options), structure)
+        factorizes = calls_lapack(module)
+    return Executable(lowered.compile(compiler_options=options), structure, factorizes)
 
 
 def _types(arrays) -> list[tuple[tuple[int, ...], str]]:

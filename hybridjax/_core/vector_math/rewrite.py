@@ -2,7 +2,7 @@
 
 A function that a user has written with `jnp` is traced, and in its program (a jaxpr) the equations
 for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `trigonometry`, and
-the factorizations behind `jnp.linalg.solve`, `inv` and `cholesky` by those of `small_matrices`;
+the factorizations behind `jnp.linalg` by those of `small_matrices` and `factorizations`;
 docs/vector-math.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
 Where a later JAX has another name for what is looked for here, nothing is replaced, and all is as
 slow as it would be without.
@@ -10,7 +10,7 @@ slow as it would be without.
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import jax
@@ -20,7 +20,7 @@ from jax.extend.core import primitives
 
 from ..boundary.checked import checked
 from ..device import on_cpu
-from . import small_matrices
+from . import factorizations, small_matrices
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
 
 
@@ -33,15 +33,15 @@ _TRIGONOMETRY = {
     primitives.asin_p: arcsin,
     primitives.acos_p: arccos,
 }
-_MATRICES = {
-    primitives.cholesky_p: small_matrices.cholesky,
-    primitives.triangular_solve_p: small_matrices.triangular_solve,
-}
+_FACTORIZATIONS = (
+    *(primitives.cholesky_p, primitives.triangular_solve_p, primitives.lu_p),
+    *(primitives.qr_p, primitives.eigh_p, primitives.svd_p),
+)
 # With up to so many of our functions behind it, a vector is concatenated from its numbers. Twice as
 # many: XLA makes a loop without vector instructions of a field with two sines.
 _TOGETHER = 1
 # Primitives whose inner programs are replaced too. Functions with derivative rules of their own
-# are left alone.
+# are left alone, unless they factorize a matrix.
 _OUTER = ("jit", "pjit", "cond", "while", "scan", "custom_linear_solve")
 
 
@@ -107,9 +107,13 @@ def _number(eqn: jex.JaxprEqn) -> int:
         return 1
     if eqn.primitive.name not in _OUTER:
         return 0
+    return sum(map(_number, _inner(eqn)))
+
+
+def _inner(eqn: jex.JaxprEqn) -> list[jex.JaxprEqn]:
+    """The equations of the programs in an equation."""
     items = [x for value in eqn.params.values() for x in _as_tuple(value)]
-    inner = [x.jaxpr.eqns for x in items if isinstance(x, jex.ClosedJaxpr)]
-    return sum(_number(eqn) for eqns in inner for eqn in eqns)
+    return [e for x in items if isinstance(x, jex.ClosedJaxpr) for e in x.jaxpr.eqns]
 
 
 def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
@@ -147,15 +151,28 @@ def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
     factors = {
         v: eqn for eqn in jaxpr.eqns if eqn.primitive is primitives.lu_p for v in eqn.outvars
     }
-    eqns = [_solved(eqn, factors) or _replaced_equation(eqn, trigonometry) for eqn in jaxpr.eqns]
-    changed = any(new is not old for new, old in zip(eqns, jaxpr.eqns, strict=True))
+    solved = [_solved(eqn, factors) or eqn for eqn in jaxpr.eqns]
+    places = [*jaxpr.outvars, *(v for eqn in solved for v in eqn.invars)] if factors else []
+    needed = {v for v in places if isinstance(v, jex.Var)}
+    eqns = [
+        _replaced_equation(eqn, trigonometry)
+        for eqn in solved
+        if eqn.primitive is not primitives.lu_p or not needed.isdisjoint(eqn.outvars)
+    ]
+    same = len(eqns) == len(jaxpr.eqns)
+    changed = not same or any(new is not old for new, old in zip(eqns, jaxpr.eqns, strict=True))
     return jaxpr.replace(eqns=eqns) if changed else jaxpr
 
 
 def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
-    ours, options = _ours(eqn, trigonometry)
+    if eqn.primitive in _FACTORIZATIONS:
+        ours = _factorization(eqn, trigonometry)
+    elif eqn.primitive.name == "custom_jvp_call":
+        ours = _with_own_derivative(eqn, trigonometry)
+    else:
+        ours = _trigonometric(eqn) if trigonometry else None
     if ours is not None:
-        new = _equation(ours, tuple(v.aval for v in eqn.invars), options)
+        new = _equation(*ours)
         return new.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
     if eqn.primitive.name in _OUTER:
         params = {k: _replaced_parameter(x, trigonometry) for k, x in eqn.params.items()}
@@ -165,8 +182,7 @@ def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
 
 
 def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
-    """Our equation in place of the solution of a linear system by factors L and U, if it is one.
-    (The factors are not computed where nobody needs them.)"""
+    """Our equation in place of the solution of a linear system by factors L and U, if it is one."""
     if eqn.primitive is not primitives.linear_solve_p:
         return None
     times, lengths, (matrix, *_, right) = (
@@ -190,19 +206,80 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
     return new.replace(invars=[matrix, right], outvars=eqn.outvars, source_info=eqn.source_info)
 
 
-def _ours(eqn: jex.JaxprEqn, trigonometry: bool) -> tuple[Callable | None, tuple]:
-    """Our function in place of an equation, if there is one, and its options."""
-    aval = eqn.invars[0].aval if eqn.invars else None
-    if eqn.primitive in _MATRICES and jnp.issubdtype(aval.dtype, jnp.floating):
+class _Ours(NamedTuple):
+    """Our function in place of an equation, the types of its arguments, and options."""
+
+    function: Callable
+    avals: tuple
+    options: tuple = ()
+
+
+def _trigonometric(eqn: jex.JaxprEqn) -> _Ours | None:
+    if eqn.primitive not in _TRIGONOMETRY or eqn.params.get("accuracy") is not None:
+        return None
+    avals = _avals(eqn)
+    same = of_one_type(*(aval.dtype for aval in avals))
+    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if same else None
+
+
+def _factorization(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
+    avals, name, given = _avals(eqn), eqn.primitive.name, eqn.params
+    rows, columns = avals[0].shape[-2:]
+    size = max(rows, columns)
+    if not jnp.issubdtype(avals[0].dtype, jnp.floating) or not min(rows, columns):
+        return None
+    other = given.get("pivoting") or given.get("subset_by_index") is not None
+    if size > factorizations.LARGEST_IN_LOOPS or other or (name == "lu" and rows != columns):
+        return None
+    some = lambda *names: tuple((name, given[name]) for name in names)  # noqa: E731
+    if name in ("cholesky", "triangular_solve"):
+        form = small_matrices if size <= small_matrices.LARGEST else factorizations
         names = ("left_side", "lower", "transpose_a", "unit_diagonal")
-        options = tuple((name, eqn.params[name]) for name in names if name in eqn.params)
-        square = aval.shape[-2] == aval.shape[-1]
-        small = square and aval.shape[-1] <= small_matrices.LARGEST
-        return (_MATRICES[eqn.primitive] if small else None), options
-    if trigonometry and eqn.primitive in _TRIGONOMETRY and eqn.params.get("accuracy") is None:
-        same = of_one_type(*(v.aval.dtype for v in eqn.invars))
-        return (_TRIGONOMETRY[eqn.primitive] if same else None), ()
-    return None, ()
+        return _Ours(getattr(form, name), avals, () if name == "cholesky" else some(*names))
+    if name == "lu":
+        return _Ours(factorizations.lu, avals)
+    if name == "qr":
+        return _Ours(factorizations.qr, avals, some("full_matrices"))
+    if name == "eigh":
+        ours = factorizations.eigh
+    else:
+        ours = ft.partial(factorizations.svd, **dict(some("full_matrices", "compute_uv")))
+    theirs = ft.partial(eqn.primitive.bind, **given)
+    return _Ours(_derived_as(theirs, ours, trigonometry), avals)
+
+
+def _with_own_derivative(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
+    """A function with a derivative rule of its own that factorizes a matrix, as `det` does; its
+    rule is rewritten, too."""
+    known = [v for v in eqn.invars if isinstance(v, jex.Var)]
+    kept = all(type(v).__name__ != "DropVar" for v in eqn.outvars)
+    if not (len(set(known)) == len(eqn.invars) and kept and _factorizes(eqn)):
+        return None
+    program = eqn.params["call_jaxpr"]
+    alone = program.jaxpr.replace(constvars=[], invars=known, outvars=eqn.outvars, eqns=[eqn])
+    theirs = jex.jaxpr_as_fun(program.replace(jaxpr=alone, consts=[]))
+    ours = jex.jaxpr_as_fun(_replaced_program(program, trigonometry))
+    return _Ours(_derived_as(theirs, ours, trigonometry), _avals(eqn))
+
+
+def _factorizes(eqn: jex.JaxprEqn) -> bool:
+    return eqn.primitive in _FACTORIZATIONS or any(map(_factorizes, _inner(eqn)))
+
+
+def _derived_as(theirs: Callable, ours: Callable, trigonometry: bool) -> Callable:
+    """`ours`, with the derivative of `theirs`, in which we replace the same."""
+    function = jax.custom_jvp(lambda *x: tuple(ours(*x)))
+
+    @function.defjvp
+    def rule(primals, tangents):
+        derivative = lambda *both: jax.jvp(lambda *x: tuple(theirs(*x)), *both)  # noqa: E731
+        return vectorized(derivative, trigonometry=trigonometry)(primals, tangents)
+
+    return jax.jit(function)
+
+
+def _avals(eqn: jex.JaxprEqn) -> tuple:
+    return tuple(v.aval for v in eqn.invars)
 
 
 def _replaced_parameter(value: Any, trigonometry: bool) -> Any:

@@ -19,9 +19,10 @@ from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.tracing import is_traced
 from ...errors import DefinitionError
+from ..coincidence import coincident
 from ..cycle import LimitCycle
 from ..sweep.batches import front
-from ..sweep.limit_cycles import LimitCycles
+from ..sweep.limit_cycles import LimitCycles, without_coincidences
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .curve import Curve, Failure, Point
 
@@ -249,9 +250,11 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
     anchor, turn = jax.tree_util.tree_map(stack, *((p.departure, p.turn) for p in points))
-    return LimitCycles(
+    cycles = LimitCycles(
         systems, cycle.base, turn.period, anchor, turn.legs, turn.factors, turn.distance,
         np.array([p.steps for p in points]), np.zeros(len(points), np.int32),
         front(turn.codes.reshape(len(points), -1)), cycle.settings, cycle.conserved,
         cycle.multiplicity,
     )  # fmt: skip
+    together = [coincident(cycle.return_map, p.turn) is not None for p in points]
+    return without_coincidences(cycles, np.array(together))

@@ -1,30 +1,25 @@
 """Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
 
-import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from ..._core.compilation.compile import quick_jit
 from ..._core.compilation.garbage_collector import uncollected
+from ..._core.compilation.lapack import is_left_to_lapack
 from ..._core.progress import working
 from ..._core.results import Result
 from ..._core.threads import in_threads
 from ...engine.lanes import Lanes
-from ...engine.move import move
-from ...engine.settings import TRANSIENT, Settings
-from ...engine.target import toward, until
 from ...sections.crossing import AtEvent
-from ...sections.section_list import ListLevels
 from ...systems.system import HybridSystem
+from ..coincidence import together
 from ..newton import excess, newton_steps
 from ..return_map import ReturnMap, Turn
+from .programs import Programs
 
 
 # Newton steps before a system is given up, or tried again. Doubled, hopeless systems cost twice as
@@ -33,9 +28,6 @@ _NEWTON = 6
 # Newton steps before a system is left until those that need more steps than most go on together.
 # Doubled, few of a call's systems are still going in its last steps.
 _USUAL = 3
-# Periods for which a system flows freely before Newton tries again. Doubled, slower transients die
-# out, and each failure takes twice as long.
-_SETTLE = 40
 # Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
 # get no slope. Doubled, a few more do not.
 _RIDGE = 1e-12
@@ -59,6 +51,8 @@ class Rounds(NamedTuple):
     """Without the codes of events,"""
     codes: Int[np.ndarray, "S E"]
     """which stand here, filled up with -1."""
+    together: Bool[np.ndarray, " S"]
+    """Whether two of them coincide."""
     result: Int[np.ndarray, " S"]
     steps: Int[np.ndarray, " S"]
 
@@ -85,7 +79,7 @@ class Tiles(NamedTuple):
     size: int
     """Systems in one compiled call."""
     workers: int
-    programs: "Programs"
+    programs: Programs
     """`QUICK` or `FULL`."""
     known: Known | None = None
 
@@ -165,9 +159,7 @@ class Tiles(NamedTuple):
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
-        begin = self._in_tiles(
-            self.programs.settled, self._threads, rows[failed], *self._given(len(failed))
-        )
+        begin = self._in_tiles(self.programs.settled, rows[failed], *self._given(len(failed)))
         there = np.isfinite(begin[0].q).all(axis=(1, 2))
         if not there.any():
             return out
@@ -209,8 +201,7 @@ class Tiles(NamedTuple):
         """Newton's first step, with Jacobians that are guessed, where it is a small one."""
         if not np.isfinite(jacobian).any():
             return anchor, period
-        turned = self._in_tiles(self._turn, self._threads, rows, anchor, period, wanted=False)
-        anchor, period, turn, _ = turned
+        anchor, period, turn, *_ = self._turn(rows, anchor, period, wanted=False)
         sizes, step = self._step_from(anchor, turn.residual, jacobian)
         small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
         q = anchor.q[..., 0] + np.where(small, step * sizes, 0.0)
@@ -225,15 +216,13 @@ class Tiles(NamedTuple):
                 break
             part = self._step(rows[going], *_pick((out.anchor, out.period), going))
             out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
-        judged = self._in_tiles(self.programs.verdict, 1, rows, out.anchor, out.period, out.turn)
+        judged = self._in_tiles(self.programs.verdict, rows, out.anchor, out.period, out.turn)
         anchor, period, result = judged
         return out._replace(anchor=anchor, period=period, result=result)
 
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
-        anchor, period, turn, codes = self._in_tiles(
-            self._turn, self._threads, rows, anchor, period
-        )
+        anchor, period, turn, codes, coincide = self._turn(rows, anchor, period)
         sizes, step = self._step_from(anchor, turn.residual, turn.jacobian)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)
@@ -242,7 +231,7 @@ class Tiles(NamedTuple):
         period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
         size[extra] = np.inf
         anchor, once = eqx.tree_at(lambda x: x.q, anchor, q[..., None]), np.ones(len(rows), int)
-        return Rounds(anchor, size, period, turn, codes, -once, once)
+        return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
 
     def _step_from(self, anchor: Lanes, residual, jacobian):
         """Sizes of the states (S, d) of some systems, and their Newton steps in these sizes."""
@@ -250,27 +239,35 @@ class Tiles(NamedTuple):
         scaled = jacobian * sizes[:, None, :] / sizes[:, :, None]
         return sizes, newton_steps(scaled, residual / sizes)
 
-    def _turn(self, *arguments, wanted: bool = True):
-        *found, codes = self.programs.turn(*arguments, np.asarray(wanted))
-        return *found, front(np.asarray(codes))
+    def _turn(self, rows, anchor: Lanes, period, wanted: bool = True):
+        """Anchors, expected periods, turns, codes of events, and whether two coincide."""
+        options = (np.asarray(wanted),)
+        return self._in_tiles(
+            self.programs.turn, rows, anchor, period, options=options, then=self._seen
+        )
 
-    @property
-    def _threads(self) -> int:
-        """One where programs factorize matrices (`held`): in several threads of XLA's pool, these
-        would wait for each other forever."""
-        return 1 if self.map.conserved else self.workers
+    def _seen(self, turned):
+        anchor, expected, turn, codes, times = jax.tree_util.tree_map(np.asarray, turned)
+        at_event = isinstance(self.map.base, AtEvent)
+        begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
+        return anchor, expected, turn, front(codes), together(codes, times, begin, turn.period)
 
-    def _in_tiles(self, work, workers: int, rows, *arguments, **options):
-        """`work` for some systems, in calls of one size, so that there is one program for all."""
+    def _in_tiles(self, program, rows, *arguments, options=(), then=lambda x: x):
+        """`program` for some systems, in calls of one size, so that there is one for all."""
         arrays, rest = eqx.partition(self.systems, eqx.is_array)
 
-        def tile(k):
+        def of_tile(k):
             some = np.arange(k, k + self.size) % len(rows)
             systems = eqx.combine(_pick(arrays, rows[some]), rest)
-            part = work(systems, self.map, *_pick(arguments, some), **options)
-            return _pick(part, slice(len(rows) - k))
+            return systems, self.map, *_pick(arguments, some), *options
 
-        return _join(*in_threads(tile, range(0, len(rows), self.size), workers))
+        def tile(k):
+            return _pick(then(program(*of_tile(k))), slice(len(rows) - k))
+
+        several = self.workers > 1 and len(rows) > self.size
+        alone = not several or is_left_to_lapack(program, *of_tile(0))
+        found = in_threads(tile, range(0, len(rows), self.size), 1 if alone else self.workers)
+        return _join(*found)
 
 
 def _numbers(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
@@ -321,73 +318,3 @@ def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
     out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
     return out
-
-
-def _own(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
-    """The return map of a system, begun at the same phase of its own clock."""
-    own = map.at_phase_of(system)
-    if map.base is not None:
-        own = dataclasses.replace(own, expected=expected)
-    anchor = eqx.tree_at(lambda x: x.t, anchor, own.anchor.t)
-    return dataclasses.replace(own, anchor=anchor)
-
-
-def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
-    """One turn of every system from its anchor, with the Jacobian if it is `wanted`."""
-
-    def one(system, anchor, expected):
-        own = _own(map, system, anchor, expected)
-        turn = own.turn_with_jacobian(own.anchor.q[:, 0], wanted)
-        return own.anchor, own.expected, turn._replace(codes=None, times=None), turn.codes.ravel()
-
-    return eqx.filter_vmap(one)(systems, anchor, period)
-
-
-def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
-    """The anchors ready to be left, periods, and result codes."""
-
-    def one(system, anchor, expected, turn):
-        own, q = _own(map, system, anchor, expected), anchor.q[:, 0]
-        period = own.expected if own.base is None else turn.period
-        return own.departure(q), period, own.judge(q, turn)
-
-    return eqx.filter_vmap(one)(systems, anchor, period, turn)
-
-
-def _settled(systems, map: ReturnMap, anchor: Lanes, period):
-    """Where systems are after they have flowed freely for a while, at the guess's phase or
-    section (NaN for those that do not get there), and their expected periods."""
-    base = map.base
-    patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
-
-    def one(system, anchor, expected):
-        own = _own(map, system, anchor, expected)
-        s, anchor, expected = own.structure, own.anchor, own.expected
-        u = jnp.zeros((s.nu, 1))
-        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
-        if base is not None:
-            at_event = isinstance(base, AtEvent)
-            event = s.transition_index(base.name) if at_event else -1
-            target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
-            if not at_event:
-                target = dataclasses.replace(target, levels=ListLevels((base,)))
-            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
-        q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
-        anchor = eqx.tree_at(lambda x: (x.chart, x.q), anchor, (moved.lanes.chart, q))
-        return anchor, expected
-
-    return eqx.filter_vmap(one)(systems, anchor, period)
-
-
-class Programs(NamedTuple):
-    """The functions above, compiled."""
-
-    turn: Callable
-    verdict: Callable
-    settled: Callable
-
-
-# For few systems, and for many.
-QUICK, FULL = (
-    Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, eqx.filter_jit)
-)

@@ -25,15 +25,20 @@ from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
 from ...systems.structure import Structure, check_system
 from ...systems.system import HybridSystem
+from ..coincidence import commutes
 from ..cycle import LimitCycle
 from ..return_map import ReturnMap, turn_product
 from ..scale import given_sizes, scale_of
-from .batches import FULL, QUICK, Programs, Rounds, Tiles
+from .batches import Rounds, Tiles
+from .programs import FULL, QUICK, Programs
 
 
 # Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
 # Doubled, it is 6 s.
 _SMALL = 2000
+# Of cycles on which events coincide, so many are looked at for whether the order of these matters,
+# and all others if it does in one of them. Doubled, that takes twice as long.
+_LOOKED_AT = 50
 # Systems per compiled call. Doubled: fewer calls, whose arrays leave the cache.
 BATCH = 250
 
@@ -198,11 +203,23 @@ def programs_for(S: int) -> Programs:
 def as_cycles(tiles: Tiles, found: Rounds) -> LimitCycles:
     """The cycles that were found."""
     turn, map = found.turn, tiles.map
-    return LimitCycles(
+    cycles = LimitCycles(
         tiles.systems, map.base, found.period, found.anchor, turn.legs, turn.factors,
         turn.distance, found.steps, found.result, found.codes, map.settings, map.conserved,
         map.multiplicity,
     )  # fmt: skip
+    return without_coincidences(cycles, found.together)
+
+
+def without_coincidences(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
+    """Cycles of which those are none on which events coincide (`together`) whose order matters."""
+    rows = np.flatnonzero(together & cycles.ok)
+    few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
+    if all(commutes(cycles[i]) for i in few):
+        return cycles
+    result = cycles.result.copy()
+    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    return dataclasses.replace(cycles, result=result)
 
 
 def _multipliers(

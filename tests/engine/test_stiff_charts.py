@@ -1,0 +1,169 @@
+"""A stiff chart beside one that is not, in all that is computed from a cycle: closed forms.
+
+A room is heated until its sensor shows 0.7, and cools until it shows 0.3. The sensor follows at
+once while the room is heated, and slowly while it cools.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import hybridjax as hj
+from hybridjax.engine.events import start_lanes
+from hybridjax.engine.move import move
+from hybridjax.engine.target import until
+from hybridjax.systems.structure import Structure
+
+
+class Room(hj.Chart):
+    states = ("x", "z")
+    heat: float
+    rate: hj.Parameter
+
+    def field(self, t, q, u):
+        x, z = q
+        return self.heat - x + u[0], self.rate * (x - z)
+
+
+class Heated(Room):
+    solver = hj.Radau()
+
+
+class Thermostat(hj.HybridSystem):
+    fast: hj.Parameter = hj.parameter(1e4)
+    slow: hj.Parameter = hj.parameter(5.0)
+
+    def charts(self):
+        return {"on": Heated(1.0, self.fast), "off": Room(0.0, self.slow)}
+
+    def transitions(self):
+        return [
+            hj.Transition("off", "on", "off", lambda t, q, u: q[1] - 0.7, "rising"),
+            hj.Transition("on", "off", "on", lambda t, q, u: q[1] - 0.3, "falling"),
+        ]
+
+
+def stay(heat, rate, x, z, end):
+    """How long it takes until z is `end`, and x then."""
+    part = (x - heat) * rate / (rate - 1)  # of exp(-t) in z - heat
+    sensor = lambda t: heat + part * np.exp(-t) + (z - heat - part) * np.exp(-rate * t) - end  # noqa: E731
+    t = brentq(sensor, 1e-2, 10.0, xtol=1e-15, rtol=1e-15)
+    return t, heat + (x - heat) * np.exp(-t)
+
+
+def exact(fast=1e4, slow=5.0):
+    """The period, and x where it is switched on."""
+    on = 0.25
+    for _ in range(8):
+        heating, off = stay(1.0, fast, on, 0.3, 0.7)
+        cooling, on = stay(0.0, slow, off, 0.7, 0.3)
+    return heating + cooling, on
+
+
+def by_differences(order):
+    """Derivatives of the period by `slow`."""
+    d, at = 0.02, np.arange(-2, 3)
+    values = [exact(slow=5.0 + d * k)[0] for k in at]
+    weights = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}[order]
+    return np.dot(weights, values) / 12 / d**order
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    """(The longest time to wait for it follows from the slow modes.)"""
+    guess = hj.Guess("on", (0.35, 0.3))
+    return hj.find_limit_cycle(Thermostat(), guess, section=hj.AtEvent("on"))
+
+
+def test_the_cycle(cycle):
+    period, x = exact()
+    np.testing.assert_allclose(cycle.period, period, rtol=1e-11)
+    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-11)
+    np.testing.assert_array_equal(cycle.multipliers, [0.0])
+
+
+def period(cycle):
+    return lambda slow: hj.find_limit_cycle(Thermostat(slow=slow), cycle).period
+
+
+@pytest.mark.slow
+def test_derivatives_under_all_transformations(cycle):
+    slow = jnp.array([5.0, 5.5])
+    first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(slow)
+    np.testing.assert_allclose(first[0], by_differences(1), rtol=1e-6)
+    backwards = jax.jit(jax.grad(period(cycle)))(5.5)
+    np.testing.assert_allclose(backwards, first[1], rtol=1e-8)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(period(cycle))))(5.0)
+    np.testing.assert_allclose(twice, by_differences(2), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_sweep(cycle):
+    slow = np.array([4.0, 5.0, 7.0])
+    found = hj.find_limit_cycles([Thermostat(slow=x) for x in slow], cycle)
+    np.testing.assert_allclose(found.period, [exact(slow=x)[0] for x in slow], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_branch(cycle):
+    branch = hj.continuation(cycle, "slow", (5.0, 6.0), step=0.5)
+    expected = [exact(slow=x)[0] for x in branch.values]
+    np.testing.assert_allclose(branch.cycles.period, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_fit(cycle):
+    data = hj.ObservedCycle([hj.AtEvent("on")], period=exact(slow=5.3)[0], period_std=1e-6)
+    fit = hj.fit_model(Thermostat(), data, free=("slow",), guess=cycle)
+    np.testing.assert_allclose(fit.system.slow, 5.3, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
+def test_experiments(cycle, start):
+    sections = [hj.AtEvent("on"), hj.AtEvent("off")]
+    placed = hj.place_sections(cycle, sections)
+    model = hj.linearize(cycle, placed, outputs="x")
+    u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
+    data = hj.run_experiments(cycle, placed, u, outputs="x", start=start, discard=0)
+    assert (data.result == 0).all()
+    x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
+    np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-9)
+    there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
+    np.testing.assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
+
+
+class Counted(Thermostat):
+    """Says whenever the field of the stiff chart is evaluated."""
+
+    say: object = eqx.field(static=True, default=None)
+
+    def charts(self):
+        said = self.say
+
+        class Loud(Heated):
+            def field(self, t, q, u):
+                jax.debug.callback(said)
+                return super().field(t, q, u)
+
+        return {"on": Loud(1.0, self.fast), "off": Room(0.0, self.slow)}
+
+
+def test_a_stiff_chart_costs_only_where_lanes_are():
+    count = []
+    s = Structure(Counted(say=lambda: count.append(1)))
+
+    @jax.jit
+    def run(chart):
+        q, t = jnp.array([[0.6, 0.65], [0.5, 0.55]]), jnp.zeros(2)
+        lanes = start_lanes(s, t, chart, q)
+        settings = hj.Settings(1e-6, 1e-6, scale=np.ones((2, 2)))
+        return move(s, lanes, jnp.zeros((1, 2)), until(t + 0.05), settings).result
+
+    for chart, visited in ((1, False), (0, True)):
+        np.testing.assert_array_equal(run(np.full(2, chart, np.int32)), 0)
+        jax.effects_barrier()
+        assert bool(count) == visited

@@ -1,0 +1,83 @@
+"""Events that coincide: found on cycles, in sweeps, along branches, and with schedules."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..toys import Field
+from .test_explain import BALLS, Balls
+
+
+class Pair(hj.HybridSystem):
+    """x and y relax to 1, and are set back to 0 together at the level 1/2."""
+
+    def charts(self):
+        return {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))}
+
+    def transitions(self):
+        first = hj.Transition(
+            "x", "a", "a", lambda t, q, u: q[0] - 0.5, "rising",
+            lambda t, q, u: (0.5 * (q[1] - 0.5), q[1]),
+        )  # fmt: skip
+        second = hj.Transition(
+            "y", "a", "a", lambda t, q, u: q[1] - 0.5, "rising", lambda t, q, u: (q[0], 0.0)
+        )
+        return first, second
+
+
+class Ticked(hj.HybridSystem):
+    """A saw-tooth that is set back when it comes to `height`, and by a clock at whole times."""
+
+    height: hj.Parameter = hj.parameter(1.0)
+    other: float = 0.0
+
+    def charts(self):
+        return {"a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))}
+
+    def transitions(self):
+        back = lambda t, q, u: (0.2,)  # noqa: E731
+        found = [
+            hj.Transition("full", "a", "a", lambda t, q, u: q[0] - self.height, "rising", back),
+            hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
+        ]
+        if self.other:
+            found.append(hj.Transition("tock", "a", "a", hj.Scheduled(0.5, self.other), reset=back))
+        return found
+
+    def period(self):
+        return 1.0
+
+
+GUESS = hj.Guess("a", (0.1, 0.1))
+
+
+def test_an_event_that_coincides_with_the_one_at_the_anchor():
+    with pytest.raises(hj.ComputationError, match="'y' coincides with 'x', at which every turn"):
+        hj.find_limit_cycle(Pair(), GUESS, section=hj.AtEvent("x"))
+
+
+@pytest.mark.slow
+def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
+    """Clocks of their own, whose events commute, and such that do not."""
+    systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(jnp.array([0.0, 0.2, 0.4]))
+    begin = hj.find_limit_cycle(Balls(), BALLS)
+    found = hj.find_limit_cycles(systems, begin)
+    ok, not_ok = hj.Result.OK, hj.Result.COINCIDENCE
+    np.testing.assert_array_equal(found.result, [ok, not_ok, not_ok])
+    branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
+    assert branch.cycles.result[0] == ok and (branch.cycles.result[1:] == not_ok).all()
+
+
+def test_an_event_that_coincides_with_a_schedule():
+    """Without the clock, it would be full at the time 1: which of the two sets it back?"""
+    height = 10 - 9.8 * np.exp(-0.1)
+    with pytest.raises(hj.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"):
+        hj.find_limit_cycle(Ticked(height), hj.Guess("a", (0.5,), 0.3))
+
+
+def test_two_schedules_for_one_time():
+    with pytest.raises(hj.DefinitionError, match="'tick' and 'tock' are scheduled for the same"):
+        hj.find_limit_cycle(Ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))

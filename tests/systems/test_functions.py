@@ -1,0 +1,76 @@
+"""What users write in fields: networks, loops, and matrices that become singular on the way."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hybridjax as hj
+
+from ..toys import Field
+
+
+class Learned(hj.HybridSystem):
+    """x' = -x + network(x, cos t) + a polynomial in x, computed by a scan."""
+
+    network: eqx.nn.MLP
+    coefficients: hj.Parameter
+
+    def charts(self):
+        def field(t, q, u):
+            forced = self.network(jnp.stack([q[0], jnp.cos(t)]))
+            horner = lambda value, c: (value * q[0] + c, None)  # noqa: E731
+            value, _ = jax.lax.scan(horner, 0.0 * q[0], self.coefficients)
+            return (-q[0] + forced[0] + value + u[0],)
+
+        return {"a": Field(("x",), field)}
+
+    def period(self):
+        return 2 * np.pi
+
+
+def test_a_network_and_a_scan():
+    """Against the same in NumPy, integrated by scipy; the multiplier by the divergence."""
+    network = eqx.nn.MLP(2, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(1))
+    system = Learned(network, jnp.array([-0.1, 0.2, 0.3]))
+    cycle = hj.find_limit_cycle(system, hj.Guess("a", (0.3,)))
+    (W, a), (V, b) = ((np.asarray(x.weight), np.asarray(x.bias)) for x in network.layers)
+
+    def field(t, z):
+        x = z[0]
+        hidden = np.tanh(W @ [x, np.cos(t)] + a)
+        slope = V @ ((1 - hidden**2) * W[:, 0]) - 1 - 0.2 * x + 0.2
+        return [-x + (V @ hidden + b)[0] - 0.1 * x**2 + 0.2 * x + 0.3, slope[0]]
+
+    start = [cycle.state["x"], 0.0]
+    there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(there[0], start[0], rtol=1e-10)
+    np.testing.assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)
+
+
+class Bound(hj.HybridSystem):
+    """Two masses, one of which is nothing once x is above 1/2."""
+
+    def charts(self):
+        def field(t, q, u):
+            M = jnp.diag(jnp.stack([1.0 + 0.0 * q[0], jnp.where(q[0] > 0.5, 0.0, 1.0)]))
+            return jnp.linalg.solve(M, jnp.stack([0.2 * jnp.sin(t) - q[0] + u[0], -q[1]]))
+
+        return {"a": Field(("x", "y"), field)}
+
+    def period(self):
+        return 2 * np.pi
+
+
+@pytest.mark.slow
+def test_a_mass_matrix_that_becomes_singular_ends_its_own_experiment():
+    cycle = hj.find_limit_cycle(Bound(), hj.Guess("a", (-0.5, 0.0)))
+    u = np.zeros((3, 16, 1))
+    u[1] = 3.0
+    data = hj.run_experiments(cycle, hj.ClockPhase(8), u, outputs="x", discard=0)
+    bad, ok = hj.Result.FIELD_NOT_FINITE, hj.Result.OK
+    np.testing.assert_array_equal(data.result, [ok, bad, ok])
+    assert "#1" in data.summary() and "mass matrix" in data.summary()
+    assert np.isfinite(data.y[[0, 2]]).all()
