@@ -1,2 +1,2 @@
-from .goals import Goal as Goal, Multipliers as Multipliers, Parameters as Parameters
+from .goals import Multipliers as Multipliers, Parameters as Parameters
 from .optimal_design import OptimalDesign as OptimalDesign

@@ -1,16 +1,16 @@
 r"""The powers that give the smallest variance within limits.
 
-For a given estimator the variance of a goal is $\sum_k a_k^2 / p_k$, with $a_k^2 = p_k^2 s_k$ at the
-powers for which it is the best one, and sensitivities $s_k = -\partial \Psi / \partial p_k$. For other
-powers the best estimator is better still, so that powers that make this sum small make the variance
-$\Psi$ smaller (a majorization; with one limit it is the multiplicative algorithm of Silvey,
-Titterington and Torsney 1978 with the square root, which Yu, Ann. Statist. 38, 2010, proved to be
-monotone).
+For a given estimator the variance of a goal is $\sum_k a_k^2 / p_k$, with $a_k^2 = p_k^2 s_k$ at
+the powers for which it is the best one, and sensitivities $s_k = -\partial \Psi / \partial p_k$.
+For other powers the best estimator is better still, so that powers that make this sum small make
+the variance $\Psi$ smaller (a majorization; with one limit it is the multiplicative algorithm of
+Silvey, Titterington and Torsney 1978 with the square root, which Yu, Ann. Statist. 38, 2010, proved
+to be monotone).
 
-*Proof of optimality.* $\Psi$ is convex and $\Psi(tp) = \Psi(p)/t$, so that for every q within the limits
-$\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_k$, a linear program (the
-general equivalence theorem; Pronzato and Pazman, *Design of Experiments in Nonlinear Models*, 2013).
-With one limit e is the largest sensitivity per unit of what is limited. It is 1 at the optimum.
+*Proof of optimality.* $\Psi$ is convex and $\Psi(tp) = \Psi(p)/t$, so that for every q within the
+limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_k$, a linear program
+(the general equivalence theorem; Pronzato and Pazman, *Design of Experiments in Nonlinear Models*,
+2013). With one limit e is the largest sensitivity per unit of what is limited, 1 at the optimum.
 """
 
 from typing import NamedTuple
@@ -73,8 +73,8 @@ class Certificate(NamedTuple):
     excess: float
     """e: with none can the criterion be smaller than a part 1/e of what it is."""
     relative: Float[np.ndarray, " K"]
-    """Sensitivities, relative to what a cosine's power costs: 1 on the average over the power, and e
-    at most where no limit of single cosines holds."""
+    """Sensitivities, relative to what a cosine's power costs: 1 on the average over the power, and
+    e at most where no limit of single cosines holds."""
 
 
 def certify(found: Answer, power: Float[np.ndarray, " K"], limits: Limits) -> Certificate:
@@ -164,7 +164,7 @@ def allocate(
 def _cheapest(
     a: Float[np.ndarray, " K"], limits: Limits, prices: Float[np.ndarray, " L"]
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " L"]]:
-    r"""The powers within limits that minimize $\sum a_k^2/p_k$: $p_k = a_k / \sqrt{(W^T \mu)_k}$, with
+    r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
     prices $\mu$ of the limits, which rise where a limit is exceeded."""
     for _ in range(_PRICES):
         power = np.minimum(a / np.sqrt(prices @ limits.cost), limits.largest)

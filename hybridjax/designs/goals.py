@@ -1,16 +1,15 @@
 """What one wants to know."""
 
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, SignalNames
 from ..errors import DefinitionError
-from ..experiments.design.design import Design
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.multipliers.structured import StructuredFit
@@ -32,17 +31,6 @@ Criterion = Literal["A", "D"]
 _SIMPLE = 1e-6
 
 
-class Goal(Protocol):
-    """What a design is made for: turns a model, cosines and noise into a `Question`."""
-
-    def question(
-        self, model: Model, cosines: Candidates, noise: Float[np.ndarray, " ny"]
-    ) -> Question:
-        """**Arguments:** `noise`, the standard deviation at the sections, infinite for outputs
-        that are not measured."""
-        ...
-
-
 @checked
 class Multipliers(eqx.Module):
     """The Floquet multipliers, as `fit_multipliers` finds them, with all numerators unknown.
@@ -52,7 +40,7 @@ class Multipliers(eqx.Module):
     - `which`: index of the only multiplier to ask for, as `model.multipliers` has them; None asks
       for all, a conjugate pair once.
     - `part`: `"position"`, real and imaginary parts, or `"modulus"`.
-    - `criterion`: `"A"`, the sum of the variances, or `"D"`, the volume of the confidence ellipsoid.
+    - `criterion`: `"A"`, the sum of the variances, or `"D"`, the volume of the ellipsoid.
     - `harmonics` and `overhang`: those of the fit.
     """
 
@@ -65,16 +53,16 @@ class Multipliers(eqx.Module):
     def question(
         self, model: Model, cosines: Candidates, noise: Float[np.ndarray, " ny"]
     ) -> Question:
-        """**Raises:** `DefinitionError` for a multiplier that does not exist or is not simple, and
+        """**Arguments:** `noise`, the standard deviation at the sections, infinite for outputs that
+        are not measured.
+
+        **Raises:** `DefinitionError` for a multiplier that does not exist or is not simple, and
         where the cosines cannot tell the multipliers."""
         multipliers = np.asarray(model.multipliers)
         c = np.poly(multipliers).real[1:]
-        htfs, members = [], []
-        for i in range(len(model.inputs)):
-            here = np.flatnonzero(cosines.channel == i)
-            if len(here):
-                htfs.append(_measured(model, cosines, here, self.harmonics, noise, i))
-                members.append(here)
+        channels = _by_channel(cosines)
+        htfs = [_measured(model, cosines, here, self.harmonics, noise, i) for i, here in channels]
+        members = [here for _, here in channels]
         sensitivities = denominator_sensitivities(htfs, members, c, self.overhang)
         wanted, names = self._wanted(multipliers, c)
         unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
@@ -136,7 +124,9 @@ class Parameters(eqx.Module):
     def question(
         self, model: Model, cosines: Candidates, noise: Float[np.ndarray, " ny"]
     ) -> Question:
-        """**Raises:** `DefinitionError` for parameters that do not exist, and combinations that the
+        """As of `Multipliers`.
+
+        **Raises:** `DefinitionError` for parameters that do not exist, and combinations that the
         data cannot see, which are named."""
         free = self.free
         wanted = free if self.wanted is None else self.wanted
@@ -144,10 +134,7 @@ class Parameters(eqx.Module):
         if strange:
             raise DefinitionError(f"'{strange[0]}' is wanted, but not one of `free`: {free}.")
         slopes, candidate = [], []
-        for i in range(len(model.inputs)):
-            here = np.flatnonzero(cosines.channel == i)
-            if not len(here):
-                continue
+        for i, here in _by_channel(cosines):
             htf = _measured(model, cosines, here, self.harmonics, noise, i)
             observed = ObservedHTF(htf, self.sections)
             seen = identifiability(self.cycle.system, observed, free, guess=self.cycle)
@@ -155,13 +142,21 @@ class Parameters(eqx.Module):
                 lost = "; ".join(seen.descriptions())
                 raise DefinitionError(f"the data cannot see {lost}: leave it out of `free`.")
             slopes.append(seen.sensitivity.T)
-            member = np.broadcast_to(here[:, None], (2, len(htf.harmonics), len(here), htf.H[0, 0].size))
-            candidate.append(member.ravel())
+            shape = 2, len(htf.harmonics), len(here), htf.H[0, 0].size
+            candidate.append(np.broadcast_to(here[:, None], shape).ravel())
         sensitivities = DirectSensitivities(
             np.concatenate(candidate), np.concatenate(slopes, axis=1)
         )
         rows = np.eye(len(free))[[free.index(name) for name in wanted]]
         return Question(sensitivities, rows, tuple(wanted), free, self.criterion)
+
+
+Goal = Multipliers | Parameters
+
+
+def _by_channel(cosines: Candidates) -> list[tuple[int, Int[np.ndarray, " k"]]]:
+    """Each input that is used, and its cosines."""
+    return [(int(i), np.flatnonzero(cosines.channel == i)) for i in np.unique(cosines.channel)]
 
 
 def _measured(
@@ -172,9 +167,9 @@ def _measured(
     noise: Float[np.ndarray, " ny"],
     channel: int,
 ) -> HTF:
-    """The HTFs of one input and the measured outputs, with the variance that power 1 gives.
+    r"""The HTFs of one input and the measured outputs, with the variance that power 1 gives.
 
-    $v = 4 \\sigma^2 / (N P \\sum a^2)$ (`Design.expected_variance`), where the sum of a^2/2 over all
+    $v = 4 \sigma^2 / (N P \sum a^2)$ (`Design.expected_variance`), where the sum of a^2/2 over all
     experiments is the power times their number.
     """
     seen = np.flatnonzero(np.isfinite(noise))

@@ -8,24 +8,21 @@ from ..experiments.design.partition import line_class
 from .candidates import Candidates
 
 
-# Cosines that together tell less than this part of all are left out. Doubled: fewer weak lines,
-# whose answers distortion hides; variances grow by about as much.
-_NEGLIGIBLE = 2e-3
 # Sweeps by which experiments are brought to the same power: to 1e-6 or better.
 _SWEEPS = 100
 
 
 def worthwhile(
-    cosines: Candidates, gain: Float[np.ndarray, " K"], experiments: int
+    cosines: Candidates, gain: Float[np.ndarray, " K"], experiments: int, negligible: float
 ) -> Bool[np.ndarray, " K"]:
     """The cosines that matter, and that so many experiments can hold: of each class of lines that
     disturb each other the best ones.
 
-    **Arguments:** `gain`, what each adds to the information.
+    **Arguments:** `gain`, what each tells; `negligible`, the part of it that is left out.
     """
     order = np.argsort(gain)
     kept = np.empty(len(gain), bool)
-    kept[order] = np.cumsum(gain[order]) > _NEGLIGIBLE * gain.sum()
+    kept[order] = np.cumsum(gain[order]) > negligible * gain.sum()
     classes = line_class(cosines.line, cosines.periods)
     for one in np.unique(classes):
         here = np.flatnonzero(kept & (classes == one))

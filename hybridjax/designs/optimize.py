@@ -20,6 +20,11 @@ from .limits import Limit, make_limits
 from .optimal_design import OptimalDesign
 
 
+# Cosines that together tell less than such a part of all are left out, the largest part of these
+# with which the criterion grows by less than the factor. Doubled: fewer weak lines, whose answers
+# distortion hides.
+_NEGLIGIBLE = (2e-3, 1e-4, 0.0)
+_AS_GOOD = 1.01
 # Noise that nobody gave, relative to the rms of the output in the usual design: 20 dB. Doubled: all
 # standard errors are.
 _NOISE = 0.1
@@ -57,8 +62,8 @@ def optimal_design(
     - `design`: what one would do otherwise. Its lines, inputs, periods and experiments are those of
       the result; by default `multisine` with all lines. Lines that are not in it are forbidden.
     - `goal`: `"multipliers"`, or a `hj.designs.Multipliers` or `hj.designs.Parameters`.
-    - `limit`: rms values by name, of inputs or of outputs (their deviation from the cycle), over all
-      experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
+    - `limit`: rms values by name, of inputs or of outputs (their deviation from the cycle), over
+      all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
       `"output"`, of each.
     - `noise`: standard deviation of the white noise of each output that is measured, by name. By
       default all are, 20 dB below their rms deviation in `design`.
@@ -89,13 +94,16 @@ def optimal_design(
     before = answer(question, usual_power)
     allowed = np.flatnonzero(most > 0)
     ideal = allocate(question.only(allowed), limits.only(allowed), usual_power[allowed], max_steps)
-    gain = ideal.power * ideal.answer.sensitivity
-    kept = allowed[worthwhile(cosines.only(allowed), gain, count)]
-    start = ideal.power[np.searchsorted(allowed, kept)]
-    best = allocate(question.only(kept), limits.only(kept), start, max_steps)
+    for negligible in _NEGLIGIBLE:
+        gain = ideal.power * ideal.answer.sensitivity
+        kept = allowed[worthwhile(cosines.only(allowed), gain, count, negligible)]
+        start = ideal.power[np.searchsorted(allowed, kept)]
+        best = allocate(question.only(kept), limits.only(kept), start, max_steps)
+        worse = best.answer.criterion / ideal.answer.criterion
+        if worse < _AS_GOOD:
+            break
     power, relative = np.zeros_like(usual_power), np.zeros_like(usual_power)
     power[kept], relative[allowed] = best.power, ideal.certificate.relative
-    worse = best.answer.criterion / ideal.answer.criterion
     return OptimalDesign(
         design=to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed),
         usual=usual,

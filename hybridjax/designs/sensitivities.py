@@ -6,7 +6,7 @@ depends on p, and is what they leave of the derivatives.
 """
 
 import abc
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -31,7 +31,7 @@ class Sensitivities(eqx.Module):
         is its share of the information."""
 
     @abc.abstractmethod
-    def only(self, some: Int[np.ndarray, " k"]) -> Self:
+    def only(self, some: Int[np.ndarray, " k"]) -> "Sensitivities":
         """Where only these cosines are applied; they are counted anew."""
 
 
@@ -101,8 +101,8 @@ def denominator_sensitivities(
     """From the exact HTFs of each input (alone) with the variances that power 1 gives, and which
     of the candidates their frequencies are.
 
-    **Raises:** `DefinitionError` if they cannot tell the multipliers, or harmonics are not symmetric
-    about 0.
+    **Raises:** `DefinitionError` if they cannot tell the multipliers, or harmonics are not
+    symmetric about 0.
     """
     channels = []
     for htf, cosine in zip(htfs, cosines, strict=True):
