@@ -28,6 +28,7 @@ LAYERS = [
     "identify",
     "scale",
     "fitting",
+    "designs",
     "recordings",
     "testing",
     "plot",

@@ -224,9 +224,7 @@ def _groups(
     powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
     powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
     rows = np.concatenate([powers.real, powers.imag]) if real else powers
-    u, s, vh = np.linalg.svd(rows, full_matrices=False)
-    kept = s > _RANK * s[0]
-    basis, to_powers = u[:, kept], vh[kept].conj().T / s[kept]
+    basis, to_powers = powers_basis(rows)
 
     weights, data = entries(weight), entries(np.asarray(htf.H))
     scale = weights[0]
@@ -255,3 +253,13 @@ def _groups(
             )
         )
     return found
+
+
+def powers_basis(
+    powers: Inexact[np.ndarray, "rows R"],
+) -> tuple[Inexact[np.ndarray, "rows r"], Inexact[np.ndarray, "R r"]]:
+    """An orthonormal basis of the powers of z^-1 on some frequencies, without combinations that
+    these cannot tell from nothing; and the (smallest) coefficients that make each element."""
+    u, s, vh = np.linalg.svd(powers, full_matrices=False)
+    kept = s > _RANK * s[0]
+    return u[:, kept], vh[kept].conj().T / s[kept]

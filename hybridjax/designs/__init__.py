@@ -1,0 +1,6 @@
+"""Experiments designed for the question: which cosines answer it in the fewest strides."""
+
+import lazy_loader
+
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,2 @@
+from .goals import Multipliers as Multipliers, Parameters as Parameters
+from .optimal_design import OptimalDesign as OptimalDesign

@@ -1,0 +1,124 @@
+"""What an optimal design is, and what it is worth."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.boundary.checked import checked_methods
+from .._core.boundary.kinds import Positive
+from .._core.html.parts import card, table, text
+from ..experiments.design.design import Design
+
+
+# Strides saved by a factor above this are worth another design. Doubled: more designs are said to
+# be nearly optimal already.
+_WORTH_IT = 1.5
+
+
+@checked_methods
+class OptimalDesign(eqx.Module):
+    """A design that answers a question in the fewest strides, beside the one it was made from.
+
+    Standard errors are Cramer-Rao bounds: a fit that uses all of the data reaches them where noise
+    is white and responses are linear.
+
+    **Fields:**
+
+    - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
+    - `usual`: the design with which it is compared.
+    - `names` (g,) of the wanted quantities; `covariance` (g, g) with `design`, `usual_covariance`
+      with `usual`.
+    - `criterion` and `usual_criterion`: what was made small, in units of a variance.
+    - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
+      to that of this one; with one limit the largest sensitivity of a line per unit of what is
+      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum.
+    - `frequencies` (K,) and `channels` (K,) of all cosines that were allowed; `power` and
+      `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
+      which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
+      power belongs, less elsewhere.
+    - `limited`: names of what is limited. `rms`, `usual_rms`: of all signals, by name, as the
+      model predicts them.
+    """
+
+    design: Design
+    usual: Design
+    names: tuple[str, ...] = eqx.field(static=True)
+    covariance: Float[np.ndarray, "g g"]
+    usual_covariance: Float[np.ndarray, "g g"]
+    criterion: float
+    usual_criterion: float
+    certificate: float
+    frequencies: Float[np.ndarray, " K"]
+    channels: np.ndarray
+    power: Float[np.ndarray, " K"]
+    usual_power: Float[np.ndarray, " K"]
+    sensitivity: Float[np.ndarray, " K"]
+    limited: tuple[str, ...] = eqx.field(static=True)
+    rms: dict[str, float]
+    usual_rms: dict[str, float]
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " g"]:
+        """Of the wanted quantities, with one run of `design`."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def usual_standard_errors(self) -> Float[np.ndarray, " g"]:
+        """The same with one run of `usual`."""
+        return np.sqrt(np.diag(self.usual_covariance))
+
+    @property
+    def strides(self) -> int:
+        """Cycles of all experiments, without those that are discarded."""
+        return self.design.cycles(0)
+
+    @property
+    def saved(self) -> float:
+        """How many strides of `usual` one stride of `design` replaces."""
+        ratio = self.usual.cycles(0) / self.strides
+        return self.usual_criterion / self.criterion * ratio
+
+    def strides_for(self, standard_error: Positive) -> int:
+        """Strides after which no wanted quantity has a larger standard error, with repeats of
+        `design`."""
+        return int(np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2))
+
+    @property
+    def advice(self) -> str:
+        """Which case this is, in a sentence."""
+        what = " and ".join(self.limited)
+        if self.saved > _WORTH_IT:
+            return (
+                f"With the rms of {what} limited it matters where the power is: one stride does "
+                f"the work of {self.saved:.3g}."
+            )
+        return (
+            f"With the rms of {what} limited the usual design is nearly optimal (one stride does "
+            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator, and in "
+            "when in the cycle one pushes."
+        )
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.names))
+        errors = zip(self.names, self.usual_standard_errors, self.standard_errors, strict=True)
+        rows = [f"OptimalDesign({', '.join(self.names)})"]
+        rows.append(f"  {'standard error':>{width + 2}}  usual     optimal")
+        rows += [f"    {name:<{width}}  {a:.2e}  {b:.2e}" for name, a, b in errors]
+        rows.append(f"  {self.advice}")
+        rows.append(
+            f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
+            f"needs less than {1 / self.certificate:.0%} of these strides"
+        )
+        rows += [
+            f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"
+            for name, old in self.usual_rms.items()
+            if old > 0
+        ]
+        return "\n".join([*rows, f"  {self.design!r}".replace("\n", "\n  ")])
+
+    def _repr_html_(self) -> str:
+        errors = zip(self.names, self.usual_standard_errors, self.standard_errors, strict=True)
+        shown = [(name, f"{a:.2e}", f"{b:.2e}") for name, a, b in errors]
+        head = ("standard error", "usual", "optimal")
+        about = f"{self.advice}\ncertificate {self.certificate:.3f} (1 at the optimum)"
+        return card("OptimalDesign", "", table(head, shown), text(about))

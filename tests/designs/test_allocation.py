@@ -1,0 +1,81 @@
+"""Powers within limits, against closed forms and another optimizer."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import hybridjax as hj
+from hybridjax.designs.allocation import Question, allocate, answer, certify
+from hybridjax.designs.limits import Limits
+from hybridjax.designs.sensitivities import DirectSensitivities
+
+
+def question(slopes, criterion="A"):
+    """Unknowns with these derivatives (d, K), one row for each cosine."""
+    d, K = slopes.shape
+    names = tuple(f"x{k}" for k in range(d))
+    return Question(DirectSensitivities(np.arange(K), slopes), np.eye(d), names, names, criterion)
+
+
+def limits(cost, largest=np.inf):
+    cost = np.atleast_2d(cost)
+    names = tuple("abc"[: len(cost)])
+    return Limits(names, cost, np.broadcast_to(largest, cost.shape[1]).astype(float))
+
+
+@pytest.mark.parametrize("criterion", ["A", "D"])
+def test_unknowns_that_are_measured_one_by_one(criterion):
+    """The sum of 1 / (s^2 p) within w p = 1 is smallest for p ~ 1 / (s sqrt(w)); the product for
+    equal shares."""
+    s, w = np.array([1.0, 2.0, 5.0, 0.3]), np.array([1.0, 3.0, 0.5, 1.0])
+    found = allocate(question(np.diag(s), criterion), limits(w), np.ones(4), 300)
+    best = 1 / (s * np.sqrt(w)) if criterion == "A" else 1 / w
+    np.testing.assert_allclose(found.power, best / (w @ best), rtol=0.05)
+    assert 1 - 1e-9 < found.certificate.excess < 1.021
+    np.testing.assert_allclose(found.certificate.relative, 1, atol=0.03)
+
+
+@pytest.mark.parametrize("criterion", ["A", "D"])
+@pytest.mark.parametrize("largest", [np.inf, 0.12])
+def test_several_limits(criterion, largest):
+    """Against sequential quadratic programming, which knows nothing of majorization."""
+    rng = np.random.default_rng(3)
+    slopes, cost = rng.normal(size=(3, 14)), rng.uniform(0.2, 2, (3, 14))
+
+    def value(p):
+        covariance = np.linalg.inv(slopes * p @ slopes.T)
+        return np.trace(covariance) if criterion == "A" else np.linalg.det(covariance) ** (1 / 3)
+
+    within = {"type": "ineq", "fun": lambda p: 1 - cost @ p}
+    start = np.full(14, 0.5 / cost.sum(axis=1).max())
+    other = minimize(
+        value, start, method="SLSQP", bounds=[(1e-9, min(largest, 9))] * 14, constraints=[within],
+        options={"maxiter": 500, "ftol": 1e-10},
+    )  # fmt: skip
+    found = allocate(question(slopes, criterion), limits(cost, largest), np.ones(14), 2000)
+    assert limits(cost).use(found.power).max() < 1 + 1e-9
+    assert found.power.max() <= largest
+    assert found.certificate.excess < 1.021
+    assert other.fun * (1 - 1e-6) < found.answer.criterion < other.fun * found.certificate.excess
+    assert value(found.power) == pytest.approx(found.answer.criterion)
+
+
+def test_the_certificate_bounds_every_other_choice():
+    """Also far from the optimum."""
+    rng = np.random.default_rng(0)
+    slopes, some = rng.normal(size=(2, 9)), limits(rng.uniform(0.2, 2, 9))
+    asked = question(slopes)
+    poor = some.within(np.ones(9))
+    now = answer(asked, poor)
+    e = certify(now, poor, some).excess
+    others = [answer(asked, some.within(rng.exponential(size=9) ** 4)) for _ in range(200)]
+    best = allocate(asked, some, poor, 300).answer.criterion
+    assert now.criterion / e < best < min(other.criterion for other in others)
+
+
+def test_what_cannot_be_seen_is_named():
+    same = question(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
+    with pytest.raises(hj.DefinitionError, match=r"combination: .*x0 .*x1"):
+        allocate(same, limits(np.ones(3)), np.ones(3), 10)
+    with pytest.raises(hj.DefinitionError, match="cannot see x1 at all"):
+        allocate(question(np.array([[1.0, 2], [0, 0]])), limits(np.ones(2)), np.ones(2), 10)
