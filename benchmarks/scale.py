@@ -220,8 +220,8 @@ def experiments(count: int, folder: pathlib.Path) -> None:
     def store(S: int):
         design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
-        records = hj.experiments.store_experiments(
-            folder / f"{S}.zarr", cycle, placed, design, outputs, start="cycle", discard=4
+        records = hj.run_experiments(
+            cycle, placed, design, outputs, discard=4, store=folder / f"{S}.zarr"
         )
         wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
         show(f"experiments.{S}.run_cpu_seconds", cpu)

@@ -11,7 +11,4 @@ from .response_function import ResponseFunction as ResponseFunction
 from .run import stream_experiments as stream_experiments
 from .steady import steady_start as steady_start
 from .stepping.plan import Plan as Plan, Stepping as Stepping
-from .stored.store import (
-    StoredExperiments as StoredExperiments,
-    store_experiments as store_experiments,
-)
+from .stored.store import StoredExperiments as StoredExperiments

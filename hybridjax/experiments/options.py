@@ -11,6 +11,9 @@ from .noise import ProcessNoise
 from .stepping.plan import Accuracy
 
 
+# Experiments that are run together where not all are. Twice as many need twice the memory.
+CHUNK = 640
+
 StartName = Literal["cycle", "periodic", "steady"]
 
 

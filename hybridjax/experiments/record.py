@@ -127,25 +127,36 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
-    parts = [data] if isinstance(data, HasRecords) else data
-    records = [record for part in parts for record in part.records]
-    if not records:
+    return list(each_uninterrupted_record(data))
+
+
+def each_uninterrupted_record(data: RecordedData) -> Iterator[Record]:
+    """`uninterrupted_records`, one after the other."""
+    kind, found = None, False
+    for record in _records(data):
+        if not record.inputs:
+            raise DefinitionError(
+                "`data` holds no input: name the signals that acted, or use what needs none "
+                "(`hj.recordings.natural_multipliers`)."
+            )
+        own = (record.n_sections, record.inputs, record.outputs, record.lead, record.drift)
+        kind = own if kind is None else kind
+        if own != kind:
+            raise DefinitionError(
+                f"`data` holds records that do not belong together: some have {kind}, others {own}."
+            )
+        for part in _with_known_inputs(record):
+            found = True
+            yield part
+    if kind is None:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
-    if not all(r.inputs for r in records):
-        raise DefinitionError(
-            "`data` holds no input: name the signals that acted, or use what needs none "
-            "(`hj.recordings.natural_multipliers`)."
-        )
-    kinds = {(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records}
-    if len(kinds) > 1:
-        a, b = sorted(kinds, key=str)[:2]
-        raise DefinitionError(
-            f"`data` holds records that do not belong together: some have {a}, others {b}."
-        )
-    found = [part for record in records for part in _with_known_inputs(record)]
     if not found:
         raise DefinitionError("the input is NaN at every sample.")
-    return found
+
+
+def _records(data: RecordedData) -> Iterator[Record]:
+    for part in [data] if isinstance(data, HasRecords) else data:
+        yield from part.records
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:

@@ -1,12 +1,15 @@
 """Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
 
 from collections.abc import Iterator
-from typing import Unpack
+from typing import Unpack, overload
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Index
+from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
+from .._core.pieces.place import check_share
+from .._core.pieces.run import DaskClient
 from .._core.progress import working
+from ..errors import DefinitionError
 from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
 from ..systems.output import OutputNames
@@ -14,12 +17,37 @@ from .campaign import chunks, prepare
 from .data import ExperimentData
 from .inputs import DesignLike
 from .noise import ProcessNoise
-from .options import Options, OptionsByName, StartName, options_of
+from .options import CHUNK, Options, OptionsByName, StartName, options_of
 from .stepping.plan import Accuracy
+from .stored.pieces import prepare_pieces
+from .stored.store import StoredExperiments, store_experiments
 
 
-# Experiments in one part of a stream. Twice as many need twice the memory.
-CHUNK = 640
+@overload
+def run_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    *,
+    store: None = None,
+    **options: Unpack[OptionsByName],
+) -> ExperimentData: ...
+
+
+@overload
+def run_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    *,
+    store: Path,
+    chunk: ExperimentCount = CHUNK,
+    client: DaskClient | None = None,
+    share: tuple[Index, ExperimentCount] = (0, 1),
+    **options: Unpack[OptionsByName],
+) -> StoredExperiments: ...
 
 
 @checked
@@ -36,13 +64,22 @@ def run_experiments(
     accuracy: Accuracy | None = None,
     record_events: bool = False,
     execution: Execution | None = None,
-) -> ExperimentData:
+    store: Path | None = None,
+    chunk: ExperimentCount = CHUNK,
+    client: DaskClient | None = None,
+    share: tuple[Index, ExperimentCount] = (0, 1),
+) -> ExperimentData | StoredExperiments:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
     All experiments of a batch run side by side in one compiled call, and batches on all cores.
     An experiment that fails (a section missed, events in another order, ...) stops there; the
-    others go on. Where the records of all experiments are too many for memory, use
-    `stream_experiments` or `store_experiments`.
+    others go on. Where the records of all experiments are too many for memory, keep them in a
+    `store`, or use `stream_experiments`.
+
+    In a store, experiments that are there already are not run again: after an interruption, make
+    the same call. The records are the same to the last bit for any number of processes and
+    interruptions, on machines of one kind; so all wait for the program that is compiled thoroughly
+    (10 s, once).
 
     **Arguments:**
 
@@ -61,16 +98,31 @@ def run_experiments(
         single precision. `data.error` is each experiment's own estimate.
     - `record_events`: whether to record when events happen, as `data.events`.
     - `execution`: batches, threads, precision.
+    - `store`: a folder, or an address that fsspec knows ("s3://bucket/records.zarr"), for a Zarr
+        group. It holds the experiments of one call only.
+    - `chunk`: of a store, the experiments in one piece.
+    - `client`: a `distributed.Client`, whose workers fill the store. Each gets the `design`: let
+        that be a `Design`, or small.
+    - `share`: `(rank, size)` where several processes without a client fill one store: this one does
+        the pieces rank, rank + size, ...; those above 0 wait until the first has begun the store.
 
-    **Returns:** `ExperimentData`. `data.summary()` names what failed and why.
+    **Returns:** `ExperimentData`, or with a store `StoredExperiments`. `data.summary()` names what
+    failed and why.
 
-    **Raises:** `DefinitionError` for arguments that do not fit together, or for an accuracy that
-    single precision cannot give; `ComputationError` for an unstable cycle, from which any
-    experiment would run away, and where a steady start is not found.
+    **Raises:** `DefinitionError` for arguments that do not fit together, for an accuracy that
+    single precision cannot give, if the store holds other experiments (with the difference) or
+    cannot be written, or for a client whose workers cannot do it; `ComputationError` for an
+    unstable cycle, from which any experiment would run away, where a steady start is not found, and
+    if the cluster is lost.
     """
     options = Options(start, discard, process_noise, accuracy, record_events, execution)
-    campaign = prepare(cycle, sections, design, outputs, options)
-    return campaign.run()
+    check_share(share)
+    if store is not None:
+        job = prepare_pieces(cycle, sections, design, outputs, options, chunk)
+        return store_experiments(store, job, client, share)
+    if client is not None or share != (0, 1):
+        raise DefinitionError("a `client` or a `share` needs a `store` to put records into.")
+    return prepare(cycle, sections, design, outputs, options).run()
 
 
 @checked

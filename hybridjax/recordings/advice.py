@@ -18,6 +18,7 @@ from ..identify.multipliers.compare import compare_multipliers
 from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem
+from ..identify.series.parts import Parts
 from ..identify.series.series_fit import SeriesFit
 from ..identify.series.validation import Validation
 from .beats.response import PhaseResponse
@@ -55,8 +56,8 @@ def plain_regression(data: RecordedData, order: Order) -> Complex[np.ndarray, " 
 
     To see by how much: `fit_series` has no such bias.
     """
-    grid = CycleGrid.from_data(data)
-    problem = OutputErrorProblem.from_grid(grid, order, grid.n_sections, free_start=True)
+    parts = Parts(data)
+    problem = OutputErrorProblem.from_data(parts, order, parts.n_sections, free_start=True)
     return ordinary_least_squares(delayed_outputs(problem, order))
 
 
@@ -103,10 +104,10 @@ def advise(
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    grid = CycleGrid.from_data(data)
+    parts = Parts(data)
     overhang = R - 1 - fit.lead - d * N
-    problem = OutputErrorProblem.from_grid(grid, d, overhang, free_start=True)
-    delayed = delayed_outputs(problem, d)
+    problem = OutputErrorProblem.from_data(parts, d, overhang, free_start=True)
+    delayed, grid = delayed_outputs(problem, d), parts.whole()
     sampled = int(np.isfinite(grid.y).all(axis=3).sum(axis=(0, 1)).min())
     unknown = R * nu + len(grid.y) * (d + 1)
     plain = ordinary_least_squares(delayed)

@@ -10,9 +10,10 @@ from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.multipliers.denominator import Denominator
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.fit import assemble, fit_series
-from ..identify.series.output_error import OutputErrorProblem, linearize
+from ..identify.series.linearization import linearize
+from ..identify.series.output_error import OutputErrorProblem
+from ..identify.series.parts import Parts
 from ..identify.series.series_fit import SeriesFit
 from ..identify.series.simulation import can_be_compared, simulate_record
 from ..identify.series.validation import Validation, validate
@@ -40,16 +41,16 @@ def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
     early, late = _split(data, share)
-    grid = CycleGrid.from_data(early)
+    parts = Parts(early)
     rest = uninterrupted_records(late)
     fits = []
     for d in range(1, most + 1):
-        problem = OutputErrorProblem.from_grid(grid, d, grid.n_sections, free_start=True)
+        problem = OutputErrorProblem.from_data(parts, d, parts.n_sections, free_start=True)
         c = total_least_squares(delayed_outputs(problem, d))
         found = linearize(problem, c)
         if (found.freedom <= 2 * d).any():
             break
-        fit = assemble(grid, problem, found, Denominator.of_unknown_accuracy(c))
+        fit = assemble(problem, found, Denominator.of_unknown_accuracy(c))
         long = [r for r in rest if can_be_compared(fit, r, free_start=True)]
         if not long:
             break

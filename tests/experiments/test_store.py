@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments import StoredExperiments, store_experiments
+from hybridjax.experiments import StoredExperiments
 from hybridjax.experiments.options import Options
 from hybridjax.experiments.stored.pieces import prepare_pieces
 
@@ -35,7 +35,7 @@ def whole(arguments):
 @pytest.fixture(scope="module")
 def made(arguments, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stores") / "records.zarr"
-    return store_experiments(folder, *arguments, chunk=40, **BATCH)
+    return hj.run_experiments(*arguments, store=folder, chunk=40, **BATCH)
 
 
 @pytest.fixture
@@ -81,15 +81,15 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     with pytest.raises(hj.errors.FileFormatError, match="piece 2 .* is damaged in `u`"):
         stored[2]
     before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
-    again = store_experiments(stored.address, *arguments, chunk=40, **BATCH)
+    again = hj.run_experiments(*arguments, store=stored.address, chunk=40, **BATCH)
     np.testing.assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
 def test_processes_share_the_chunks(arguments, whole, tmp_path):
     for rank in (0, 1):
-        stored = store_experiments(
-            tmp_path / "records.zarr", *arguments, chunk=40, share=(rank, 2), **BATCH
+        stored = hj.run_experiments(
+            *arguments, store=tmp_path / "records.zarr", chunk=40, share=(rank, 2), **BATCH
         )
         assert stored.missing() == ([] if rank else [1])
     np.testing.assert_array_equal(records(stored), whole.y)
@@ -112,14 +112,15 @@ def test_other_experiments_are_refused(made, arguments, change, what):
     names = ("cycle", "sections", "design", "outputs")
     call = dict(zip(names, arguments, strict=True)) | dict(chunk=40) | BATCH | change
     with pytest.raises(hj.DefinitionError, match=f"holds other results: .*`{what}"):
-        store_experiments(made.address, **call)
+        hj.run_experiments(**call, store=made.address)
 
 
 def test_another_system_is_refused(made, arguments):
     _, placed, design, outputs = arguments
     other = eqx.tree_at(lambda p: p.cycle.system.k, placed, jnp.asarray(10.001, float))
     with pytest.raises(hj.DefinitionError, match="`model.numbers.k` is 10.0, not 10.001"):
-        store_experiments(made.address, other.cycle, other, design, outputs, chunk=40, **BATCH)
+        call = other.cycle, other, design, outputs
+        hj.run_experiments(*call, store=made.address, chunk=40, **BATCH)
 
 
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
@@ -139,7 +140,8 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
 def test_events_are_kept(hopper_cycle, tmp_path):
     design = hj.experiments.single_cosine([0.25, 0.75, 1.25], 4, 4)
     call = hopper_cycle, hj.ClockPhase(4), design, "yM"
-    stored = store_experiments(tmp_path / "records.zarr", *call, chunk=2, record_events=True)
+    store = tmp_path / "records.zarr"
+    stored = hj.run_experiments(*call, store=store, chunk=2, record_events=True)
     whole = hj.run_experiments(*call, record_events=True)
     assert [len(part.u) for part in stored] == [2, 1]
     np.testing.assert_allclose(stored[0].events.time, whole.events.time[:2], rtol=1e-9)
@@ -152,8 +154,8 @@ def test_what_is_no_store(tmp_path, arguments):
         StoredExperiments(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.DefinitionError, match="file"):
-        store_experiments(tmp_path / "file", *arguments, **BATCH)
+        hj.run_experiments(*arguments, store=tmp_path / "file", **BATCH)
     with pytest.raises(hj.DefinitionError, match="0 <= rank < size"):
-        store_experiments(tmp_path / "s", *arguments, share=(2, 2), **BATCH)
-    with pytest.raises(TypeError, match="store_experiments has no argument 'works'.* share, start"):
-        store_experiments(tmp_path / "s", *arguments, works=2)
+        hj.run_experiments(*arguments, store=tmp_path / "s", share=(2, 2), **BATCH)
+    with pytest.raises(hj.DefinitionError, match="a `share` needs a `store`"):
+        hj.run_experiments(*arguments, share=(0, 2), **BATCH)

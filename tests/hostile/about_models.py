@@ -321,18 +321,13 @@ def experiments(t):
         "start": WORD, "discard": optional(WHOLE), "process_noise": [0.1, "x", PHASE],
         "accuracy": optional(POSITIVE), "record_events": FLAG, "execution": EXECUTION,
     }  # fmt: skip
-    yield "run_experiments", hj.run_experiments, to_run, drive | options
+    stored = {"chunk": LIMITED, "store": PATH[1:], "share": SHARES, "client": CLIENTS}
+    yield "run_experiments", hj.run_experiments, to_run, drive | options | stored
     yield (
         "stream_experiments",
         hj.experiments.stream_experiments,
         to_run,
         (drive | options | {"chunk": LIMITED}),
-    )
-    yield (
-        "store_experiments",
-        hj.experiments.store_experiments,
-        to_run | dict(store="store"),
-        (drive | options | {"chunk": LIMITED, "store": PATH, "share": SHARES, "client": CLIENTS}),
     )
     yield "StoredExperiments", hj.experiments.StoredExperiments, dict(store="nope"), {
         "store": [*PATH, "nope"],

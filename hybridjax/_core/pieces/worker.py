@@ -10,6 +10,7 @@ import numpy as np
 from distributed import Reschedule, Worker, WorkerPlugin
 
 from ..compilation.compilation_cache import enable_compilation_cache
+from .allocator import keep_freed_memory
 from .zarr_store import ZarrStore
 
 
@@ -30,6 +31,7 @@ class Setup(WorkerPlugin):
         if self._x64:
             jax.config.update("jax_enable_x64", True)
         enable_compilation_cache()
+        keep_freed_memory()
         store = None if self._address is None else ZarrStore(self._address)
         _jobs[self.name] = cloudpickle.loads(self._job), store
 

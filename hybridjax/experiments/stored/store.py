@@ -2,71 +2,30 @@
 
 import functools
 from collections.abc import Iterator
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import ExperimentCount, Index, Path
+from ..._core.boundary.kinds import Index, Path
 from ..._core.pieces.layout import Layout
 from ..._core.pieces.place import absolute, filled
 from ..._core.pieces.run import DaskClient
 from ..._core.pieces.zarr_store import ZarrStore
-from ..._core.progress import working
 from ..._core.signal import Signal
 from ...errors import DefinitionError
-from ...maps.placed import SectionsLike
-from ...orbits.cycle import LimitCycle
-from ...systems.output import OutputNames
 from ..data import ExperimentData, Simulated, summary
 from ..events import EventTimes
-from ..inputs import DesignLike
-from ..options import OptionsByName, options_of
-from ..run import CHUNK
-from .pieces import KIND, describe, layout_of, prepare_pieces
+from .pieces import KIND, ExperimentJob, describe, layout_of
 
 
-@checked
-@working("store_experiments")
 def store_experiments(
-    store: Path,
-    cycle: LimitCycle,
-    sections: SectionsLike,
-    design: DesignLike,
-    outputs: OutputNames,
-    *,
-    chunk: ExperimentCount = CHUNK,
+    store: Any,
+    job: ExperimentJob,
     client: DaskClient | None = None,
-    share: tuple[Index, ExperimentCount] = (0, 1),
-    **options: Unpack[OptionsByName],
+    share: tuple[int, int] = (0, 1),
 ) -> "StoredExperiments":
-    """Run experiments and keep them in a Zarr store, in memory that does not depend on their
-    number.
-
-    Chunks that are there already are not run again: after an interruption, make the same call. The
-    records are the same to the last bit for any number of processes and interruptions, on machines
-    of one kind; so all wait for the program that is compiled thoroughly (10 s, once).
-
-    **Arguments:** as for `run_experiments`, and
-
-    - `store`: a folder, or an address that fsspec knows ("s3://bucket/records.zarr"). It holds the
-        experiments of one call only.
-    - `chunk`: the number of experiments in one piece.
-    - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`); with a client it has
-        to be a `Design`, or small, since each worker gets it.
-    - `client`: a `distributed.Client`, whose workers run the pieces.
-    - `share`: `(rank, size)` where several processes without a client fill one store: this one does
-        the pieces rank, rank + size, ...; those above 0 wait until the first has begun the store.
-
-    **Returns:** `StoredExperiments`.
-
-    **Raises:** `DefinitionError` if the store holds other experiments (with the difference), or
-    cannot be written, or for a client whose workers cannot do it; `ComputationError` if the cluster
-    is lost; `TypeError` for an argument that does not exist; and as `run_experiments`.
-    """
-    job = prepare_pieces(
-        cycle, sections, design, outputs, options_of(store_experiments, options), chunk
-    )
+    """Run what is missing of some experiments in a store; see `run_experiments`."""
     description = describe(job)
 
     def begin():
@@ -81,7 +40,7 @@ def store_experiments(
 
 @checked
 class StoredExperiments:
-    """Experiments in a store that `store_experiments` fills.
+    """Experiments in a store that `run_experiments(..., store=...)` fills.
 
     Iterating over them reads chunk after chunk as `ExperimentData`, so that
     `estimate_htf(StoredExperiments(store))` needs memory for one chunk only.
@@ -139,7 +98,7 @@ class StoredExperiments:
         if gone:
             raise DefinitionError(
                 f"{len(gone)} of {len(self)} chunks in '{self.address}' are missing, the first is "
-                f"{gone[0]}: call `store_experiments` as before to run them."
+                f"{gone[0]}: make the call that began it again to run them."
             )
         for k in range(len(self)):
             yield self[k]

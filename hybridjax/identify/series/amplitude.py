@@ -15,7 +15,7 @@ from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
 from .simulation import simulate_record
-from .validation import require_same_kind
+from .checks.comparable import require_same_kind
 
 
 class AmplitudeSweep(eqx.Module):

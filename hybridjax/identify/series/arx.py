@@ -4,18 +4,17 @@ What inputs leave of the outputs 0, 1, ..., d cycles earlier is linearly depende
 the coefficients of that combination are those of $\chi$.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..._core.threads import on_all_cores
 from ..multipliers.denominator import multipliers_of
 from ..multipliers.gauss_newton import Coefficients
 from ..multipliers.order import refuse_invented
 from .cycle_filters import delay_cycles, lagged_inputs
-from .output_error import OutputErrorProblem
-from .section_regression import SectionRegression, weighted_alike
+from .output_error import OutputErrorProblem, Part, in_passes
+from .section_regression import SectionRegression, root_of
 
 
 # The leading coefficient relative to the largest one, below which the solution is no start (c would
@@ -47,27 +46,80 @@ class DelayedOutputs(NamedTuple):
 
 def delayed_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     """Only from rows whose lagged inputs and outputs are all known."""
-    _, T, N, ny = problem.y.shape
+    N, _, ny = problem.shape
     delays = range(order + 1)
-    cycle = np.arange(T)[:, None]
+    sums = [[_Sums(some) for some in alike] for alike in problem.alike]
 
-    def section(n: int):
-        gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
-        inputs = lagged_inputs(problem.u, n, problem.lags, problem.lead) @ problem.to_lags[n]
-        known = (cycle >= problem.first[:, n] + problem.free).T[..., None]
-        sampled, y = problem.sampled[:, :, n], problem.y[:, :, n]
+    def regress(part: Part, _, n: int):
+        inputs = lagged_inputs(part.u, n, problem.lags, problem.lead) @ problem.to_lags[n]
+        cycle = np.arange(part.y.shape[1])[:, None]
+        known = (cycle >= part.first[:, n] + problem.free).T
+        sampled = part.weight[:, :, n] > 0
         before = np.all([delay_cycles(sampled, j, not problem.free) for j in delays], axis=0)
-        for rows, outputs in weighted_alike(known & before):
-            no_starts = problem.drift[:, :, :0]
-            regression = SectionRegression.make(inputs, no_starts, problem.drift, rows)
-            past = np.concatenate([delay_cycles(y[..., outputs], j) for j in delays], axis=2)
-            left = regression.solve(past)[1].reshape(-1, order + 1, len(outputs))
-            gram[outputs] = np.einsum("rji,rki->ijk", left, left)
-            freedom += max(regression.freedom, 0) * len(outputs)
-        return gram, freedom
+        past = np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=2)
+        no_starts = part.drift[:, :, :0]
+        found = []
+        for some in problem.alike[n]:
+            rows = known & before[..., some[0]]
+            regression = SectionRegression.make(inputs, no_starts, part.drift, rows)
+            x = past[..., some]
+            reduced = regression.reduced(x.reshape(*x.shape[:2], -1))
+            found.append((regression, reduced))
+        return found
 
-    grams, freedoms = zip(*on_all_cores(section, range(N)), strict=True)
-    return DelayedOutputs(sum(grams), sum(freedoms))
+    def of(work):
+        def section(k, part, n, regressions):
+            for one, (regression, reduced) in zip(sums[n], regressions, strict=True):
+                work(one, regression, reduced)
+
+        return section
+
+    in_passes(problem, [of(_Sums.begin), of(_Sums.finish)], regress, lambda part: None)
+    gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
+    for one in (x for some in sums for x in some):
+        gram[one.outputs] += one.left
+        freedom += max(round(one.freedom) - one.root.shape[1], 0) * len(one.outputs)
+    return DelayedOutputs(gram, freedom)
+
+
+class _Sums:
+    """What two passes add up for some outputs of a section: the second one sees what the first has
+    left, and corrects what rounding has left in that."""
+
+    def __init__(self, outputs: list[int]):
+        self.outputs = outputs
+        self.freedom = 0.0
+        self._gram: Any = 0.0
+        self._along: Any = 0.0
+        self._along_left: Any = 0.0
+        self._squares: Any = 0.0
+        self.root: Any = None
+
+    def begin(self, regression: SectionRegression, reduced: Float[np.ndarray, "rows C"]) -> None:
+        self._gram += regression.gram
+        self.freedom += regression.freedom
+        self._along += regression.along(reduced)
+
+    def finish(self, regression: SectionRegression, reduced: Float[np.ndarray, "rows C"]) -> None:
+        if self.root is None:
+            self.root = root_of(self._gram)
+            self._along = self._solved(self._along)
+        left = reduced - regression.remainder @ self._along
+        self._along_left += regression.along(left)
+        self._squares += self._products(left, left)
+
+    @property
+    def left(self) -> Float[np.ndarray, "m d1 d1"]:
+        """Of each output, products of what is left of it at different delays."""
+        missed = self._solved(self._along_left)
+        return self._squares - self._products(self._along_left, missed)
+
+    def _products(self, x: Float[np.ndarray, "rows C"], y: Float[np.ndarray, "rows C"]):
+        x, y = (z.reshape(len(z), -1, len(self.outputs)) for z in (x, y))
+        return np.einsum("rji,rki->ijk", x, y)
+
+    def _solved(self, along: Float[np.ndarray, "r C"]) -> Float[np.ndarray, "r C"]:
+        return self.root @ (self.root.T @ along)
 
 
 def total_least_squares(delayed: DelayedOutputs) -> Coefficients:

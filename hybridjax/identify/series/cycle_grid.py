@@ -1,11 +1,12 @@
 """Records on the axes record, cycle and section."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ...experiments.record import Record, RecordedData, uninterrupted_records
+from ...experiments.record import Record
 
 
 class CycleGrid(NamedTuple):
@@ -29,12 +30,8 @@ class CycleGrid(NamedTuple):
         return self.y.shape[2]
 
     @classmethod
-    def from_data(cls, data: RecordedData) -> "CycleGrid":
-        """All records, cut where an input is unknown, as one array.
-
-        **Raises:** `DefinitionError` as `uninterrupted_records`.
-        """
-        records = uninterrupted_records(data)
+    def from_records(cls, records: Sequence[Record]) -> "CycleGrid":
+        """Records of one kind, without unknown inputs, as one array."""
         S, T, about = len(records), max(map(count_cycles, records)), records[0]
         N, nu, ny = about.n_sections, len(about.inputs), len(about.outputs)
         u = np.zeros((S, T * N, nu))

@@ -16,8 +16,12 @@ from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
 from ..multipliers.denominator import Denominator, multipliers_of
 from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
-from .cycle_grid import CycleGrid
-from .output_error import Linearization, OutputErrorProblem, gradient_covariance, linearize
+from .gradient_covariance import gradient_covariance
+from .linearization import Linearization, linearize
+from .nonlinear.second_order import allow_for_second_order
+from .nonlinear.shared_state_fit import HORIZON
+from .output_error import OutputErrorProblem, Part
+from .parts import Parts
 from .robust import (
     Loss,
     efficiency,
@@ -27,9 +31,7 @@ from .robust import (
     weigh_outputs,
     without_outliers,
 )
-from .second_order import allow_for_second_order
 from .series_fit import SeriesFit
-from .shared_state_fit import HORIZON
 
 
 # Outputs of pure noise, from which the noise in the Jacobian is estimated. Doubled: its share of a
@@ -70,6 +72,7 @@ def fit_series(
 
     - `data`: a `Record`, which may have gaps and any length, `ExperimentData` (all cycles are used,
       not only its window; failed experiments are left out), `SectionData`, or several of them.
+      `StoredExperiments` are read part by part, some ten times over.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
     - `overhang`: lags of the numerators beyond d N; None means N.
     - `start`: "free": whatever happened before a record, the state at its start is unknown.
@@ -84,7 +87,7 @@ def fit_series(
       noise) and on the inputs (distortion). "white": from its size alone.
     - `distortion`: whether to allow for a part of the response of second order, with squares only;
       None: if that explains more than half of the misfit, and lowers the standard errors by 10 % or
-      more.
+      more. Data that are read part by part have no such part.
     - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
     - `max_steps`: of Gauss and Newton's iteration.
 
@@ -94,13 +97,14 @@ def fit_series(
     require_x64()
     free_start = start == "free"
     order = order.rank() if isinstance(order, LDTP) else order
-    grid = CycleGrid.from_data(data)
-    N = grid.n_sections
+    parts = Parts(data)
+    N = parts.n_sections
     overhang = N if overhang is None else overhang
     if distortion and loss != "squares":
         raise DefinitionError(f"distortion is allowed for with the loss 'squares', not {loss!r}.")
-    _require_signals(grid)
-    problem = OutputErrorProblem.from_grid(grid, order, overhang, free_start)
+    if distortion and not parts.in_memory:
+        raise DefinitionError("distortion is allowed for only where `data` are in memory.")
+    problem = OutputErrorProblem.from_data(parts, order, overhang, free_start)
     usual = problem if loss == "squares" else without_outliers(problem)
     delayed = delayed_outputs(usual, order)
     if loss != "squares":
@@ -117,12 +121,12 @@ def fit_series(
         noise = rms_of(usual, misfit(problem, found))
     if check:
         refuse_order(delayed.rescale(noise * problem.scale / usual.scale))
-    best = Denominator(c, _covariance(problem, c, found, errors, loss), converged)
+    best = Denominator(c, _covariance(problem, found, errors, loss), converged)
     second = None
-    if distortion is not False and loss == "squares":
-        first = assemble(grid, problem, found, best)
+    if distortion is not False and loss == "squares" and parts.in_memory:
+        first = assemble(problem, found, best)
         second = allow_for_second_order(
-            grid,
+            parts.whole(),
             first.impulse_response((1 + HORIZON + order + -(-overhang // N)) * N),
             order,
             overhang,
@@ -134,11 +138,10 @@ def fit_series(
         )
     if second is not None:
         best, found = second, linearize(problem, second.coefficients)
-    return assemble(grid, problem, found, best, distortion=second is not None, loss=loss)
+    return assemble(problem, found, best, distortion=second is not None, loss=loss)
 
 
 def assemble(
-    grid: CycleGrid,
     problem: OutputErrorProblem,
     found: Linearization,
     denominator: Denominator,
@@ -146,7 +149,7 @@ def assemble(
     loss: Loss = "squares",
 ) -> SeriesFit:
     """The fit with this denominator, in the units of the data; `found`: the problem there."""
-    N, nu, ny = grid.n_sections, len(grid.inputs), len(grid.outputs)
+    N, nu, ny = problem.shape
     c = denominator.coefficients
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
@@ -172,9 +175,9 @@ def assemble(
         covariance_freedom=denominator.covariance.freedom,
         result=Result.OK if denominator.converged else Result.NOT_CONVERGED,
         n_sections=N,
-        inputs=grid.inputs,
-        outputs=grid.outputs,
-        lead=grid.lead,
+        inputs=problem.data.inputs,
+        outputs=problem.data.outputs,
+        lead=problem.lead,
         distortion=distortion,
     )
 
@@ -194,7 +197,7 @@ def _minimize(
         return last[1]
 
     def normal(c):
-        return at(c).residual.ravel(), at(c).jacobian.reshape(len(c), -1).T
+        return at(c).as_residuals()
 
     c, converged = gauss_newton(normal, start, max_steps)
     return c, at(c), converged
@@ -219,49 +222,39 @@ def _reweighted(
 
 def _noise(found: Linearization, order: int) -> Float[np.ndarray, " ny"]:
     """Standard deviation of each output's noise, in its units of the moment."""
-    square = (found.residual**2).sum(axis=(0, 1, 2, 4))
     left = found.freedom.sum(axis=0) - order / found.freedom.shape[1]
-    return np.maximum(np.sqrt(square / left), _ROUNDING)
+    return np.maximum(np.sqrt(found.square.sum(axis=0) / left), _ROUNDING)
 
 
 def _section_noise(found: Linearization) -> Float[np.ndarray, "N ny"]:
-    square = (found.residual**2).sum(axis=(0, 1, 4))
-    return np.sqrt(square / np.maximum(found.freedom, 1))
+    return np.sqrt(found.square / np.maximum(found.freedom, 1))
 
 
 def _covariance(
-    problem: OutputErrorProblem, c: Coefficients, found: Linearization, errors: str, loss: Loss
+    problem: OutputErrorProblem, found: Linearization, errors: str, loss: Loss
 ) -> Covariance:
     """Of c, by blocks of cycles, which may depend on their neighbors."""
     price = efficiency(problem, found, loss)
-    rng = np.random.default_rng(0)
-    probes = rng.standard_normal((*problem.y.shape, _PROBES)) * problem.sampled[..., None]
-    noise = linearize(problem, c, probes * price.noise[:, None]).jacobian
-    noise = np.einsum("istnac,jstnac,a->ij", noise, noise, price.curvature) / _PROBES
-    by_output = np.einsum("istnac,jstnac->aij", found.jacobian, found.jacobian)
-    curvature = np.einsum("aij,a->ij", by_output, price.curvature) - noise
+
+    def probes(k: int, part: Part):
+        draws = np.random.default_rng((0, k)).standard_normal((*part.y.shape, _PROBES))
+        return draws * (part.weight > 0)[..., None] * price.noise[:, None]
+
+    noise = linearize(problem, found.c, probes).curvature / _PROBES
+    curvature = np.einsum("aij,a->ij", found.curvature - noise, price.curvature)
+    by_output = found.curvature
     if errors == "white" or not np.linalg.eigvalsh(by_output.sum(axis=0))[0] > 0:
         return sandwich(curvature, np.einsum("aij,a->ij", by_output, price.variance))
-    lags = correlated_cycles(multipliers_of(c), problem.y.shape[1])
-    gradient = gradient_covariance(problem, c, found, lags + 1)
+    lags = correlated_cycles(multipliers_of(found.c), problem.cycles)
+    gradient = gradient_covariance(problem, found, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
-
-
-def _require_signals(grid: CycleGrid) -> None:
-    for i, name in enumerate(grid.inputs):
-        if not grid.u[..., i].any():
-            raise DefinitionError(f"the input {name} is zero at every sample.")
-    for i, name in enumerate(grid.outputs):
-        seen = np.isfinite(grid.y[..., i])
-        if not grid.y[..., i][seen].any():
-            raise DefinitionError(f"the output {name} is zero or missing at every sample.")
 
 
 def _require_freedom(found: Linearization, order: int, problem: OutputErrorProblem) -> None:
     if (found.freedom > order).all():
         return
     n, i = np.argwhere(found.freedom <= order)[0]
-    sampled = int(problem.sampled[:, :, n, i].sum())
+    sampled = sum(int((part.weight[:, :, n, i] > 0).sum()) for part in problem.parts())
     missing = order + 1 - int(found.freedom[n, i])
     raise DefinitionError(
         f"section {n} was sampled {sampled} times, too few for numerators of {problem.lags} lags "

@@ -5,7 +5,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .output_error import Linearization, OutputErrorProblem
+from .linearization import Linearization, SectionFit, each_part
+from .output_error import OutputErrorProblem, Part
+from .section_regression import SectionRegression
 
 
 Loss = Literal["squares", "huber", "student"]
@@ -46,46 +48,73 @@ def _slope(loss: Loss, error: np.ndarray) -> np.ndarray:
     return (_STUDENT + 1) * (_STUDENT - error**2) / (_STUDENT + error**2) ** 2
 
 
+Samples = list[Float[np.ndarray, "S T N ny"]]
+"""One number for each sample of each part."""
+
+
 def weigh_outputs(problem: OutputErrorProblem) -> OutputErrorProblem:
     """With weights that take the outputs themselves for errors, to start from."""
-    weight = root_weights("huber", problem.y / np.maximum(_spread(problem, problem.y), _ROUNDING))
-    return problem._replace(weight=problem.weight * weight)
+    parts = list(problem.parts())
+    spread = np.maximum(_spread(problem, [part.y for part in parts]), _ROUNDING)
+    weights = [part.weight * root_weights("huber", part.y / spread) for part in parts]
+    return problem.weighed(weights)
 
 
 def without_outliers(problem: OutputErrorProblem) -> OutputErrorProblem:
     """Without the outputs that are far from all others."""
-    far = np.abs(problem.y) > _FAR * _spread(problem, problem.y)
-    return problem._replace(weight=np.where(far, 0.0, problem.weight))
+    parts = list(problem.parts())
+    spread = _spread(problem, [part.y for part in parts])
+    weights = [np.where(np.abs(part.y) > _FAR * spread, 0.0, part.weight) for part in parts]
+    return problem.weighed(weights)
 
 
 def reweight(problem: OutputErrorProblem, found: Linearization, loss: Loss) -> OutputErrorProblem:
     """In units of the noise, with the weights that a fit suggests."""
     error = misfit(problem, found)
     scale = np.maximum(_spread(problem, error), _ROUNDING)
-    weight = root_weights(loss, error / scale)
-    return problem.rescale(scale)._replace(weight=np.where(problem.sampled, weight, 0.0))
+    weights = [
+        np.where(part.weight > 0, root_weights(loss, e / scale), 0.0)
+        for part, e in zip(problem.parts(), error, strict=True)
+    ]
+    return problem.rescale(scale).weighed(weights)
 
 
-def misfit(problem: OutputErrorProblem, found: Linearization) -> Float[np.ndarray, "S T N ny"]:
+def misfit(problem: OutputErrorProblem, found: Linearization) -> Samples:
     """Unweighted, and without the share that the fit takes of it."""
-    left = problem.weight * np.sqrt(np.maximum(1 - found.leverage, _SMALLEST_REMAINDER))
-    return np.where(problem.sampled, found.residual[..., 0] / np.where(left > 0, left, 1.0), 0.0)
+    errors = [np.zeros(part.y.shape) for part in problem.parts()]
+
+    def section(part: Part, n: int, fit: SectionFit, regression: SectionRegression):
+        x = part.y[:, :, n, fit.outputs, None]
+        error, _ = fit.samples(found.c, regression, x)
+        error = error.reshape(x.shape[:3])
+        weight = part.weight[:, :, n, fit.outputs]
+        remainder = np.maximum(1 - regression.leverage(fit.root), _SMALLEST_REMAINDER)
+        left = weight * np.sqrt(remainder)[..., None]
+        return n, fit.outputs, np.where(weight > 0, error / np.where(left > 0, left, 1.0), 0.0)
+
+    def collect(k, sections):
+        for n, outputs, error in (one for each in sections for one in each):
+            errors[k][:, :, n, outputs] = error
+
+    each_part(problem, found, section, collect)
+    return errors
 
 
-def rms_of(
-    problem: OutputErrorProblem, x: Float[np.ndarray, "S T N ny"]
-) -> Float[np.ndarray, " ny"]:
+def rms_of(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
     """Root mean square of each output's x where the problem has samples."""
-    square = (np.where(problem.sampled, x, 0.0) ** 2).sum(axis=(0, 1, 2))
-    return np.maximum(np.sqrt(square / problem.sampled.sum(axis=(0, 1, 2))), _ROUNDING)
+    square, count = 0.0, 0
+    for part, values in zip(problem.parts(), x, strict=True):
+        sampled = part.weight > 0
+        square = square + (np.where(sampled, values, 0.0) ** 2).sum(axis=(0, 1, 2))
+        count = count + sampled.sum(axis=(0, 1, 2))
+    return np.maximum(np.sqrt(square / count), _ROUNDING)
 
 
-def _spread(
-    problem: OutputErrorProblem, x: Float[np.ndarray, "S T N ny"]
-) -> Float[np.ndarray, " ny"]:
+def _spread(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
     """Standard deviation of each output's x, by the median of its modulus."""
-    each = np.moveaxis(np.abs(x), -1, 0), np.moveaxis(problem.sampled, -1, 0)
-    return np.array([np.median(a[s]) for a, s in zip(*each, strict=True)]) / _MEDIAN
+    pairs = [(np.abs(a), part.weight > 0) for a, part in zip(x, problem.parts(), strict=True)]
+    each = [np.concatenate([a[..., i][s[..., i]] for a, s in pairs]) for i in range(x[0].shape[3])]
+    return np.array([np.median(a) for a in each]) / _MEDIAN
 
 
 class Efficiency(NamedTuple):
@@ -104,12 +133,15 @@ class Efficiency(NamedTuple):
 
 
 def efficiency(problem: OutputErrorProblem, found: Linearization, loss: Loss) -> Efficiency:
-    ny = problem.y.shape[-1]
+    ny = problem.shape[2]
     if loss == "squares":
         return Efficiency(np.ones(ny), np.ones(ny))
-    total = (problem.weight**2).sum(axis=(0, 1, 2))
-    slope = _slope(loss, misfit(problem, found)) * problem.sampled
+    total = slope = count = np.zeros(ny)
+    for part, error in zip(problem.parts(), misfit(problem, found), strict=True):
+        sampled = part.weight > 0
+        total = total + (part.weight**2).sum(axis=(0, 1, 2))
+        slope = slope + (_slope(loss, error) * sampled).sum(axis=(0, 1, 2))
+        count = count + sampled.sum(axis=(0, 1, 2))
     # Of the residuals' squares a share is missing, as of those of least squares.
-    square = (found.residual**2).sum(axis=(0, 1, 2, 4))
-    kept = found.freedom.sum(axis=0) / problem.sampled.sum(axis=(0, 1, 2))
-    return Efficiency(slope.sum(axis=(0, 1, 2)) / total, square / kept / total)
+    kept = found.freedom.sum(axis=0) / count
+    return Efficiency(slope / total, found.square.sum(axis=0) / kept / total)

@@ -1,6 +1,5 @@
 """The linear regression of one section: inputs, unknown starts and drift, solved for together."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +14,11 @@ _GRAM_RANK = 1e-12
 
 
 class SectionRegression(NamedTuple):
-    """Regressors of outputs that are sampled in the same rows (records and cycles).
+    """Regressors of outputs that are sampled in the same rows (records and cycles), in one part of
+    the data.
 
-    Starts and drift are unknown in each record of its own; the coefficients of inputs are common.
+    Starts and drift are unknown in each record of its own, and are projected out here. The
+    coefficients of inputs are common to all parts, whose sums of `gram` and `along` give them.
     """
 
     inputs: Float[np.ndarray, "S T r"]
@@ -31,8 +32,6 @@ class SectionRegression(NamedTuple):
     """Takes coefficients of the basis to those of the starts."""
     remainder: Float[np.ndarray, "rows r"]
     """The weighted rows of the inputs, less what starts and drift explain."""
-    root: Float[np.ndarray, "r k"]
-    """root @ root.T is the inverse of the Gram matrix of `remainder`."""
 
     @classmethod
     def make(
@@ -45,45 +44,42 @@ class SectionRegression(NamedTuple):
         rows = weight[:, :, None]
         each = rows * np.concatenate([starts, drift], axis=2)
         basis, s, right = np.linalg.svd(each, full_matrices=False)
-        kept = s > RANK * s.max(initial=0)
+        kept = s > RANK * s.max(axis=1, initial=0, keepdims=True)
         basis = basis * kept[:, None]
         weights = np.where(kept, 1 / np.where(kept, s, 1), 0)[:, None]
         to_starts = (np.swapaxes(right, 1, 2) * weights)[:, : starts.shape[2]]
         remainder = rows * inputs
         remainder = remainder - basis @ (basis.swapaxes(1, 2) @ remainder)
-        remainder = remainder.reshape(-1, inputs.shape[2])
-        w, q = np.linalg.eigh(remainder.T @ remainder)
-        kept = w > _GRAM_RANK * w.max(initial=0)
-        root = q[:, kept] / np.sqrt(w[kept])
-        return cls(inputs, starts, rows, basis, to_starts, remainder, root)
+        return cls(inputs, starts, rows, basis, to_starts, remainder.reshape(-1, inputs.shape[2]))
 
     @property
-    def freedom(self) -> int:
-        """Samples less unknowns."""
-        used = self.root.shape[1] + (self.basis**2).sum()
-        return int((self.weight > 0).sum()) - int(round(float(used)))
+    def gram(self) -> Float[np.ndarray, "r r"]:
+        """Products of the inputs with each other."""
+        return self.remainder.T @ self.remainder
 
     @property
-    def input_basis(self) -> Float[np.ndarray, "S T k"]:
-        """Orthonormal basis of `remainder`, in the same rows."""
-        return (self.remainder @ self.root).reshape(*self.basis.shape[:2], -1)
+    def freedom(self) -> float:
+        """Samples less unknown starts and drift."""
+        return float((self.weight > 0).sum() - (self.basis**2).sum())
 
-    @property
-    def leverage(self) -> Float[np.ndarray, "S T"]:
-        """The share of its own error that the fit takes from each sample."""
-        return (self.basis**2).sum(axis=2) + (self.input_basis**2).sum(axis=2)
+    def input_basis(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T k"]:
+        """The rows of this part in an orthonormal basis of all rows of the inputs."""
+        return (self.remainder @ root).reshape(*self.basis.shape[:2], -1)
 
-    def solve(
-        self, x: Float[np.ndarray, "S T C"]
-    ) -> tuple[Float[np.ndarray, "r C"], Float[np.ndarray, "S T C"]]:
-        """Coefficients of the inputs for C outputs, and what is left of these, weighted."""
-        a, left = np.zeros((self.remainder.shape[1], x.shape[2])), self.weight * x
+    def leverage(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T"]:
+        """The share of its own error that a fit takes from each sample."""
+        return (self.basis**2).sum(axis=2) + (self.input_basis(root) ** 2).sum(axis=2)
+
+    def reduced(self, x: Float[np.ndarray, "S T C"]) -> Float[np.ndarray, "rows C"]:
+        """C outputs, weighted, less what starts and drift explain."""
+        left = self.weight * x
         for _ in range(2):  # the second time for accuracy
             left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
-            more = self.root @ (self.root.T @ (self.remainder.T @ left.reshape(-1, x.shape[2])))
-            left = left - (self.remainder @ more).reshape(left.shape)
-            a += more
-        return a, left
+        return left.reshape(-1, x.shape[2])
+
+    def along(self, left: Float[np.ndarray, "rows C"]) -> Float[np.ndarray, "r C"]:
+        """Products of the inputs with what is left of outputs."""
+        return self.remainder.T @ left
 
     def response(
         self, a: Float[np.ndarray, "r C"], x: Float[np.ndarray, "S T C"]
@@ -94,11 +90,8 @@ class SectionRegression(NamedTuple):
         return forced + self.starts @ free
 
 
-def weighted_alike(weight: np.ndarray) -> Iterator[tuple[np.ndarray, list[int]]]:
-    """Of weights (S, T, ny), those (S, T) that differ, and the outputs that have them."""
-    left = list(range(weight.shape[2]))
-    while left:
-        rows = weight[..., left[0]]
-        same = [i for i in left if np.array_equal(weight[..., i], rows)]
-        yield rows, same
-        left = [i for i in left if i not in same]
+def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:
+    """root @ root.T is the inverse of a Gram matrix, where it has one."""
+    w, q = np.linalg.eigh(gram)
+    kept = w > _GRAM_RANK * w.max(initial=0)
+    return q[:, kept] / np.sqrt(w[kept])

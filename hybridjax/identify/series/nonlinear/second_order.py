@@ -12,10 +12,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance
-from ..multipliers.denominator import Denominator
-from .cycle_grid import CycleGrid
-from .section_regression import RANK
+from ...multipliers.covariance import Covariance
+from ...multipliers.denominator import Denominator
+from ..cycle_grid import CycleGrid
+from ..section_regression import RANK
 from .shared_state import ProductInputs, set_up, simulate_state, smallest_noise
 from .shared_state_fit import SharedStateFit, denominator_of, first_model, fit_shared_state
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .cycle_filters import delay_cycles, lagged_inputs
-from .cycle_grid import CycleGrid
-from .section_regression import RANK
+from ..cycle_filters import delay_cycles, lagged_inputs
+from ..cycle_grid import CycleGrid
+from ..section_regression import RANK
 
 
 # Part of the rms of an output that no noise is taken to be smaller than: rounding. Doubled:

@@ -5,8 +5,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance, correlated_cycles, serial_covariance
-from ..multipliers.denominator import Denominator
+from ...multipliers.covariance import Covariance, correlated_cycles, serial_covariance
+from ...multipliers.denominator import Denominator
 from .shared_state import (
     SharedStateModel,
     SharedStateProblem,

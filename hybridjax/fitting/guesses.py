@@ -1,0 +1,118 @@
+"""Fits from several guesses of the parameters, one after the other or as pieces of work."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.pieces.blocks import Blocks
+from .._core.pieces.description import array_digest, digest_of, versions
+from .._core.pieces.layout import Constant, Layout, Variable
+from .._core.pieces.place import filled
+from .._core.results import Result
+from ..engine.describe import describe
+from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
+from ..orbits.rough import rough
+from ..systems.system import HybridSystem
+from .problem import FitProblem, levenberg_marquardt
+
+
+class Tried(NamedTuple):
+    """What became of S guesses."""
+
+    fitted: Float[np.ndarray, "S p"]
+    """Coordinates to which they led."""
+    cost: Float[np.ndarray, " S"]
+    """There; infinite where there is no limit cycle, or nothing to be observed on it."""
+    steps: Int[np.ndarray, " S"]
+    result: Int[np.ndarray, " S"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Guesses:
+    """**Fields:** `problem`; `system`, whose parameters are replaced; `near`, a limit cycle to look
+    around; coordinates `x` of each guess; `max_steps` from each."""
+
+    problem: FitProblem
+    system: HybridSystem
+    near: LimitCycle
+    x: Float[np.ndarray, "S p"]
+    max_steps: int
+
+    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
+        """The fit from guess k."""
+        x = self.x[k]
+        cycle = self.cycle(x, self.near)
+        cost, steps, result = np.inf, 0, int(cycle.result)
+        if result == Result.OK:
+            end = levenberg_marquardt(self.problem, jnp.asarray(x), cycle, self.max_steps)
+            r, steps = np.asarray(end.residuals), int(end.steps)
+            result = int(Result.NOT_CONVERGED)
+            if np.isfinite(r).all():  # (else there is a cycle, but not what was observed on it)
+                x, cost = np.asarray(end.x), float(r @ r)
+                result = int(Result.OK) if end.converged else result
+        found = Tried(x, np.array(cost), np.array(steps), np.array(result))
+        return {name: value[None] for name, value in found._asdict().items()}
+
+    def cycle(self, x: Float[np.ndarray, " p"], near: LimitCycle) -> LimitCycle:
+        """That of the system with the parameters at x, found or not."""
+        p = self.problem.parameters
+        system = p.insert(self.system, p.decode(jnp.asarray(x)))
+        return find_limit_cycle(system, near, throw=False)
+
+    def all(self, store: Any, client: Any) -> Tried:
+        """What becomes of all of them, by workers or in a store; see `fit_model`."""
+        S, p = self.x.shape
+        description = self.describe()
+
+        def begin():
+            names = np.array(self.problem.parameters.names)
+            variables = {
+                "fitted": Variable("<f8", ("parameter",), (p,)),
+                "cost": Variable("<f8"), "steps": Variable("<i8"), "result": Variable("<i8"),
+            }  # fmt: skip
+            constants = {"parameter": Constant(("parameter",), names)}
+            blocks = Blocks((S,), (1,))
+            layout = Layout(("guess",), blocks, variables, constants, ("parameter",), description)
+            return self, layout, self.arrays()
+
+        def again(layout: Layout, start: list[np.ndarray]):
+            return self.restored(start)
+
+        found = filled(begin, again, description, store, client, (0, 1)).dataset()
+        return Tried(*(found[name].values for name in Tried._fields))
+
+    def arrays(self) -> list[np.ndarray]:
+        """What was computed before the first guess was tried."""
+        return [np.asarray(x) for x in jax.tree_util.tree_leaves(self._computed()[0])]
+
+    def restored(self, arrays: list[np.ndarray]) -> "Guesses":
+        """With these numbers of another call."""
+        own, rest = self._computed()
+        own = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(own), arrays)
+        problem, near = eqx.combine(jax.tree_util.tree_map(jnp.asarray, own), rest)
+        return dataclasses.replace(self, problem=problem, near=near)
+
+    def _computed(self) -> Any:
+        return eqx.partition((self.problem, self.near), eqx.is_array)
+
+    def describe(self) -> dict[str, Any]:
+        """What makes these fits what they are."""
+        parameters = self.problem.parameters
+        given = [one.data for one in self.problem.observations]
+        return {
+            "kind": "guesses",
+            "versions": versions(),
+            "model": describe(self.system),
+            "guess": rough(self.near),
+            "free": list(parameters.names),
+            "bounds": [array_digest(parameters.low), array_digest(parameters.high)],
+            "data": [digest_of(*map(array_digest, jax.tree_util.tree_leaves(x))) for x in given],
+            "guesses": array_digest(self.x),
+            "max_steps": self.max_steps,
+        }
