@@ -144,7 +144,7 @@ CASES: dict[str, Callable[[], Case]] = {
         1e-5,
         [*_pair(0.847302228159268509 + 0.427350687398246989j), -0.694479389634475538,
          0.643345392432610566],
-        _MPMATH, ("v1", "i1"),
+        _MPMATH, ("v2", "i2"),
     ),
     "Chua": lambda: Case(
         "Chua's circuit, alpha = 8", m.ChuaCircuit(),
@@ -159,15 +159,15 @@ CASES: dict[str, Callable[[], Case]] = {
         "block on a belt", m.BeltOscillator(),
         [hj.AtEvent("sticks to behind"), hj.Crossing("x", "falling", charts=("behind",)),
          hj.AtEvent("behind to sticks"), hj.Crossing("x", "rising", charts=("sticks",))],
-        "x", "force", 1e-4, [], _CLOSED, ("x", "v"), section=hj.AtEvent("sticks to behind"),
+        "x", "force", 1e-4, [], _CLOSED, ("v", "x"), section=hj.AtEvent("sticks to behind"),
     ),
     "Izhikevich": lambda: Case(
         "Izhikevich's neuron", m.IzhikevichNeuron(), hj.ClockPhase(16), "w", "current", 1e-3,
-        [0.48958210923116263, -1.1522394149920956e-11], "heyoka", ("v", "w"),
+        [0.48958210923116263, -1.5695975926619675e-11], "heyoka", ("v", "w"),
     ),
     "AdEx": lambda: Case(
         "adaptive exponential neuron", m.AdExNeuron(), hj.ClockPhase(16), "w", "current", 1e-2,
-        [0.7474603512727481, 0.17911718353780215], "heyoka", ("v", "w"),
+        [0.7474603512727481, 0.17911718353685366], "heyoka", ("v", "w"),
     ),
     "Hopf": lambda: Case(
         "Hopf normal form", m.HopfOscillator(),
