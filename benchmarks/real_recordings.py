@@ -253,7 +253,7 @@ def variable(model, strides, noise, rng):
     )  # fmt: skip
 
 
-def phase_model(seeds=20, seconds=3, trials=20):
+def phase_model(seeds=10, seconds=3, trials=20):
     """Coverage of the 95 % bands of phase response curves that are known."""
     x, at = np.arange(400) / 400, np.linspace(0.025, 0.975, 20)
     smooth = 1 - 0.45 * np.cos(2 * np.pi * x) + 0.15 * np.sin(2 * np.pi * x)

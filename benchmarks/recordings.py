@@ -131,28 +131,42 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=400, strides=300, noise=1e-4, chunk=50, n_sections=16, first=20000):
+def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16):
     print(
-        f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {n_sections} sections, "
+        f"\nCoverage of 95 % regions: {draws} draws, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
     )
-    tallies = {name: ([], [], []) for name in PHASES}
-    for done in range(0, seeds, chunk):
-        recordings, true = hopper(strides, range(first + done, first + done + chunk))
-        for seed, recording in enumerate(recordings, first + done):
-            dirty = noisy(recording, noise, seed)
-            for name, (hits, found, said) in tallies.items():
-                fit = hj.fit_series(at_sections(dirty, name, n_sections).records, 2, check=False)
-                hits.append(bool(fit.contains(true[:1])[0]))
-                found.append(distance(fit.multipliers, true))
-                said.append(fit.standard_errors[0])
-        for name, (hits, found, said) in tallies.items():
-            p = stats.binomtest(sum(hits), len(hits), 0.95).pvalue
-            print(
-                f"{name}: {sum(hits)} of {len(hits)} ({100 * np.mean(hits):.1f} %), p = {p:.2g}; "
-                f"rms error {rms(found):.1e}, said {rms(said):.1e}",
-                flush=True,
-            )
+
+    def some(rng):
+        """So many recordings, simulated side by side."""
+        recordings, true = hopper(strides, rng.integers(2**31, size=chunk).tolist())
+        seeds = rng.integers(2**31, size=chunk).tolist()
+        dirty = [noisy(r, noise, seed) for r, seed in zip(recordings, seeds, strict=True)]
+        return {
+            name: [found_in(at_sections(d, name, n_sections).records, true) for d in dirty]
+            for name in PHASES
+        }
+
+    found = hj.monte_carlo(some, draws // chunk)
+    for name in PHASES:
+        print(f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}", flush=True)
+
+
+def found_in(records, true, **options):
+    """Of each multiplier whether its region holds it, the error, and the standard error (3, d)."""
+    fit = hj.fit_series(records, len(true), check=False, **options)
+    return np.stack([fit.contains(true), fit.compare(true).error, fit.standard_errors])
+
+
+def tally(found):
+    """Of one multiplier, for all draws (n, 3): how often it was held, and the errors."""
+    hits, n = int(found[:, 0].sum()), len(found)
+    p = stats.binomtest(hits, n, 0.95).pvalue
+    error, said = rms(found[:, 1]), rms(found[:, 2])
+    return (
+        f"{hits} of {n} ({100 * hits / n:.1f} %), p = {p:.2g}; rms error {error:.1e}, said "
+        f"{said:.1e}, {said / error:.2f} of it"
+    )
 
 
 def dirt(seeds=5, strides=500, noise=1e-4):
@@ -296,39 +310,28 @@ def linear_system(multipliers, nu, ny, n_sections=8, seed=5):
     return hj.LDTP.from_blocks(A, list(B), list(C), [np.zeros((ny, nu))] * n_sections)
 
 
-def white_records(model, strides, seeds, noise):
+def coverage_of(label, multipliers, nu, ny, noise, draws, strides, **options):
     """White inputs from the limit cycle, and outputs with `noise(rng, shape)`, of their size."""
-    for seed in range(seeds):
-        rng = np.random.default_rng(seed)
-        u = rng.normal(size=(strides * model.n_sections, len(model.inputs)))
+    model, true = linear_system(multipliers, nu, ny), np.asarray(multipliers)
+
+    def one(rng):
+        u = rng.normal(size=(strides * model.n_sections, nu))
         y = np.array(model.simulate(u))
         y += y.std(axis=0) * noise(rng, y.shape)
         about = dict(inputs=model.inputs, outputs=model.outputs)
-        yield hj.Record(u, y, n_sections=model.n_sections, **about)
+        return found_in(hj.Record(u, y, n_sections=model.n_sections, **about), true, **options)
 
-
-def coverage_of(label, records, multipliers, **options):
-    true = np.asarray(multipliers)
-    fits = [hj.fit_series(r, len(true), check=False, **options) for r in records]
-    hits = np.sum([f.contains(true) for f in fits], axis=0)
-    found = np.sqrt(np.mean([f.compare(true).error ** 2 for f in fits], axis=0))
-    said = np.sqrt(np.mean([f.standard_errors**2 for f in fits], axis=0))
+    found = hj.monte_carlo(one, draws).value.values
     for k, z in enumerate(true):
         if np.imag(z) >= 0:
-            p = stats.binomtest(int(hits[k]), len(fits), 0.95).pvalue
-            print(
-                f"{label}, {z:.2g}: {hits[k]} of {len(fits)} ({100 * hits[k] / len(fits):.1f} %), "
-                f"p = {p:.2g}; rms error {found[k]:.1e}, said / rms {said[k] / found[k]:.2f}",
-                flush=True,
-            )
+            print(f"{label}, {z:.2g}: {tally(found[..., k])}", flush=True)
 
 
-def short(seeds=400, strides=200):
-    print(f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, 8 sections, 20 dB")
-    for label, (multipliers, nu, ny) in LINEAR.items():
-        model = linear_system(multipliers, nu, ny)
-        records = white_records(model, strides, seeds, lambda rng, n: 0.1 * rng.normal(size=n))
-        coverage_of(label, records, multipliers)
+def short(draws=400, strides=200):
+    print(f"\nCoverage of 95 % regions: {draws} draws, {strides} strides, 8 sections, 20 dB")
+    noise = lambda rng, n: 0.1 * rng.normal(size=n)  # noqa: E731
+    for label, system in LINEAR.items():
+        coverage_of(label, *system, noise, draws, strides)
 
 
 NOISES_OF_LOSSES = {
@@ -340,17 +343,16 @@ NOISES_OF_LOSSES = {
 }
 
 
-def losses(seeds=200, strides=200):
-    print(f"\nLosses of fit_series: {seeds} seeds, {strides} strides, 8 sections")
-    multipliers, nu, ny = LINEAR["a complex pair"]
-    model = linear_system(multipliers, nu, ny)
+def losses(draws=200, strides=200):
+    print(f"\nLosses of fit_series: {draws} draws, {strides} strides, 8 sections")
+    system = LINEAR["a complex pair"]
     for label, noise in NOISES_OF_LOSSES.items():
         for loss in ("squares", "huber", "student"):
-            records = white_records(model, strides, seeds, noise)
-            coverage_of(f"{label}, {loss}", records, multipliers, loss=loss, distortion=False)
+            about = dict(loss=loss, distortion=False)
+            coverage_of(f"{label}, {loss}", *system, noise, draws, strides, **about)
 
 
-def walker(seeds=30, strides=100, trials=5, noise=1e-4):
+def walker(draws=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
     oscillator = hj.models.VanDerPol(mu=0.1)
@@ -368,35 +370,44 @@ def walker(seeds=30, strides=100, trials=5, noise=1e-4):
             oscillator, None, ("x", "v"), angle, None, 0.005, 1, 1,
         ),
     }  # fmt: skip
-    for label, (system, event, outputs, phase, mark, size, order, overhang) in systems.items():
-        where = {} if event is None else {"section": hj.AtEvent(event)}
-        cycle = hj.find_limit_cycle(system, **where)
-        period, true = float(cycle.period), np.asarray(cycle.multipliers)[:order]
-        rate = 200 / period
+    for label, about in systems.items():
+        walks(label, *about, draws, strides, trials, noise)
+
+
+def walks(
+    label, system, event, outputs, phase, mark, size, order, overhang, draws, strides, trials, noise
+):
+    where = {} if event is None else {"section": hj.AtEvent(event)}
+    cycle = hj.find_limit_cycle(system, **where)
+    period, true = float(cycle.period), np.asarray(cycle.multipliers)[:order]
+    rate = 200 / period
+
+    def one(rng):
         force = [
-            hj.testing.random_force(strides * period, rate, 8 / period, rms=size, seed=k)
-            for k in range(seeds * trials)
+            hj.testing.random_force(strides * period, rate, 8 / period, rms=size, seed=seed)
+            for seed in rng.integers(2**31, size=trials).tolist()
         ]
         made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
-        hits, widths, found = 0, [], []
-        for seed in range(seeds):
-            own = made.trials[seed * trials : (seed + 1) * trials]
-            one = eqx.tree_at(lambda r: r.trials, made, own)
-            one = spoil(one, outputs, Dirt(noise=noise, seed=seed))
-            if mark:
-                one = one.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
-            data = hj.recordings.section_data(
-                one, phase, inputs="u", outputs=outputs, n_sections=16, timing="duration"
-            )
-            fit = hj.fit_series(data.records, order, overhang=16 * overhang, check=False)
-            hits += bool(fit.contains(true).all())
-            found.append(fit.compare(true).max_error)
-            widths.append([np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)])
-        print(
-            f"{label} (multipliers {true}): {data!r}\n  rms error {rms(found):.1e}, 95 % regions "
-            f"reach {np.mean(widths, axis=0)}, all held in {hits}/{seeds}",
-            flush=True,
+        made = spoil(made, outputs, Dirt(noise=noise, seed=int(rng.integers(2**31))))
+        if mark:
+            made = made.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
+        data = hj.recordings.section_data(
+            made, phase, inputs="u", outputs=outputs, n_sections=16, timing="duration"
         )
+        fit = hj.fit_series(data, order, overhang=16 * overhang, check=False)
+        reach = [np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)]
+        return {
+            "held": int(fit.contains(true).all()),
+            "error": float(fit.compare(true).max_error),
+            "reach": np.array(reach),
+        }
+
+    found = hj.monte_carlo(one, draws)
+    print(
+        f"{label} (multipliers {true}): rms error {rms(found.error.values):.1e}, 95 % regions "
+        f"reach {found.reach.values.mean(axis=0)}, all held in {int(found.held.sum())}/{draws}",
+        flush=True,
+    )
 
 
 def size(trials=10, minutes=10, rate=1000):

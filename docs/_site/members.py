@@ -1,11 +1,30 @@
 """What the reference says of members: `@remembered` makes properties, systems have parameters."""
 
 import ast
+import re
+from collections.abc import Iterator
 
 import griffe
 
 
+# Functions that are named as the makers of a result. Doubled: longer lists.
+_MAKERS = 4
+
+
 class Members(griffe.Extension):
+    def on_package(self, *, pkg: griffe.Module, **_) -> None:
+        """Results say which function gives them: its example shows them."""
+        makers: dict[str, list[str]] = {}
+        for name, thing in _public(pkg):
+            if thing.is_function and thing.returns is not None:
+                for word in re.findall(r"\w+", str(thing.returns)):
+                    makers.setdefault(word, []).append(name)
+        for name, thing in _public(pkg):
+            own = makers.pop(name.split(".")[-1], []) if thing.is_class else []
+            if thing.docstring and own:
+                given = ", ".join(f"`hj.{x}`" for x in own[:_MAKERS])
+                thing.docstring.value += f"\n\n*Given by* {given}."
+
     def on_function(self, *, func: griffe.Function, **_) -> None:
         if any(decorator.callable_path.endswith("remembered") for decorator in func.decorators):
             value = griffe.Attribute(
@@ -19,6 +38,18 @@ class Members(griffe.Extension):
         lines = [_parameter(x) for x in cls.attributes.values() if str(x.annotation) == "Parameter"]
         if lines and cls.docstring:
             cls.docstring.value += "\n\n**Parameters:**\n\n" + "\n".join(lines)
+
+
+def _public(pkg: griffe.Module) -> Iterator[tuple[str, griffe.Object]]:
+    """Functions and classes, by the names that the tables of public names give them."""
+    for module in (pkg, *(x for x in pkg.modules.values() if x.is_subpackage)):
+        path = module.path.removeprefix("hybridjax").removeprefix(".")
+        for name, member in module.members.items():
+            if member.is_alias and not name.startswith("_"):
+                try:
+                    yield f"{path}.{name}".removeprefix("."), member.final_target
+                except griffe.AliasResolutionError:
+                    continue
 
 
 def _parameter(attribute: griffe.Attribute) -> str:
