@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 # In the order in which they run.
 NAMES = (
-    "experiments", "honesty", "precision", "sizes", "size", "jacobians", "gradients", "grid", "steps",
-    "solvers", "cores", "compile",
+    "experiments", "honesty", "precision", "sizes", "size", "jacobians", "gradients", "grid",
+    "steps", "solvers", "cores", "compile",
 )  # fmt: skip
 
 
