@@ -121,7 +121,7 @@ def _predicate(s: Structure, g: int, u) -> Callable:
     """1 where transition g may happen, else 0, as a function whose derivatives are zero."""
 
     def holds(t, q):
-        value = kernels.enabled(s, g, t, q, u) * 1.0
+        value = kernels.enabled(s, s.member(g), t, q, u) * 1.0
         return np.concatenate([value[None], np.zeros((1 + len(q), len(t)))])[None]
 
     return holds

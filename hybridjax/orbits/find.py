@@ -25,7 +25,7 @@ from .coincidence import check_begin, coincident, commutes, events_of
 from .conserved import check_conserved
 from .cycle import LimitCycle
 from .explain import explain
-from .guess import begin, check_section, guessed_lane
+from .guess import begin, check_section, guessed_lane, own_guess
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
 from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
@@ -75,7 +75,8 @@ def find_limit_cycle(
         the best guess: a clocked system begins at the same phase of its own clock. It goes without
         `settle` and `max_period`.
     - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
-        "falling")` or `AtEvent("heelstrike")`. By default the plane through the guess across the
+        "falling")` or `AtEvent("heelstrike")`. By default right after the event that the guess
+        names (`Guess(..., after="heelstrike")`), or else on the plane through the guess across the
         flow. Newton starts at the guess if it lies on the section, else where the flow from the
         guess first meets it.
     - `multiplicity`: periods of the clock, or returns to the section, until the cycle closes: 2
@@ -142,6 +143,7 @@ def find_limit_cycle(
         )
     else:
         multiplicity = 1 if multiplicity is None else multiplicity
+        guess = own_guess(system) if guess is None else guess
         lane, period = guessed_lane(system, guess), system.period()
         near = sizes_near(
             system, int(np.asarray(lane.chart)[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
@@ -154,8 +156,9 @@ def find_limit_cycle(
         if max_period is None:
             max_period = _PATIENCE * max(near.time, slow_time(s, times[0], near.points))
         anchor, base, expected = begin(
-            system, lane, section, multiplicity, settle, max_period, settings, near.time
-        )
+            system, lane, guess.after, section, multiplicity, settle, max_period, settings,
+            near.time,
+        )  # fmt: skip
         map = ReturnMap(system, settings, anchor, base, expected, {}, multiplicity)
     conserved = {k: real(v) for k, v in (conserved or {}).items()}
     map = dataclasses.replace(map, conserved=conserved)

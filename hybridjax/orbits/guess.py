@@ -54,23 +54,38 @@ class Beginning(NamedTuple):
     """The period to be expected."""
 
 
-def guessed_lane(system: HybridSystem, guess: Guess | None) -> Lanes:
-    """The lane at a guess, by default the model's own.
+def own_guess(system: HybridSystem) -> Guess:
+    """The guess that a model knows.
 
-    **Raises:** `DefinitionError` if there is none, or it does not fit the system.
+    **Raises:** `DefinitionError` if it knows none.
     """
-    s = Structure(system)
-    guess = system.guess() if guess is None else guess
+    guess = system.guess()
     if guess is None:
         raise DefinitionError(
             f"{type(system).__name__} has no guess of its own: pass `guess=Guess(chart, state)`."
         )
+    return guess
+
+
+def guessed_lane(system: HybridSystem, guess: Guess) -> Lanes:
+    """The lane at a guess.
+
+    **Raises:** `DefinitionError` if it does not fit the system.
+    """
+    s = Structure(system)
     a = s.chart_index(guess.chart)
     if guess.state.shape != (s.dims[a],):
         raise DefinitionError(
             f"the guess must give values for the {s.dims[a]} states "
             f"{', '.join(s.charts[a].states)} of chart '{guess.chart}'; got {guess.state}."
         )
+    if guess.after is not None:
+        event = s.transitions[s.transition_index(guess.after)]
+        if event.target != guess.chart:
+            raise DefinitionError(
+                f"the guess is in chart '{guess.chart}', but the event '{event.name}', after which "
+                f"it is said to be, leads to chart '{event.target}'."
+            )
     q = np.zeros((s.d, 1))
     q[: s.dims[a], 0] = guess.state
     return from_host(start_lanes(s, np.array([guess.time]), np.array([a], np.int32), q))
@@ -92,6 +107,7 @@ def check_section(s: Structure, section: Crossing | AtEvent | None) -> None:
 def begin(
     system: HybridSystem,
     lanes: Lanes,
+    after: str | None,
     section: Crossing | AtEvent | None,
     multiplicity: int,
     settle: float,
@@ -99,8 +115,9 @@ def begin(
     settings: Settings,
     time: float,
 ) -> Beginning:
-    """From a guess to a state on the section, and the period to be expected. `time` is that in
-    which the states change by their sizes at the guess.
+    """From a guess to a state on the section, and the period to be expected. `after` is the event
+    that led to the guess, if one did; `time` is that in which the states change by their sizes
+    there.
 
     **Raises:** `ComputationError` where the flow does not lead there, or nothing moves.
     """
@@ -127,6 +144,8 @@ def begin(
             "moves: start elsewhere."
         )
     on_section = rate < 0 and abs(level) <= -_ON_SECTION * time * rate
+    if section is None and after is not None:
+        section, on_section = AtEvent(after), not settle
     by_default = section is None
     if section is None:
         sizes = np.asarray(settings.scale)[a, : s.dims[a]]

@@ -149,7 +149,8 @@ class Quotient(HybridSystem):
         guess = self.system.guess()
         if guess is None or guess.chart not in self.charts():
             return None
-        return Guess(guess.chart, self.charts()[guess.chart].less(guess.state), guess.time)
+        state = self.charts()[guess.chart].less(guess.state)
+        return Guess(guess.chart, state, guess.time, after=guess.after)
 
     def check(self) -> None:
         """Raise for a function that has not the symmetry."""

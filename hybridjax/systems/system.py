@@ -58,14 +58,19 @@ def _number(x: Scalar) -> Array:
 
 @checked
 class Guess(eqx.Module):
-    """Where the search for a limit cycle starts: a chart's name, a state there, and a time."""
+    """Where the search for a limit cycle starts: a chart's name, a state there, and a time.
+
+    `after` names an event that has just led there: in an autonomous system, the search then takes
+    the return map right after that event, if no other section is asked for.
+    """
 
     chart: str = eqx.field(static=True)
     state: Float[Array, " n"]
     time: Float[Array, ""]
+    after: str | None = eqx.field(static=True, default=None)
 
-    def __init__(self, chart: str, state: Vector, time: Scalar = 0.0):
-        self.chart, self.state, self.time = chart, real(state), real(time)
+    def __init__(self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None):
+        self.chart, self.state, self.time, self.after = chart, real(state), real(time), after
 
     def __repr__(self):
         return fields(self)

@@ -96,8 +96,9 @@ def systems(t):
     def flow(time, q, u):
         return q[0]
 
-    yield "Guess", hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0), {
+    yield "Guess", hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0, after="hit"), {
         "chart": NEW_NAME, "state": array([1.0, 0.0], free=True), "time": FINITE,
+        "after": optional(NEW_NAME),
     }  # fmt: skip
     yield "Output", hj.Output, dict(name="z", function=flow), {
         "name": NEW_NAME, "function": [*CALLABLE, {3: flow}, {"flow": 3}],

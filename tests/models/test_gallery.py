@@ -241,9 +241,7 @@ def test_energy_is_conserved_in_running():
 # What `find_limit_cycle` says of the models that have no cycle that it could find by itself.
 SAYS_WHAT_TO_GIVE = {
     "BouncingBall": "pass `guess=Guess",
-    "FiveLinkBiped": "section=AtEvent('touchdown')",
     "SLIPRunner": "conserved={'energy': 17",
-    "TorsoWalker": "section=AtEvent('touchdown')",
 }
 
 
@@ -273,3 +271,16 @@ def test_where_no_section_is_met_again_one_is_asked_for():
         hj.find_limit_cycle(wheel, after_impact)
     cycle = hj.find_limit_cycle(wheel, after_impact, section=hj.AtEvent("impact"))
     np.testing.assert_allclose(cycle.multipliers, [wheel.exact()[1]], rtol=1e-9)
+    # A guess that says so is enough, and is where Newton's method starts.
+    said = hj.Guess("swing", after_impact.state, after="impact")
+    again = hj.find_limit_cycle(wheel, said)
+    assert again.base.name == "impact" and float(again.anchor.t[0]) == 0
+    np.testing.assert_allclose(again.multipliers, cycle.multipliers, rtol=1e-9)
+
+
+def test_a_guess_after_an_event_that_leads_elsewhere():
+    guess = hj.Guess("stance", (0.9, 5.0, 0.0, 0.0), after="liftoff")
+    with pytest.raises(hj.DefinitionError, match="there is no event 'impact'; events are"):
+        hj.find_limit_cycle(m.TorsoWalker(), hj.Guess("step", 6 * (0.1,), after="impact"))
+    with pytest.raises(hj.DefinitionError, match="'liftoff', after which it is said to be, leads"):
+        hj.find_limit_cycle(m.SLIPRunner(), guess)

@@ -136,4 +136,5 @@ class FiveLinkBiped(HybridSystem):
                 *(-s + k, -s - k, self.lean, s - k, s + k),
                 *(rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)),
             ),
+            after="touchdown",
         )

@@ -148,4 +148,5 @@ class TorsoWalker(HybridSystem):
         return q[3:] + tips(self.r * np.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
 
     def guess(self):
-        return Guess("step", (-self.stride, self.stride, self.lean, 1.5, -1.5, 0.0))
+        start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
+        return Guess("step", start, after="touchdown")

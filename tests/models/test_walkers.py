@@ -1,0 +1,66 @@
+"""Linearizations of the walkers with feedback, and their HTFs from experiments.
+
+The truth is `benchmarks/walkers_truth.py`: differences of another simulation, equations by hand.
+"""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..conftest import DATA
+
+
+# Walkers, the angles that make up that of the stance leg, its levels, and an amplitude of torque.
+WALKERS = {
+    "TorsoWalker": ([1.0, 0, 0], (-0.2, 0.0, 0.2), 1e-2),
+    "FiveLinkBiped": ([0.5, 0.5, 0, 0, 0], (-0.1, 0.0, 0.1), 1e-2),
+}
+
+
+def placed(name):
+    leg, levels, _ = WALKERS[name]
+    angle = lambda t, q: np.array(leg) @ q[: len(leg)]  # noqa: E731
+    levels = [hj.Crossing(angle, "rising", level) for level in levels]
+    cycle = hj.find_limit_cycle(getattr(hj.models, name)())
+    return hj.place_sections(cycle, [hj.AtEvent("touchdown"), *levels])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WALKERS)
+def test_A_and_B(name):
+    truth, sections = np.load(DATA / "walkers.npz"), placed(name)
+    model = hj.linearize(sections.cycle, sections, sections.cycle.system.charts()["step"].states[0])
+    state, by_state, by_input = (
+        truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input")
+    )
+    np.testing.assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
+    leg, d = np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0]))), len(state)
+    for n in range(4):
+        # A move in one coordinate takes the one that is left out along the section.
+        out, dropped = int(sections.drop[n]) - 1, int(sections.drop[(n + 1) % 4]) - 1
+        moves = np.eye(d) if out < 0 else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
+        rows, columns = (np.flatnonzero(np.arange(d) != k) for k in (dropped, out))
+        A, B = (by_state[n] @ moves)[np.ix_(rows, columns)], by_input[n][rows]
+        ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
+        np.testing.assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
+        np.testing.assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WALKERS)
+def test_HTFs_of_80_experiments(name):
+    sections = placed(name)
+    output = sections.cycle.system.charts()["step"].states[0]
+    amplitude = WALKERS[name][2]
+    design = hj.multisine(
+        4, 16, band=(0, 2), amplitude=amplitude, lines="odd", experiments=16, division="random"
+    )
+    data = hj.run_experiments(
+        sections.cycle, sections, design, output, start="periodic", discard=32
+    )
+    assert data.ok.all()
+    estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
+    exact = hj.linearize(sections.cycle, sections, output).htf(estimate.f, harmonics=(-1, 0, 1))
+    print(name, estimate.error(exact))
+    assert estimate.error(exact)[0] < 1e-5
