@@ -109,8 +109,10 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
 
 
 def commutes(cycle: LimitCycle) -> bool:
-    """Whether all events that coincide on a cycle may come in either order."""
-    return all(group.commute for group in coincidences(cycle))
+    """Whether all events that coincide on a cycle, of which there are some, may come in either
+    order."""
+    groups = coincidences(cycle)
+    return bool(groups) and all(group.commute for group in groups)
 
 
 def events_of(turn: Turn) -> list[tuple[int, float]]:

@@ -68,8 +68,8 @@ two = hj.Execution(workers=2, batch=250)
 cycle = hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.5, 0.1), 0.5))
 kicks = eqx.filter_vmap(lambda k: Kicked(kick=k))(jnp.linspace(0.5, 1.5, 500))
 print(hj.find_limit_cycles(kicks, cycle, execution=two).summary())
-u = 1e-3 * np.random.default_rng(0).normal(size=(500, 12))
-print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), execution=two).summary())
+u = 1e-3 * np.random.default_rng(0).normal(size=(500, 12, 1))
+print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), discard=0, execution=two).summary())
 """
 
 

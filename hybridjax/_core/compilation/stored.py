@@ -25,6 +25,7 @@ from . import compilation_cache, kept, thorough
 from .compile import compiler_options, kind, quick_jit
 from .fingerprint import IndescribableError, digest, surroundings
 from .garbage_collector import uncollected
+from .lapack import in_turn, is_left_to_lapack
 from .portable import Executable, Portable, build, trace
 
 
@@ -83,7 +84,11 @@ class Stored:
         program = _plain_program(self._function, self.large)
         with kept.one_by_one, uncollected:  # two threads would both compile it
             program.lower(*arguments).compile()
-        return program(*arguments)
+        if is_traced(arguments) or is_inside_program():
+            return program(*arguments)
+        with in_turn(alone := is_left_to_lapack(program, *arguments)):
+            results = program(*arguments)
+            return jax.block_until_ready(results) if alone else results
 
 
 @ft.cache
