@@ -81,11 +81,15 @@ def numbers(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | 
 
 
 def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path):
-    """The cycle (of one that is rest: its multipliers), and |H_m| beside it."""
+    """The cycle (of one that is rest: its multipliers), and |H_m| beside it; of a walker, a turn
+    before."""
     with hj.plot.style():
-        figure, (left, right) = pyplot.subplots(
-            1, 2, figsize=(hj.plot.PAGE, 2.7), layout="constrained", width_ratios=(1, 1.5)
+        widths = (1.2,) * bool(case.sticks) + (1, 1.5)
+        figure, (*before, left, right) = pyplot.subplots(
+            1, len(widths), figsize=(hj.plot.PAGE, 2.7), layout="constrained", width_ratios=widths
         )
+        for ax in before:
+            sticks(case, cycle, ax)
         if case.plane is None:
             hj.plot.multipliers(cycle, ax=left, zoom=False)
         else:
@@ -101,6 +105,21 @@ def draw(case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | Non
         )  # fmt: skip
         figure.suptitle(f"{case.title}: {case.push} to {case.output}", fontsize=8)
         save(path, figure)
+
+
+def sticks(case: Case, cycle: hj.LimitCycle, ax) -> None:
+    """One turn of a walker, lighter where it is earlier."""
+    links = len(case.sticks[0][0])
+    names = cycle.system.charts()["step"].states[:links]
+    _, *angles = cycle.trajectory()(*names)
+    angles = np.stack(angles)
+    for k in np.linspace(0, angles.shape[1] - 1, 7).astype(int):
+        way = np.stack([np.sin(angles[:, k]), np.cos(angles[:, k])])
+        for line, color in zip(case.sticks, ("C0", "C1", "0.3"), strict=True):
+            x, y = way @ np.array(line, float).T
+            ax.plot(x, y, color=color, alpha=0.25 + 0.75 * k / (angles.shape[1] - 1), lw=1)
+    ax.axhline(0, color="0.7", lw=0.5, zorder=0)
+    ax.set(aspect="equal", xlabel="m", ylabel="m")
 
 
 def branches(path: Path) -> None:

@@ -23,7 +23,9 @@ class Case(NamedTuple):
     `sections` are for linearization and experiments, `output` and `input` name what is measured and
     pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An experiment
     begins in the predicted periodic response, or where there is none, on the cycle (`start`); where
-    the amplitude is zero there are no experiments.
+    the amplitude is zero there are no experiments. A walker is drawn as `sticks`: lines from joint to
+    joint, by the lengths that each has along each link, whose angles from the vertical are the first
+    states.
     """
 
     title: str
@@ -41,6 +43,7 @@ class Case(NamedTuple):
     conserved: dict[str, float] | None = None
     start: str = "periodic"
     max_period: float | None = None
+    sticks: tuple[list[list[float]], ...] = ()
 
 
 def _pair(z: complex) -> list[complex]:
@@ -53,6 +56,14 @@ def _levels(event: str, state: str, direction: str, first: float, last: float) -
     return [hj.AtEvent(event), *(hj.Crossing(state, direction, value) for value in levels)]
 
 
+# Stance leg, swing leg and torso, from the stance foot on.
+_HIP, _KNEES = [1, 0, 0], [0.4, 0.4, 0, 0, 0]
+_TORSO_WALKER = ([[0, 0, 0], _HIP], [_HIP, [1, -1, 0]], [_HIP, [1, 0, 0.5]])
+_BIPED = (
+    [[0, 0, 0, 0, 0], [0.4, 0, 0, 0, 0], _KNEES],
+    [_KNEES, [0.4, 0.4, 0, -0.4, 0], [0.4, 0.4, 0, -0.4, -0.4]],
+    [_KNEES, [0.4, 0.4, 0.24, 0, 0]],
+)
 _APEX = hj.Crossing("vM", "falling")
 _MPMATH = "mpmath"
 _CLOSED = "closed form"
@@ -117,6 +128,20 @@ CASES: dict[str, Callable[[], Case]] = {
         "vs", "hip torque", 1e-3,
         [*_pair(-0.199726126830030 + 0.544476062094737j), 0.131572624077177], _MPMATH,
         ("s", "vs"), section=hj.AtEvent("heelstrike"),
+    ),
+    "torso walker": lambda: Case(
+        "three-link walker with torso", m.TorsoWalker(),
+        _levels("touchdown", "th1", "rising", -0.3, 0.3), "w1", "hip torque", 1e-2,
+        [0.558921496182006, 2.129597704e-06, 5.85308700e-07, 4.9e-09, 0.0], "scipy",
+        ("th1", "w1"), sticks=_TORSO_WALKER,
+    ),
+    "biped": lambda: Case(
+        "five-link biped", m.FiveLinkBiped(), _levels("touchdown", "leg", "rising", -0.15, 0.15),
+        "leg", "hip torque", 1e-2,
+        [0.9365565991540, 0.2106146374910, 0.01714336047405,
+         *_pair(0.005638528689762 + 0.004702903938051j), 0.004783922552855, 0.001857583000819,
+         0.001466407402454, 4.28e-07],
+        "scipy", ("shin", "swing_shin"), sticks=_BIPED,
     ),
     "SLIP": lambda: Case(
         "SLIP runner at 1784.8 J", m.SLIPRunner(),

@@ -78,14 +78,15 @@ class Mechanism(eqx.Module):
 
     def mass(self, q: Float[Array, " n"]) -> Float[Array, "n n"]:
         """The mass matrix M(q)."""
-        momentum = lambda v: jax.grad(self.kinetic, 1)(q, v)  # noqa: E731
-        return jax.jacfwd(momentum)(jnp.zeros_like(q))
+        # T is quadratic in v: the momentum at a velocity of 1 in one coordinate is a column.
+        return jax.vmap(lambda v: jax.grad(self.kinetic, 1)(q, v))(jnp.eye(len(q), dtype=q.dtype))
 
     def bias(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         """h(q, v) = C(q, v) v + G(q): the forces that keep the velocities as they are."""
-        momentum = lambda q: jax.grad(self.kinetic, 1)(q, v)  # noqa: E731
-        lagrangian = lambda q: jnp.asarray(self.kinetic(q, v) - self.potential(q))  # noqa: E731
-        return jax.jvp(momentum, (q,), (v,))[1] - jax.grad(lagrangian)(q)
+        lagrangian = lambda q, v: jnp.asarray(self.kinetic(q, v) - self.potential(q))  # noqa: E731
+        slopes = lambda q: jax.grad(lagrangian, (0, 1))(q, v)  # noqa: E731
+        (force, _), (_, change) = jax.jvp(slopes, (q,), (v,))
+        return change - force
 
     def acceleration(
         self, q: Float[Array, " n"], v: Float[Array, " n"], force: ArrayLike = 0.0
@@ -107,8 +108,9 @@ class Mechanism(eqx.Module):
         const. and J v = 0: what they miss stays (c) or grows slowly (by J v) with rounding.
         """
         mass, (jacobian, drift) = self.mass(q), _moving(contact, q, v)
-        free = solve_positive(mass, force - self.bias(q, v))
-        by_force = _solve_columns(mass, jacobian.T)
+        pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
+        solved = solve_positive(mass, pushes)
+        free, by_force = solved[0], solved[1:].T
         found = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
         return Constrained(free + by_force @ found, found)
 
@@ -131,7 +133,7 @@ class Mechanism(eqx.Module):
         as an array (k,); `restitution`, e: 0 for a contact that sticks; a number, or k of them.
         """
         jacobian = jax.jacfwd(lambda q: as_vector(contact(q)))(q)
-        by_impulse = _solve_columns(self.mass(q), jacobian.T)
+        by_impulse = solve_positive(self.mass(q), jacobian).T
         impulse = solve_positive(jacobian @ by_impulse, -(1 + restitution) * (jacobian @ v))
         return Impact(v + by_impulse @ impulse, impulse)
 
@@ -153,7 +155,3 @@ def _moving(contact, q, v):
     place = lambda q: as_vector(contact(q))  # noqa: E731
     speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
     return jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
-
-
-def _solve_columns(matrix, columns):
-    return jnp.stack([solve_positive(matrix, x) for x in columns.T], axis=1)

@@ -25,10 +25,10 @@ LARGEST, LARGEST_PIVOTED = 12, 7
 
 @jax.jit
 def solve_positive(
-    matrix: Float[Array, "*b n n"], right: Float[Array, "*b n"]
+    matrix: Float[Array, "n n"], right: Float[Array, "*b n"]
 ) -> Float[Array, "*b n"]:
     """x in `matrix @ x = right` for a symmetric positive definite matrix, of which the lower
-    triangle is read, by L D L^T.
+    triangle is read, by L D L^T, which is found once for all right sides.
 
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """

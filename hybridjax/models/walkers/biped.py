@@ -58,7 +58,15 @@ class FiveLinkBiped(HybridSystem):
     left, the rotation about the foot, is driven by the torso's lean. Input `u` is a further torque
     between torso and swing thigh. A step ends when the swing foot comes down in front: it sticks,
     the other foot lifts off, and the legs change their names. (That the ground only pushes, and
-    that no foot slips, is not checked. Inertias of the motors are left out.)
+    that no foot slips, is not checked.)
+
+    Where the numbers are from: masses, lengths, centers of mass and inertias are those that public
+    simulation programs give for RABBIT, among them one derived from E. R. Westervelt's and J. W.
+    Grizzle's of 2003; the two publications themselves could not be compared. Inertias are taken
+    about the joints, as in these authors' program of 2001 (which has an earlier set: 20, 6.8 and
+    3.2 kg; 2.22, 1.08 and 0.93 kg m^2); programs of others take the same numbers about the centers
+    of mass. RABBIT's motors, of 3.32e-4 kg m^2 behind gears of 50, and its friction are left out.
+    The virtual constraints, `lean`, `stride`, `knee`, `lift` and `stiffness` are none of theirs.
     """
 
     input_units = ("N m",)
