@@ -131,28 +131,35 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(seeds=400, strides=300, noise=1e-4, chunk=50, n_sections=16, first=20000):
+def coverage(seeds=400, strides=300, noise=1e-4, n_sections=16, first=20000):
     print(
         f"\nCoverage of 95 % regions: {seeds} seeds, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
     )
-    tallies = {name: ([], [], []) for name in PHASES}
-    for done in range(0, seeds, chunk):
-        recordings, true = hopper(strides, range(first + done, first + done + chunk))
-        for seed, recording in enumerate(recordings, first + done):
-            dirty = noisy(recording, noise, seed)
-            for name, (hits, found, said) in tallies.items():
-                fit = hj.fit_series(at_sections(dirty, name, n_sections).records, 2, check=False)
-                hits.append(bool(fit.contains(true[:1])[0]))
-                found.append(distance(fit.multipliers, true))
-                said.append(fit.standard_errors[0])
-        for name, (hits, found, said) in tallies.items():
-            p = stats.binomtest(sum(hits), len(hits), 0.95).pvalue
-            print(
-                f"{name}: {sum(hits)} of {len(hits)} ({100 * np.mean(hits):.1f} %), p = {p:.2g}; "
-                f"rms error {rms(found):.1e}, said {rms(said):.1e}",
-                flush=True,
-            )
+
+    def draw(rng):
+        seed = int(rng.integers(2**31))
+        (recording,), true = hopper(strides, [seed])
+        dirty = noisy(recording, noise, seed)
+        fits = [
+            hj.fit_series(at_sections(dirty, name, n_sections).records, 2, check=False)
+            for name in PHASES
+        ]
+        return {
+            "hit": [bool(fit.contains(true[:1])[0]) for fit in fits],
+            "error": [distance(fit.multipliers, true) for fit in fits],
+            "said": [fit.standard_errors[0] for fit in fits],
+        }
+
+    found = hj.monte_carlo(draw, seeds, seed=first)
+    for k, name in enumerate(PHASES):
+        hits, each = found.hit.values[:, k], (found.error.values[:, k], found.said.values[:, k])
+        p = stats.binomtest(int(hits.sum()), seeds, 0.95).pvalue
+        print(
+            f"{name}: {int(hits.sum())} of {seeds} ({100 * hits.mean():.1f} %), p = {p:.2g}; "
+            f"rms error {rms(each[0]):.1e}, said {rms(each[1]):.1e}",
+            flush=True,
+        )
 
 
 def dirt(seeds=5, strides=500, noise=1e-4):
