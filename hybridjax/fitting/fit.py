@@ -112,7 +112,7 @@ def _until_good(job: Guesses) -> Tried:
     for k in counted(range(S), "guesses", S):
         found.append(job.run(k, None))
         one = Tried(**found[-1])
-        goal = _goal(job.problem, int(one.count[0]), p)
+        goal = _goal(job.problem, int(one.residuals[0]), p)
         if one.result[0] == Result.OK and one.cost[0] <= goal:
             break
     return Tried(*(np.concatenate([one[name] for one in found]) for name in Tried._fields))

@@ -30,7 +30,7 @@ class Tried(NamedTuple):
     """Coordinates to which they led."""
     cost: Float[np.ndarray, " S"]
     """There; infinite where there is no limit cycle, or nothing to be observed on it."""
-    count: Int[np.ndarray, " S"]
+    residuals: Int[np.ndarray, " S"]
     """How many residuals there are."""
     steps: Int[np.ndarray, " S"]
     result: Int[np.ndarray, " S"]
@@ -62,8 +62,8 @@ class Guesses:
             if np.isfinite(r).all():  # (else there is a cycle, but not what was observed on it)
                 x, cost = np.asarray(end.x), float(r @ r)
                 result = int(Result.OK) if end.converged else result
-        found = Tried(x, cost, count, steps, result)
-        return {name: np.asarray(value)[None] for name, value in found._asdict().items()}
+        found = zip(Tried._fields, (x, cost, count, steps, result), strict=True)
+        return {name: np.asarray(value)[None] for name, value in found}
 
     def cycle(self, x: Float[np.ndarray, " p"], near: LimitCycle) -> LimitCycle:
         """That of the system with the parameters at x, found or not."""
@@ -81,7 +81,7 @@ class Guesses:
             variables = {
                 "fitted": Variable("<f8", ("parameter",), (p,)),
                 "cost": Variable("<f8"),
-                **dict.fromkeys(("count", "steps", "result"), Variable("<i8")),
+                **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
             }
             constants = {"parameter": Constant(("parameter",), names)}
             blocks = Blocks((S,), (1,))
