@@ -127,25 +127,24 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     f = design.frequencies
     chosen = [f[np.argmin(np.abs(f - x))] for x in np.geomspace(0.06, 9.9, 10)]
 
-    def chunk(count, seed):
+    def run(count, seed):
         return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
-    truth = hj.estimate_htf((chunk(100, seed + 10**5 + k) for k in range(20)), (-1, 0, 1))
+    truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1))
     truth = np.asarray(truth.at(chosen).H)
-    hits, variances, part = np.zeros(truth.shape), [], 25
-    for first in range(0, runs, part):
-        data = chunk(each * part, seed + first)
-        size = each * design.experiments
-        for k in range(part):
-            rows = slice(k * size, (k + 1) * size)
-            one = hj.ExperimentData(
-                data.u[rows], data.y[rows], n_sections=N, periods=32, outputs=OUTPUTS
-            )
-            noisy = hj.experiments.add_noise(one, snr=20, seed=seed + first + k)
-            estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
-            error = np.abs(np.asarray(estimate.H) - truth)
-            hits += error <= np.asarray(estimate.confidence_radius())
-            variances.append(np.stack([estimate.variance, estimate.noise_variance]))
+
+    def draw(rng):
+        phases, noise = rng.integers(2**31, size=2).tolist()
+        noisy = hj.experiments.add_noise(run(each, phases), snr=20, seed=noise)
+        estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
+        error = np.abs(np.asarray(estimate.H) - truth)
+        return {
+            "hit": error <= np.asarray(estimate.confidence_radius()),
+            "variance": np.stack([estimate.variance, estimate.noise_variance]),
+        }
+
+    found = hj.monte_carlo(draw, runs, seed)
+    hits = found.hit.sum("draw").values
     exact = np.asarray(family.model.htf(chosen, (-1, 0, 1)).H)
     name = f"coverage.{rms}.{each}_realizations"
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
@@ -156,7 +155,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
     print(f"# least: H_{m - 1} of {OUTPUTS[k]} at f = {chosen[i]}", flush=True)
     family.show(f"{name}.most", hits.max() / runs)
     family.show(f"{name}.p", min(tests.min() * tests.size, 1.0))
-    total, noise = np.mean(variances, axis=0)
+    total, noise = found.variance.mean("draw").values
     family.show(f"{name}.distortion.mean", np.mean(1 - noise / total))
     family.show(f"{name}.distortion.most", np.max(1 - noise / total))
     family.show(f"{name}.distortion.least_covered", (1 - noise / total)[worst])
@@ -167,7 +166,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=1000, help="for coverage, a multiple of 25")
+    parser.add_argument("--runs", type=int, default=1000, help="for coverage")
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()

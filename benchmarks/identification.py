@@ -130,30 +130,35 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
     design = hj.multisine(periods=32, seed=1).scaled(rms)
     chosen = (-1, 0, 1)
 
-    def chunk(count, seed):
+    def run(count, seed):
         return family.run(design.realizations(count, seed), start="periodic", discard=32)
 
-    mean = hj.estimate_htf((chunk(100, 10**6 + k) for k in range(20)), chosen)
-    fits, variances, each, part = [], [], 4, 25
-    for first in range(0, runs, part):
-        data = chunk(each * part, first)
-        size = each * design.experiments
-        for k in range(part):
-            rows = slice(k * size, (k + 1) * size)
-            one = hj.ExperimentData(
-                data.u[rows], data.y[rows], n_sections=N, periods=32, outputs=OUTPUTS
-            )
-            noisy = hj.experiments.add_noise(one, snr=20, seed=first + k)
-            estimate = hj.estimate_htf(noisy, chosen, repeats=2)
-            fits.append(hj.fit_multipliers(estimate, 2))
-            variances.append(estimate.variance)
+    mean = hj.estimate_htf((run(100, 10**6 + k) for k in range(20)), chosen)
+
+    def draw(rng):
+        phases, noise = rng.integers(2**31, size=2).tolist()
+        noisy = hj.experiments.add_noise(run(4, phases), snr=20, seed=noise)
+        estimate = hj.estimate_htf(noisy, chosen, repeats=2)
+        freedom = estimate.variance_freedom
+        return {"H": estimate.H, "variance": estimate.variance, "freedom": freedom}
+
+    def fitted(H, variance, freedom):
+        htf = hj.HTF(
+            mean.f, H, chosen, N, mean.inputs, mean.outputs,
+            variance=variance, variance_freedom=freedom,
+        )  # fmt: skip
+        return hj.fit_multipliers(htf, 2)
+
+    found = hj.monte_carlo(draw, runs)
+    freedom = float(found.freedom[0])
+    fits = [
+        fitted(H, variance, freedom)
+        for H, variance in zip(found.H.values, found.variance.values, strict=True)
+    ]
     # Where distortion matters the HTFs are not of the structure exactly, and the fit to them
     # depends on the weights: the truth has those of the runs.
-    weighted = hj.HTF(
-        mean.f, mean.H, chosen, N, mean.inputs, mean.outputs,
-        variance=np.mean(variances, axis=0), variance_freedom=estimate.variance_freedom,
-    )  # fmt: skip
-    truth = hj.fit_multipliers(weighted, 2).multipliers[:1]
+    weighted = fitted(mean.H, found.variance.mean("draw").values, freedom)
+    truth = weighted.multipliers[:1]
     hits = sum(int(fit.contains(truth).all()) for fit in fits)
     errors = np.array([family.error(fit, truth) for fit in fits])
     family.show(f"coverage.{rms}.multiplier", hits / runs)
@@ -167,7 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--series", type=int, default=50)
-    parser.add_argument("--runs", type=int, default=1000, help="for coverage, a multiple of 25")
+    parser.add_argument("--runs", type=int, default=1000, help="for coverage")
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()

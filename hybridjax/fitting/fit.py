@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Positive, Seed, StepCount
+from .._core.boundary.kinds import Count, Path, Positive, Seed, StepCount
+from .._core.pieces.run import DaskClient
 from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
@@ -17,10 +17,11 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
+from .guesses import Guesses, Tried
 from .model_fit import ModelFit, ParameterGuesses
 from .observations import AbstractObservation
 from .parameters import Free, Parameters, free_parameters
-from .problem import MAX_STEPS, FitProblem, evaluate, levenberg_marquardt
+from .problem import MAX_STEPS, FitProblem, evaluate
 from .sensitivity import Identifiability, diagnose
 
 
@@ -44,6 +45,8 @@ def fit_model(
     spread: Positive = 0.2,
     seed: Seed = 0,
     max_steps: StepCount = MAX_STEPS,
+    store: Path | None = None,
+    client: DaskClient | None = None,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
 
@@ -72,33 +75,47 @@ def fit_model(
     - `spread`: the other guesses have coordinates uniformly drawn within this distance: 0.2 means
         factors between exp(-0.2) and exp(0.2). `seed` of the draw.
     - `max_steps`: evaluations of the model from each guess.
+    - `store`, `client`: as of `sweep`; a guess is a piece. With one of them all guesses are tried.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: nothing
     is raised where a fit does not converge.
 
     **Raises:** `DefinitionError` for parameters, bounds or data that do not fit the system;
-    `ComputationError` if no guess has a limit cycle on which the data can be observed.
+    `ComputationError` if no guess has a limit cycle on which the data can be observed; and as
+    `sweep` for a store or a client.
 
     The program is compiled at the first call for each class of systems and kind of data; other
     values of parameters and data use it again.
     """
     problem, near = _prepare(system, data, free, guess)
-    parameters, weighted = problem.parameters, problem.weighted
-    x0 = np.asarray(parameters.encode(parameters.read(system)))
+    p = problem.parameters
+    x0 = np.asarray(p.encode(p.read(system)))
     around = spread * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
-    tried, best = [], None
-    for x in counted([x0, *(x0 + around)], "guesses", guesses):
-        found = _from(problem, jnp.asarray(x), system, near, max_steps)
-        tried.append(found)
-        best = found if best is None or found.cost < best.cost else best
-        if best.result == Result.OK and best.cost <= _goal(len(best.residuals), len(x0), weighted):
-            break
-    if best.cost == np.inf:
+    job = Guesses(problem, _several(data), system, near, np.stack([x0, *(x0 + around)]), max_steps)
+    if store is None and client is None:
+        tried = _until_good(job)
+    else:
+        tried = job.all(store, client)
+    best = int(np.argmin(tried.cost))
+    if tried.cost[best] == np.inf:
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
-            f"({best.result.message}): give another system, or more `guesses`."
+            f"({Result(int(tried.result[best])).message}): give another system, or more `guesses`."
         )
-    return _summary(problem, tried, best)
+    return _summary(job, tried, best)
+
+
+def _until_good(job: Guesses) -> Tried:
+    """What becomes of the guesses up to the first that explains the data."""
+    found: list[dict[str, np.ndarray]] = []
+    S, p = job.x.shape
+    for k in counted(range(S), "guesses", S):
+        found.append(job.run(k, None))
+        one = Tried(**found[-1])
+        goal = _goal(job.problem, int(one.residuals[0]), p)
+        if one.result[0] == Result.OK and one.cost[0] <= goal:
+            break
+    return Tried(*(np.concatenate([one[name] for one in found]) for name in Tried._fields))
 
 
 @checked
@@ -135,12 +152,18 @@ def _prepare(
 ) -> tuple[FitProblem, LimitCycle]:
     """The problem, and a limit cycle near which to look for others."""
     parameters = free_parameters(system, free)
-    observations = (data,) if isinstance(data, AbstractObservation) else tuple(data)
+    observations = _several(data)
     if not observations:
         raise DefinitionError("`data` holds no observation, but one or more are needed.")
     near = guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
     near = _anchored(near)
     return FitProblem(parameters, tuple(one.prepare(near) for one in observations)), near
+
+
+def _several(
+    data: AbstractObservation | Sequence[AbstractObservation],
+) -> tuple[AbstractObservation, ...]:
+    return (data,) if isinstance(data, AbstractObservation) else tuple(data)
 
 
 def _anchored(cycle: LimitCycle) -> LimitCycle:
@@ -172,61 +195,34 @@ def _sizes(values):
     return jnp.where(values == 0, 1.0, jnp.abs(values))
 
 
-class _Found(eqx.Module):
-    """Where one guess led."""
-
-    guess: Float[Array, " p"]
-    x: Float[Array, " p"]
-    cost: float
-    steps: int
-    result: Result
-    cycle: LimitCycle
-    residuals: Float[np.ndarray, " r"]
-    jacobian: Float[np.ndarray, "r p"]
-
-
-def _from(problem: FitProblem, x, system: HybridSystem, near: LimitCycle, max_steps) -> _Found:
-    p = problem.parameters
-    cycle = find_limit_cycle(p.insert(system, p.decode(x)), near, throw=False)
-    nothing = np.zeros(0), np.zeros((0, len(x)))
-    if int(cycle.result) != Result.OK:
-        return _Found(x, x, np.inf, 0, Result(int(cycle.result)), cycle, *nothing)
-    end = levenberg_marquardt(problem, x, cycle, max_steps)
-    r, J, steps = np.asarray(end.residuals), np.asarray(end.jacobian), int(end.steps)
-    if not np.isfinite(r).all():  # there is a cycle, but not what was observed on it
-        return _Found(x, x, np.inf, steps, Result.NOT_CONVERGED, cycle, *nothing)
-    cycle = find_limit_cycle(p.insert(system, p.decode(end.x)), cycle, throw=False)
-    result = Result.OK if end.converged else Result.NOT_CONVERGED
-    return _Found(x, end.x, float(r @ r), steps, result, cycle, r, J)
-
-
-def _goal(count: int, parameters: int, weighted: bool) -> float:
-    """The cost of a fit that needs no other guess."""
-    if not weighted:
+def _goal(problem: FitProblem, count: int, parameters: int) -> float:
+    """The cost of a fit to so many numbers that needs no other guess."""
+    if not problem.weighted:
         return _PERFECT * count
     freedom = max(count - parameters, 1)
     return freedom + _LIKELY * np.sqrt(2 * freedom)
 
 
-def _summary(problem: FitProblem, tried: list[_Found], best: _Found) -> ModelFit:
-    parameters, weighted = problem.parameters, problem.weighted
-    decode = lambda x: np.asarray(parameters.decode(x))  # noqa: E731
+def _summary(job: Guesses, tried: Tried, best: int) -> ModelFit:
+    parameters, weighted = job.problem.parameters, job.problem.weighted
+    decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
     guesses = ParameterGuesses(
-        np.stack([decode(one.guess) for one in tried]),
-        np.stack([decode(one.x) for one in tried]),
-        np.array([one.cost for one in tried]),
-        np.array([one.steps for one in tried]),
-        np.array([int(one.result) for one in tried]),
-    )
-    values = decode(best.x)
+        decode(job.x[: len(tried.cost)]), decode(tried.fitted), tried.cost, tried.steps,
+        tried.result,
+    )  # fmt: skip
+    x = jnp.asarray(tried.fitted[best])
+    # (By way of the guess: the first cycle may be too far away.)
+    cycle = job.cycle(tried.fitted[best], job.cycle(job.x[best], job.near))
+    there = evaluate(job.problem, x, cycle)
+    residuals, values = np.asarray(there.residuals), decode(x)
     size = np.asarray(_sizes(values))
-    sensitivity = _relative(parameters, best.x, best.jacobian)
+    sensitivity = _relative(parameters, x, there.jacobian)
     seen = diagnose(parameters.names, sensitivity)
-    freedom = len(best.residuals) - seen.rank
-    unit = 1.0 if weighted else max(best.cost / max(freedom, 1), np.finfo(float).tiny)
+    freedom, cost = len(residuals) - seen.rank, float(tried.cost[best])
+    unit = 1.0 if weighted else max(cost / max(freedom, 1), np.finfo(float).tiny)
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     some = left[:, : seen.rank] / singular[: seen.rank] * size[:, None]
     return ModelFit(
-        best.cycle.system, best.cycle, parameters.names, values, unit * some @ some.T,
-        best.residuals, best.cost, freedom, seen, guesses, int(best.result), problem,
+        cycle.system, cycle, parameters.names, values, unit * some @ some.T,
+        residuals, cost, freedom, seen, guesses, int(tried.result[best]), job.problem,
     )  # fmt: skip

@@ -19,6 +19,7 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..orbits.rough import rough
 from ..systems.system import HybridSystem
+from .observations import AbstractObservation
 from .problem import FitProblem, levenberg_marquardt
 
 
@@ -29,16 +30,20 @@ class Tried(NamedTuple):
     """Coordinates to which they led."""
     cost: Float[np.ndarray, " S"]
     """There; infinite where there is no limit cycle, or nothing to be observed on it."""
+    residuals: Int[np.ndarray, " S"]
+    """How many residuals there are."""
     steps: Int[np.ndarray, " S"]
     result: Int[np.ndarray, " S"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Guesses:
-    """**Fields:** `problem`; `system`, whose parameters are replaced; `near`, a limit cycle to look
-    around; coordinates `x` of each guess; `max_steps` from each."""
+    """**Fields:** `problem`; `given`, its observations as they came; `system`, whose parameters are
+    replaced; `near`, a limit cycle to look around; coordinates `x` of each guess; `max_steps` from
+    each."""
 
     problem: FitProblem
+    given: tuple[AbstractObservation, ...]
     system: HybridSystem
     near: LimitCycle
     x: Float[np.ndarray, "S p"]
@@ -48,16 +53,17 @@ class Guesses:
         """The fit from guess k."""
         x = self.x[k]
         cycle = self.cycle(x, self.near)
-        cost, steps, result = np.inf, 0, int(cycle.result)
+        cost, count, steps, result = np.inf, 0, 0, int(cycle.result)
         if result == Result.OK:
             end = levenberg_marquardt(self.problem, jnp.asarray(x), cycle, self.max_steps)
             r, steps = np.asarray(end.residuals), int(end.steps)
+            count = len(r)
             result = int(Result.NOT_CONVERGED)
             if np.isfinite(r).all():  # (else there is a cycle, but not what was observed on it)
                 x, cost = np.asarray(end.x), float(r @ r)
                 result = int(Result.OK) if end.converged else result
-        found = Tried(x, np.array(cost), np.array(steps), np.array(result))
-        return {name: value[None] for name, value in found._asdict().items()}
+        found = zip(Tried._fields, (x, cost, count, steps, result), strict=True)
+        return {name: np.asarray(value)[None] for name, value in found}
 
     def cycle(self, x: Float[np.ndarray, " p"], near: LimitCycle) -> LimitCycle:
         """That of the system with the parameters at x, found or not."""
@@ -74,8 +80,9 @@ class Guesses:
             names = np.array(self.problem.parameters.names)
             variables = {
                 "fitted": Variable("<f8", ("parameter",), (p,)),
-                "cost": Variable("<f8"), "steps": Variable("<i8"), "result": Variable("<i8"),
-            }  # fmt: skip
+                "cost": Variable("<f8"),
+                **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
+            }
             constants = {"parameter": Constant(("parameter",), names)}
             blocks = Blocks((S,), (1,))
             layout = Layout(("guess",), blocks, variables, constants, ("parameter",), description)
@@ -104,7 +111,6 @@ class Guesses:
     def describe(self) -> dict[str, Any]:
         """What makes these fits what they are."""
         parameters = self.problem.parameters
-        given = [one.data for one in self.problem.observations]
         return {
             "kind": "guesses",
             "versions": versions(),
@@ -112,7 +118,12 @@ class Guesses:
             "guess": rough(self.near),
             "free": list(parameters.names),
             "bounds": [array_digest(parameters.low), array_digest(parameters.high)],
-            "data": [digest_of(*map(array_digest, jax.tree_util.tree_leaves(x))) for x in given],
+            "data": [_digest(x) for x in self.given],
             "guesses": array_digest(self.x),
             "max_steps": self.max_steps,
         }
+
+
+def _digest(data: AbstractObservation) -> str:
+    leaves = jax.tree_util.tree_leaves(eqx.filter(data, eqx.is_array))
+    return digest_of(type(data).__qualname__, *map(array_digest, leaves))

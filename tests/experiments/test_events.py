@@ -83,9 +83,7 @@ def test_experiments_record_their_events(hopper_cycle, placed_isochrons, tmp_pat
     without = hj.run_experiments(*arguments, discard=0)
     assert without.events is None
     np.testing.assert_allclose(without.y, data.y, rtol=0, atol=1e-13)
-    stored = hj.run_experiments(
-        *arguments, store=tmp_path, discard=0, record_events=True, chunk=2
-    )
+    stored = hj.run_experiments(*arguments, store=tmp_path, discard=0, record_events=True, chunk=2)
     for part, rows in zip(stored, (slice(0, 2), slice(2, 3)), strict=True):
         count = part.events.time.shape[1]
         np.testing.assert_allclose(part.events.time, events.time[rows, :count], atol=1e-11)

@@ -174,6 +174,7 @@ def fitting(t):
     shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
     yield "fit_model", hj.fit_model, both, shared | {
         "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT,
+        "store": PATH[1:], "client": ["tcp://here", 3, Other()],
     }  # fmt: skip
     yield "identifiability", hj.fitting.identifiability, both, shared
     yield "spectral_radius", hj.fitting.spectral_radius, dict(model=t.model), {

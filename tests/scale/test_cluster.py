@@ -4,6 +4,7 @@ import os
 import signal
 import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -14,6 +15,23 @@ distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
 DRAWS = 40
+
+
+class Plane(hj.Chart):
+    states = ("x", "v")
+
+    def field(self, t, q, u):
+        return q[1], u[0] + jnp.cos(2 * jnp.pi * t) - 20.0 * q[0] - 1.0 * q[1]
+
+
+class Driven(hj.HybridSystem):
+    """A damped oscillator, driven with period 1."""
+
+    def charts(self):
+        return {"all": Plane()}
+
+    def period(self):
+        return 1.0
 
 
 def walk(rng):
@@ -134,3 +152,26 @@ def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
     monkeypatch.setattr(hj, "__version__", "9.9")
     with pytest.raises(hj.DefinitionError, match="has hybridjax 0.1.0, and this process has 9.9"):
         hj.monte_carlo(walk, DRAWS, client=client)
+
+
+@pytest.fixture(scope="module")
+def experiments():
+    """A stable linear oscillator with a clock: compiled in a moment."""
+    cycle = hj.find_limit_cycle(Driven(), hj.Guess("all", (0.0, 0.0)))
+    return cycle, hj.ClockPhase(4), hj.multisine(experiments=6, periods=8, highest_harmonic=0), "x"
+
+
+def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
+    call = {"discard": 2, "chunk": 2}
+    stored = hj.run_experiments(*experiments, store=tmp_path / "a.zarr", client=client, **call)
+    alone = hj.run_experiments(*experiments, store=tmp_path / "b.zarr", **call)
+    assert len(stored) == 3 and stored.missing() == []
+    for mine, theirs in zip(alone, stored, strict=True):
+        np.testing.assert_array_equal(mine.y, theirs.y)
+    data = list(stored)
+    parts, whole = (hj.fit_series(x, 2, distortion=False, check=False) for x in (stored, data))
+    np.testing.assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
+    assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))
+    with pytest.raises(hj.DefinitionError, match="`data` are in memory"):
+        hj.fit_series(stored, 2, distortion=True)

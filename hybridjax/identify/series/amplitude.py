@@ -14,8 +14,8 @@ from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
-from .simulation import simulate_record
 from .checks.comparable import require_same_kind
+from .simulation import simulate_record
 
 
 class AmplitudeSweep(eqx.Module):

@@ -8,6 +8,7 @@ where g is free in the first cycles of each record: it stands for inputs and out
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,8 @@ from ..._core.cores import core_count
 from ..._core.threads import on_all_cores
 from ...errors import DefinitionError
 from ..multipliers.gauss_newton import Coefficients
-from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
+from .cycle_filters import lagged_inputs, start_responses
+from .cycle_grid import CycleGrid
 from .parts import Parts
 from .section_regression import RANK, SectionRegression
 
@@ -74,23 +76,15 @@ class OutputErrorProblem(NamedTuple):
         square, count, excited = np.zeros(ny), np.zeros(ny), np.zeros(nu, bool)
         cycles = 0
         for grid in data:
-            sampled, first = np.isfinite(grid.y), np.argmax(grid.inside, axis=1)
-            cycle = np.arange(grid.y.shape[1])
-            cycles = max(cycles, len(cycle))
+            sampled = np.isfinite(grid.y)
+            cycles = max(cycles, grid.y.shape[1])
             square += np.nansum(grid.y**2, axis=(0, 1, 2))
             count += sampled.sum(axis=(0, 1, 2))
             excited |= grid.u.any(axis=(0, 1, 2))
             for i in range(ny):
                 equal[:, i] &= (sampled == sampled[..., [i]]).all(axis=(0, 1))
-            if lags > cycles * N:
-                continue
-
-            def triangle(n: int):
-                tells = sampled[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
-                rows = lagged_inputs(grid.u, n, lags, data.lead)[tells]
-                return np.linalg.qr(np.concatenate([triangles[n], rows]), mode="r")
-
-            triangles = on_all_cores(triangle, range(N))
+            if lags <= cycles * N:
+                triangles = _with_rows(triangles, grid, lags, free)
         _require_signals(data, excited, square)
         if lags > cycles * N:
             raise DefinitionError(
@@ -146,6 +140,21 @@ class OutputErrorProblem(NamedTuple):
         return SectionRegression.make(inputs, starts, part.drift, part.weight[:, :, n, output])
 
 
+def _with_rows(
+    triangles: list[np.ndarray], grid: CycleGrid, lags: int, free: int
+) -> list[np.ndarray]:
+    """Triangles of the lagged inputs of each section, with those of more records."""
+    sampled, first = np.isfinite(grid.y), np.argmax(grid.inside, axis=1)
+    cycle = np.arange(grid.y.shape[1])
+
+    def section(n: int):
+        tells = sampled[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
+        rows = lagged_inputs(grid.u, n, lags, grid.lead)[tells]
+        return np.linalg.qr(np.concatenate([triangles[n], rows]), mode="r")
+
+    return on_all_cores(section, range(len(triangles)))
+
+
 def _independent(triangle: np.ndarray) -> np.ndarray:
     _, s, vh = np.linalg.svd(triangle, full_matrices=False)
     kept = s > RANK * s.max(initial=0)
@@ -193,15 +202,16 @@ def in_passes(
         for work in passes:
             parts = prepared if kept else ((part, prepare(part)) for part in problem.parts())
             for k, (part, ready) in enumerate(parts):
-
-                def section(n: int):
-                    found = regressions.get((k, n))
-                    if found is None:
-                        found = regress(part, ready, n)
-                        if kept:
-                            regressions[k, n] = found
-                    return work(k, part, n, found)
-
-                results = on_all_cores(section, some)
+                missing = [n for n in some if (k, n) not in regressions]
+                made = on_all_cores(functools.partial(regress, part, ready), missing)
+                regressions |= {(k, n): one for n, one in zip(missing, made, strict=True)}
+                each = [(n, regressions[k, n]) for n in some]
+                results = on_all_cores(functools.partial(_on_pair, work, k, part), each)
                 if collect is not None:
                     collect(k, results)
+                if not kept:
+                    regressions.clear()
+
+
+def _on_pair(work: Callable, k: int, part: Part, pair: tuple[int, Any]) -> Any:
+    return work(k, part, *pair)

@@ -13,7 +13,7 @@ from .cycle_grid import CycleGrid, count_cycles
 
 
 # Samples of a part, unless a single record has more. Doubled: twice the memory.
-_SAMPLES = 200_000
+_SAMPLES = 100_000
 # Cycles of the shortest record in a part, relative to the longest. Doubled: all are of one length,
 # and there are as many parts as lengths.
 _ALIKE = 0.5

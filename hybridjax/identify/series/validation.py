@@ -151,8 +151,8 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is.
-    - `data`: as for `fit_series` (`StoredExperiments` are read twice), best those that the model was not made from; those that it was
-      made from always fit too well.
+    - `data`: as for `fit_series`, best those that the model was not made from; those that it was
+      made from always fit too well. `StoredExperiments` are read twice, part by part.
     - `start`: "free" estimates the state at the start of each record from it; "cycle" takes it as
       zero. A drift that the records announce is estimated from them in either case.
     - `lags`: how many are looked at; default one period, less for few cycles.

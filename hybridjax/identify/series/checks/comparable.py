@@ -1,6 +1,6 @@
 """Records that say more of a model than where they started, and how many samples they have."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,9 +10,9 @@ from ....experiments.data import ExperimentData
 from ....experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ....linear.ldtp import LDTP
 from ..parts import in_groups
-from .residual_tests import sections_of
 from ..series_fit import SeriesFit
 from ..simulation import can_be_compared
+from .residual_tests import sections_of
 
 
 class Comparable:
@@ -50,8 +50,8 @@ class Comparable:
         if self.longest is None:
             raise DefinitionError(
                 f"the longest of {self.left_out} uninterrupted records has "
-                f"{longest / self.n_sections:.3g} cycles: too few to tell the model from an unknown "
-                "start."
+                f"{longest / self.n_sections:.3g} cycles: too few to tell the model from an "
+                "unknown start."
             )
 
     def groups(self) -> Iterator[list[Record]]:
