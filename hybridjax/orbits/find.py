@@ -20,8 +20,9 @@ from ..engine.target import until
 from ..engine.watch import watch
 from ..errors import ComputationError, DefinitionError
 from ..sections.crossing import AtEvent, Crossing
+from ..systems.check import check_system
 from ..systems.solver import Radau
-from ..systems.structure import Structure, check_system
+from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
 from .coincidence import coincidences
