@@ -4,9 +4,9 @@
 
 Flights by DOP853 (relative tolerance 1e-13) to its events, which Newton's method moves onto the
 true gap along further flights. Newton's method for the cycle, and multipliers, by the matrix
-exponential of the linear flight and the saltation matrices of the impacts. Printed for each number of masses:
-the state at t = 0, multipliers (real and imaginary parts), the times of the impacts in order, and
-the residual.
+exponential of the linear flight and the saltation matrices of the impacts. Printed for each number
+of masses: the state at t = 0, multipliers (real and imaginary parts), the times of the impacts in
+order, and the residual.
 """
 
 import json

@@ -20,12 +20,12 @@ m = hj.models
 class Case(NamedTuple):
     """One entry.
 
-    `sections` are for linearization and experiments, `output` and `input` name what is measured and
-    pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An experiment
-    begins in the predicted periodic response, or where there is none, on the cycle (`start`); where
-    the amplitude is zero there are no experiments. A walker is drawn as `sticks`: lines from joint to
-    joint, by the lengths that each has along each link, whose angles from the vertical are the first
-    states.
+    `sections` are for linearization and experiments, `output` and `input` name what is measured
+    and pushed, `amplitude` is that of each cosine of the design. `truth` are multipliers. An
+    experiment begins in the predicted periodic response, or where there is none, on the cycle
+    (`start`); where the amplitude is zero there are no experiments. A walker is drawn as `sticks`:
+    lines from joint to joint, by the lengths that each has along each link, whose angles from the
+    vertical are the first states.
     """
 
     title: str

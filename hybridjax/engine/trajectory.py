@@ -19,7 +19,8 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
 from ..errors import ComputationError, DefinitionError
-from ..systems.structure import Structure, check_system
+from ..systems.check import check_system
+from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .events import start_lanes

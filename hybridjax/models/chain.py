@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count
 from ..systems.chart import Chart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
@@ -51,7 +50,6 @@ class Contact(eqx.Module):
         return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
 
 
-@checked_methods
 class BouncingChain(HybridSystem):
     """`n` equal masses in a row above a table, each joined to its neighbors by a spring and a
     dashpot. Along the table a wave travels that is as long as the row: every mass bounces once a

@@ -17,8 +17,9 @@ from .._core.tracing import is_traced
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
 from ..sections.crossing import AtEvent, Crossing
+from ..systems.check import check_system
 from ..systems.solver import Radau
-from ..systems.structure import Structure, check_system
+from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
 from .clock import check_clock, check_times
 from .coincidence import check_begin, coincident, commutes, events_of

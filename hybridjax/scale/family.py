@@ -14,7 +14,7 @@ from .._core.pieces.description import digest_of, function_digest
 from .._core.precision import require_x64
 from ..engine.describe import describe
 from ..errors import DefinitionError
-from ..systems.structure import check_system
+from ..systems.check import check_system
 from ..systems.system import HybridSystem, unit_of_parameter
 
 

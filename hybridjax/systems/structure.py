@@ -5,7 +5,7 @@ functions that return arrays, guards that fall through zero at their event.
 """
 
 import dataclasses
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,12 +19,10 @@ from .._core.executor import Array
 from .._core.lanes.per_lane import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
-from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .alike import Kind, Member, chosen, kinds
 from .chart import Chart
 from .output import Output
-from .quotient import Quotient
 from .solver import ByChart, Method, as_method
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
@@ -35,6 +33,11 @@ def as_vector(value: Any) -> jax.Array:
     if isinstance(value, tuple | list):
         return jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
     return jnp.asarray(value, float)
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Names in quotation marks, for messages."""
+    return ", ".join(map(repr, names)) or "none"
 
 
 def stacked(parts: Sequence[jax.Array]) -> jax.Array:
@@ -106,13 +109,13 @@ class Structure:
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:
-            raise DefinitionError(f"there is no chart '{name}'; charts are {_list(self.names)}.")
+            raise DefinitionError(f"there is no chart '{name}'; charts are {quoted(self.names)}.")
         return self.names.index(name)
 
     def transition_index(self, name: str) -> int:
         names = [t.name for t in self.transitions]
         if name not in names:
-            raise DefinitionError(f"there is no event '{name}'; events are {_list(names)}.")
+            raise DefinitionError(f"there is no event '{name}'; events are {quoted(names)}.")
         return names.index(name)
 
     def method(self, a: int) -> Method | None:
@@ -267,14 +270,14 @@ class Outputs:
                 item = defined[item]
             if isinstance(item, str) and item not in structure.state_names():
                 known = (*structure.state_names(), *defined)
-                raise DefinitionError(f"there is no output {item!r}; outputs are {_list(known)}.")
+                raise DefinitionError(f"there is no output {item!r}; outputs are {quoted(known)}.")
             self.items.append(item)
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(
             states[o] if isinstance(o, str) else Signal(o.name, o.unit) for o in self.items
         )
         if len(set(self.names)) < len(self.names):
-            raise DefinitionError(f"two outputs have the same name: {_list(self.names)}.")
+            raise DefinitionError(f"two outputs have the same name: {quoted(self.names)}.")
 
     def __call__(self, a: int, t, q, u) -> jax.Array:
         """All outputs in chart a, shape (ny,); NaN where a chart does not define one."""
@@ -308,96 +311,3 @@ class Outputs:
         if function is None:
             return None
         return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))
-
-
-def check_system(system: HybridSystem) -> None:
-    """Check that a system is well formed: names, shapes of every function, finite parameters.
-
-    **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
-    """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
-        if (
-            jnp.issubdtype(leaf.dtype, jnp.inexact)
-            and not is_traced(leaf)
-            and not np.all(np.isfinite(leaf))
-        ):
-            raise DefinitionError(
-                f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
-                f"{np.asarray(leaf)}; every parameter must be finite."
-            )
-    if not system.charts():
-        raise DefinitionError(f"{type(system).__name__} has no charts.")
-    _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
-    s = Structure(system)
-    for name in system.solver.names if isinstance(system.solver, ByChart) else ():
-        s.chart_index(name)
-    for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
-        for unknown in set(chart.inputs or ()) - set(system.inputs):
-            raise DefinitionError(
-                f"chart '{name}' uses input '{unknown}', which the system does not have; inputs "
-                f"are {_list(system.inputs)}."
-            )
-        if len(set(chart.states)) < len(chart.states):
-            raise DefinitionError(f"chart '{name}' names a state twice: {_list(chart.states)}.")
-        _check_units(f"chart '{name}'", "states", chart.states, chart.units)
-        s.method(a)
-        shape = _shape(f"field of chart '{name}'", lambda t, q, u, a=a: s.field(a, t, q, u), s, a)
-        if shape != (s.dims[a],):
-            raise DefinitionError(
-                f"the field of chart '{name}' returns shape {shape}, but the chart has the "
-                f"{s.dims[a]} states {_list(chart.states)}."
-            )
-    if len(set(map(str, s.state_names()))) < len(s.state_names()):
-        raise DefinitionError(
-            f"charts of {type(system).__name__} give a state different units: "
-            f"{_list(s.state_names())}."
-        )
-    seen: set[str] = set()
-    # Those of one kind are one program; the first and the last may reach beyond the states.
-    looked_at = {g for kind in s.kinds for g in (kind[0], kind[-1])}
-    for g, tr in enumerate(s.transitions):
-        if tr.name in seen:
-            raise DefinitionError(
-                f"two transitions are called '{tr.name}'; give each its own name."
-            )
-        seen.add(tr.name)
-        if g not in looked_at:
-            continue
-        a, b = s.chart_index(tr.source), s.chart_index(tr.target)
-        label = f"transition '{tr.name}' ({tr.source} -> {tr.target})"
-        if not isinstance(tr.guard, Scheduled):
-            shape = _shape(f"guard of {label}", lambda t, q, u, g=g: s.guard(g, t, q, u), s, a)
-            if shape != ():
-                raise DefinitionError(f"the guard of {label} returns shape {shape}, not a number.")
-        shape = _shape(f"reset of {label}", lambda t, q, u, g=g: s.reset(g, t, q, u), s, a)
-        if shape != (s.dims[b],):
-            raise DefinitionError(
-                f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
-                f"{s.dims[b]} states {_list(s.charts[b].states)}."
-            )
-    if isinstance(system, Quotient):
-        system.check()
-
-
-def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:
-    shapes = (), (s.dims[a],), (s.nu,)
-    try:
-        return jax.eval_shape(
-            function, *(jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes)
-        ).shape
-    except DefinitionError:
-        raise
-    except Exception as error:
-        raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
-
-
-def _check_units(what: str, kind: str, names: Sequence[str], units: Sequence[str]) -> None:
-    if len(units) not in (0, len(names)):
-        raise DefinitionError(
-            f"{what} has the {kind} {_list(names)}, but {len(units)} units: give one for each, "
-            "or none."
-        )
-
-
-def _list(names) -> str:
-    return ", ".join(map(repr, names)) or "none"

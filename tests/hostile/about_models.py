@@ -118,6 +118,7 @@ def systems(t):
     yield "VerticalHopper", hj.models.VerticalHopper, dict(k=10.0), {
         "k": ["10", 1j, NAN, INF, Other(), {}],
     }  # fmt: skip
+    yield "BouncingChain", hj.models.BouncingChain, dict(n=2), {"n": COUNT, "k": ["1", NAN]}
     yield "enable_vector_math", hj.enable_vector_math, dict(enabled=True), {"enabled": FLAG}
     yield "enable_progress", hj.enable_progress, dict(enabled=False), {"enabled": FLAG}
     yield "enable_compilation_cache", hj.enable_compilation_cache, dict(folder=None), {

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.systems.structure import Structure, check_system
+from hybridjax.systems.check import check_system
+from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import own_fields
 
 from ..toys import Field, Switched, TwoInputs

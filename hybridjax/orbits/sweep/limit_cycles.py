@@ -23,7 +23,8 @@ from ...engine.lanes import Lanes
 from ...engine.settings import SWEEP, Settings
 from ...errors import DefinitionError
 from ...sections.crossing import AtEvent, Crossing
-from ...systems.structure import Structure, check_system
+from ...systems.check import check_system
+from ...systems.structure import Structure
 from ...systems.system import HybridSystem
 from ..coincidence import commutes
 from ..cycle import LimitCycle
