@@ -214,9 +214,9 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "van der Pol, 100": lambda: Case(
         "van der Pol, mu = 100", m.VanDerPol(mu=100.0, solver=hj.Radau()),
-        [hj.Crossing("x", "falling", 1.5), hj.Crossing("x", "falling"),
-         hj.Crossing("x", "rising", -1.5), hj.Crossing("x", "rising")],
-        "x", "force", 0.0, [0.0], _STIFF, ("x", "v"),
+        [*(hj.Crossing("x", "falling", x) for x in (0.5, 0.0, -0.5)),
+         *(hj.Crossing("x", "rising", x) for x in (-0.5, 0.0, 0.5))],
+        "v", "force", 0.0, [0.0], _STIFF, ("x", "v"),
         section=hj.Crossing("v", "falling"), max_period=500.0,
     ),
     "FitzHugh-Nagumo": lambda: Case(

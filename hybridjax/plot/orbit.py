@@ -133,7 +133,7 @@ def _points(s: Structure, a: int, names, t, q) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
-    named = set()
+    named: list[tuple[np.ndarray, list[str]]] = []  # what happens at a point stands there together
     for k in np.flatnonzero(orbit.event >= 0):
         transition = s.transitions[orbit.event[k]]
         a, b = s.chart_index(transition.source), s.chart_index(transition.target)
@@ -147,9 +147,15 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
             ax.plot(*ends, "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
-        if transition.name not in named:
-            _text(ax, transition.name, before, center, distance=-9)
-        named.add(transition.name)
+        if any(transition.name in texts for _, texts in named):
+            continue
+        at = [texts for point, texts in named if np.allclose(point, before, atol=1e-9)]
+        if at:
+            at[0].append(transition.name)
+        else:
+            named.append((before, [transition.name]))
+    for point, texts in named:
+        _text(ax, "\n".join(texts), point, center, distance=-9)
 
 
 def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
