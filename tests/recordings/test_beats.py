@@ -47,6 +47,8 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
     true = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=CURVE, folds=3)
     assert flat.r2 + 0.01 < own.r2 < true.r2 + 0.02
     assert "Shape: it adds" in repr(found)
+    page = found._repr_html_()
+    assert page.count("<svg") == 1 and "Shape: it adds" in page
 
 
 def rms(values):
