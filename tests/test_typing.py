@@ -39,6 +39,7 @@ hj.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]]).htf([0.1, 0.2])
 hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
 hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
 hj.convert.to_lti(model).multipliers.shape
+hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modulus")).advice
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
 hj.Recording.beside([recording, recording]).units
 hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
@@ -149,7 +150,8 @@ UNCHECKED = {
         "IntervalForecast", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
-        "NaturalMultipliers", "OutputLevels", "ParameterGuesses", "Phase", "PhaseResponse",
+        "NaturalMultipliers", "OptimalDesign", "OutputLevels", "ParameterGuesses", "Phase",
+        "PhaseResponse",
         "PlacedSections", "Plan", "Plot",
         "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",

@@ -25,7 +25,7 @@ class OptimalDesign(eqx.Module):
     **Fields:**
 
     - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
-    - `usual`: the design with which it is compared.
+    - `usual`: the design with which it is compared, scaled to the same limits.
     - `names` (g,) of the wanted quantities; `covariance` (g, g) with `design`, `usual_covariance`
       with `usual`.
     - `criterion` and `usual_criterion`: what was made small, in units of a variance.

@@ -1,5 +1,6 @@
 """The design that answers a question in the fewest strides."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Literal
 
@@ -14,10 +15,11 @@ from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
 from .allocation import allocate, answer
 from .candidates import Candidates
-from .goals import Goal, Model, Multipliers
+from .goals import Goal, Multipliers
 from .grouping import to_design, worthwhile
 from .limits import Limit, make_limits
 from .optimal_design import OptimalDesign
+from .questions import Model, question_of
 
 
 # Cosines that together tell less than such a part of all are left out, the largest part of these
@@ -54,6 +56,8 @@ def optimal_design(
 
     The variance of the goal is the Cramer-Rao bound with white noise. It is a convex function of
     the cosines' powers, and the result's `certificate` says how far from the optimum they are.
+    Strong cosines stand in several experiments, weak ones in one: for variances that are estimated
+    run `plan.design.realizations(4)`, or two windows.
 
     **Arguments:**
 
@@ -84,12 +88,21 @@ def optimal_design(
     cosines = Candidates.of(usual)
     usual_power = cosines.power_of(usual)
     squares = _squares(model, cosines)
-    usual_rms = {name: float(np.sqrt(square @ usual_power)) for name, square in squares.items()}
+    given_rms = _rms(squares, usual_power)
     count = usual.experiments if experiments is None else experiments
     most = _largest(largest, cosines, count)
     limits = make_limits(limit, squares, model.inputs, usual_power, most)
+    if count > len(cosines.f):
+        raise DefinitionError(
+            f"{count} experiments are more than the {len(cosines.f)} cosines that there are."
+        )
     goal = Multipliers() if isinstance(goal, str) else goal
-    question = goal.question(model, cosines, _noise(model, noise, usual_rms))
+    question = question_of(goal, model, cosines, _noise(model, noise, given_rms))
+
+    # The usual proportions, as large as the limits allow.
+    factor = 1 / limits.use(usual_power).max()
+    usual_power = usual_power * factor
+    usual = dataclasses.replace(usual, amplitude=usual.amplitude * np.sqrt(factor))
 
     before = answer(question, usual_power)
     allowed = np.flatnonzero(most > 0)
@@ -102,15 +115,16 @@ def optimal_design(
         worse = best.answer.criterion / ideal.answer.criterion
         if worse < _AS_GOOD:
             break
+    shorter = usual.experiments / count
     power, relative = np.zeros_like(usual_power), np.zeros_like(usual_power)
     power[kept], relative[allowed] = best.power, ideal.certificate.relative
     return OptimalDesign(
         design=to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed),
         usual=usual,
         names=question.names,
-        covariance=best.answer.covariance,
+        covariance=best.answer.covariance * shorter,
         usual_covariance=before.covariance,
-        criterion=best.answer.criterion,
+        criterion=best.answer.criterion * shorter,
         usual_criterion=before.criterion,
         certificate=ideal.certificate.excess * worse,
         frequencies=cosines.f,
@@ -119,8 +133,8 @@ def optimal_design(
         usual_power=usual_power,
         sensitivity=relative,
         limited=limits.names,
-        rms={name: float(np.sqrt(square @ power)) for name, square in squares.items()},
-        usual_rms=usual_rms,
+        rms=_rms(squares, power),
+        usual_rms=_rms(squares, usual_power),
     )
 
 
@@ -137,12 +151,18 @@ def _squares(model: Model, cosines: Candidates) -> dict[str, Float[np.ndarray, "
     return dict(zip((*model.inputs, *model.outputs), (*inputs, *answers), strict=True))
 
 
+def _rms(
+    squares: dict[str, Float[np.ndarray, " K"]], power: Float[np.ndarray, " K"]
+) -> dict[str, float]:
+    return {name: float(np.sqrt(square @ power)) for name, square in squares.items()}
+
+
 def _noise(
-    model: Model, noise: Mapping[str, float] | None, usual_rms: dict[str, float]
+    model: Model, noise: Mapping[str, float] | None, rms: dict[str, float]
 ) -> Float[np.ndarray, " ny"]:
     """Standard deviation of each output's noise, infinite for those that are not measured."""
     if noise is None:
-        noise = {name: _NOISE * usual_rms[name] for name in model.outputs if usual_rms[name] > 0}
+        noise = {name: _NOISE * rms[name] for name in model.outputs if rms[name] > 0}
     unknown = [name for name in noise if name not in model.outputs]
     if unknown or not noise:
         what = f"names '{unknown[0]}'" if unknown else "names no output"

@@ -77,8 +77,9 @@ class DenominatorSensitivities(Sensitivities):
         channels = []
         for one in self.channels:
             kept, number = _renumbered(one.cosine, some)
-            basis, _ = powers_basis(one.basis[kept])
-            channels.append(Channel(number, basis, one.slopes[kept]))
+            if len(kept):
+                basis, _ = powers_basis(one.basis[kept])
+                channels.append(Channel(number, basis, one.slopes[kept]))
         return DenominatorSensitivities(tuple(channels), self.order)
 
     def at(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, "d rows"]:

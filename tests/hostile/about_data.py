@@ -54,6 +54,7 @@ def calls(t):
     yield from estimates(t)
     yield from series(t)
     yield from fitting(t)
+    yield from designs(t)
     yield from recordings(t)
     yield from testing(t)
     yield from files(t)
@@ -209,6 +210,45 @@ def fitting(t):
             yield f"{name}.{method}", getattr(made, method), dict(cycle=t.cycle), {
                 "cycle": instance(t.system),
             }  # fmt: skip
+
+
+def designs(t):
+    ask = hj.designs.Multipliers(harmonics=0, overhang=6)
+    amplitudes = [*POSITIVE, lambda f: "x", lambda f: f * NAN, lambda f: -1 - f]
+    limits = [
+        None,
+        3,
+        "nope",
+        ["u0"],
+        {},
+        {"z": 1.0},
+        {"u0": 0.0},
+        {"u0": NAN},
+        {"u0": "1"},
+        Other(),
+    ]
+    yield "optimal_design", hj.optimal_design, dict(
+        model=t.model, design=t.design, goal=ask, max_steps=1
+    ), {
+        "model": instance(t.design), "design": [3, t.model, t.one_input, np.zeros((1, 9, 2))],
+        "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
+        "limit": limits, "noise": optional([3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]),
+        "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
+        "max_steps": COUNT,
+    }  # fmt: skip
+    yield "Multipliers", hj.designs.Multipliers, {}, {
+        "which": optional(WHOLE), "part": WORD, "criterion": WORD, "harmonics": HARMONICS,
+        "overhang": optional(WHOLE),
+    }  # fmt: skip
+    yield "Parameters", hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",)), {
+        "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],
+        "free": [None, 3, (), (3,), ("x", "x"), Other()],
+        "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "criterion": WORD,
+        "harmonics": HARMONICS,
+    }  # fmt: skip
+    yield "OptimalDesign.strides_for", t.plan.strides_for, dict(standard_error=1.0), {
+        "standard_error": POSITIVE,
+    }  # fmt: skip
 
 
 def recordings(t):

@@ -102,6 +102,11 @@ class Things:
         return hj.fit_multipliers(self.estimate, 2, overhang=6)
 
     @ft.cached_property
+    def plan(self):
+        goal = hj.designs.Multipliers(harmonics=0, overhang=6)
+        return hj.optimal_design(self.model, self.design, goal=goal, max_steps=1)
+
+    @ft.cached_property
     def record(self):
         u = np.random.default_rng(0).normal(size=(300, 2))
         y = np.asarray(self.model.simulate(u))
