@@ -47,6 +47,7 @@ from .fitting.observations import (
     ObservedSeries as ObservedSeries,
 )
 from .identify.htf.nonparametric import estimate_htf as estimate_htf
+from .identify.joint.fit import fit_ldtp as fit_ldtp
 from .identify.multipliers.order import select_order as select_order
 from .identify.multipliers.structured import fit_multipliers as fit_multipliers
 from .identify.rational.fit import fit_rational as fit_rational

@@ -3,6 +3,8 @@ from .htf.distortion import OutputLevels as OutputLevels, output_levels as outpu
 from .htf.leakage import predict_leakage as predict_leakage
 from .htf.nonparametric import missing_frequencies as missing_frequencies
 from .htf.transient import TransientFit as TransientFit, remove_transient as remove_transient
+from .joint.bound import ldtp_bound as ldtp_bound
+from .joint.ldtp_fit import LDTPFit as LDTPFit
 from .multipliers.bound import (
     MultiplierBound as MultiplierBound,
     multiplier_bound as multiplier_bound,

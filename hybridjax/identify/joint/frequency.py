@@ -1,0 +1,163 @@
+r"""Misfit of harmonic transfer functions, and its derivatives in closed form.
+
+With $z = e^{2 \pi i f / N}$ and periodic $\tilde x$, the response to $u[n] = z^n$ is
+$z^n \tilde x[n]$ and
+
+$$z\,\tilde x[n+1] = A[n] \tilde x[n] + B[n], \qquad
+H_m = \frac{1}{N} \sum_n e^{-2 \pi i m n / N} (C[n] \tilde x[n] + D[n]).$$
+
+A change of the matrices at section n alone changes $H_m$ by
+
+$$\delta H_m = \frac{1}{N} e^{-2 \pi i m n / N} \left( \nu_m[n] (\delta A\,\tilde x[n] + \delta B)
++ \delta C\,\tilde x[n] + \delta D \right),$$
+
+with $\nu_m[n] = z_m^{-1} \mu_m[n+1]$, $z_m = z e^{2 \pi i m / N}$ and the adjoint
+$\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ...linear.htf import HTF
+from .coordinates import LocalCoordinates
+from .normal_equations import NormalEquations
+from .periodic_model import PeriodicModel
+
+
+# Numbers of a Jacobian that are held at once. Doubled: twice the memory, 64 MB.
+_HELD = 2**21
+
+
+class FrequencyProblem(NamedTuple):
+    """Harmonic transfer functions that a model is to have."""
+
+    f: Float[np.ndarray, " F"]
+    harmonics: tuple[int, ...]
+    target: Complex[np.ndarray, "M F ny nu"]
+    weight: Float[np.ndarray, "M F ny nu"]
+    """One over the standard deviation of real and imaginary part."""
+
+    @classmethod
+    def of(
+        cls, htf: HTF, weight: Float[np.ndarray, "M F ny nu"], scale: Float[np.ndarray, " ny"]
+    ) -> "FrequencyProblem":
+        """With outputs in units of `scale`; `weight` is for those in their own."""
+        size = scale[:, None]
+        return cls(np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size)
+
+    @property
+    def count(self) -> int:
+        """Real residuals."""
+        return 2 * self.target.size
+
+    def errors(self, model: PeriodicModel) -> Complex[np.ndarray, "M F ny nu"]:
+        """In units of standard deviations."""
+        return self.weight * (self.target - transfer(model, self.f, self.harmonics))
+
+    def cost(self, model: PeriodicModel) -> float:
+        """Infinite for a model that is resonant, or grows beyond all numbers, in a period."""
+        try:
+            with np.errstate(all="ignore"):
+                cost = float((np.abs(self.errors(model)) ** 2).sum())
+        except np.linalg.LinAlgError:
+            return np.inf
+        return cost if np.isfinite(cost) else np.inf
+
+    def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
+        P, error = coordinates.size, self.errors(coordinates.model)
+        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        for rows, slopes in transfer_slopes(coordinates, self.f, self.harmonics):
+            slopes *= self.weight[:, rows]
+            J = slopes.reshape(P, -1).view(float)
+            gram += J @ J.T
+            gradient += J @ np.ascontiguousarray(error[:, rows]).ravel().view(float)
+        return NormalEquations(gram, gradient)
+
+
+def transfer(
+    model: PeriodicModel, f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]
+) -> Complex[np.ndarray, "M F ny nu"]:
+    """The harmonic transfer functions of a model."""
+    N = model.n_sections
+    states = _states(model, np.exp(2j * np.pi / N * f))
+    G = np.stack(
+        [x @ C.T + D.T for x, C, D in zip(states, model.C, model.D, strict=True)]
+    )  # (N, F, nu, ny)
+    n = np.arange(N)
+    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, n)) / N
+    return np.tensordot(waves, G, 1).swapaxes(2, 3)
+
+
+def transfer_slopes(
+    coordinates: LocalCoordinates, f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]
+) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
+    """Derivatives of the harmonic transfer functions, for some frequencies at a time."""
+    ny, nu = coordinates.model.D[0].shape
+    step = max(_HELD // (coordinates.size * len(harmonics) * ny * nu), 1)
+    for first in range(0, len(f), step):
+        rows = slice(first, min(first + step, len(f)))
+        yield rows, _slopes(coordinates, f[rows], np.array(harmonics))
+
+
+def _slopes(coordinates, f, m):
+    model, places = coordinates.model, coordinates.places
+    N, (ny, nu) = model.n_sections, model.D[0].shape
+    z = np.exp(2j * np.pi / N * f)
+    z_m = np.exp(2j * np.pi / N * (m[:, None] + f)).ravel()
+    states, adjoints = _states(model, z), _adjoints(model, z_m)
+    J = np.zeros((coordinates.size, len(m), len(f), ny, nu), complex)
+    for n, at in enumerate(places):
+        x = states[n]  # (F, nu, d)
+        after = adjoints[(n + 1) % N] / z_m[:, None, None]
+        wave = np.exp(-2j * np.pi / N * m * n)[:, None, None, None] / N
+        nu_m = after.reshape(len(m), len(f), ny, -1) * wave
+        shapes = dict(coordinates.blocks(n))
+        left = nu_m @ coordinates.to_A[n] + wave * coordinates.to_C[n]  # (M, F, ny, q)
+        Y = J[at["Y"]].reshape(*shapes["Y"], *J.shape[1:])
+        right = x.transpose(2, 0, 1)[None, :, None, :, None]  # (1, d, 1, F, 1, nu)
+        np.multiply(left.transpose(3, 0, 1, 2)[:, None, ..., None], right, out=Y)
+        B = J[at["B"]].reshape(*shapes["B"], *J.shape[1:])
+        for j in range(nu):
+            B[:, j, ..., j] = nu_m.transpose(3, 0, 1, 2)
+        if coordinates.direct:
+            D = J[at["D"]].reshape(*shapes["D"], *J.shape[1:])
+            for i, j in np.ndindex(ny, nu):
+                D[i, j, ..., i, j] = wave[..., 0, 0]
+    return J
+
+
+def _states(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
+    """x~ at each section, (F, nu, d)."""
+
+    def around(x):
+        found = []
+        for A, B in zip(model.A, model.B, strict=True):
+            found.append(x)
+            x = (x @ A.T + B.T) / z[:, None, None]
+        return found, x
+
+    nu, phi = model.B[0].shape[1], model.monodromy()
+    _, forced = around(np.zeros((len(z), nu, len(phi)), complex))
+    return around(forced @ _resolvent(phi.T, z, model.n_sections))[0]
+
+
+def _adjoints(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
+    """mu at each section, (F, ny, d)."""
+
+    def around(mu):
+        found = []
+        for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
+            mu = C + mu @ A / z[:, None, None]
+            found.append(mu)
+        return found[::-1]
+
+    ny, phi = len(model.C[0]), model.monodromy()
+    forced = around(np.zeros((len(z), ny, len(phi)), complex))[0]
+    return around(forced @ _resolvent(phi, z, model.n_sections))
+
+
+def _resolvent(phi: Float[np.ndarray, "d d"], z: Complex[np.ndarray, " F"], N: int):
+    return np.linalg.inv(np.eye(len(phi)) - phi * z[:, None, None] ** -N)

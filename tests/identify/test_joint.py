@@ -1,0 +1,172 @@
+"""The fit of a linear periodic model itself, and its bound."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import hybridjax as hj
+from hybridjax.identify.joint.characteristic import characteristic_slopes
+from hybridjax.identify.joint.coordinates import local_coordinates
+from hybridjax.identify.joint.frequency import transfer, transfer_slopes
+from hybridjax.identify.joint.periodic_model import PeriodicModel
+from hybridjax.linear.frequency_response import harmonic_transfer
+
+
+F = np.linspace(0.03, 2.9, 40)
+ONE = np.ones(2)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hj.testing.synthetic_ldtp()
+
+
+@pytest.fixture(scope="module")
+def exact(model):
+    """All harmonics, with the variance of errors of 2 %."""
+    htf = model.htf(F)
+    return with_values(htf, htf.H, 4e-4)
+
+
+def with_values(htf, H, variance=None):
+    if variance is not None:
+        variance = np.full(H.shape, variance)
+    return hj.HTF(
+        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs, variance=variance
+    )
+
+
+def noisy(htf, rng):
+    size = np.sqrt(np.asarray(htf.variance) / 2)
+    error = rng.normal(size=(2, *htf.H.shape)) * size
+    return eqx.tree_at(lambda h: h.H, htf, htf.H + error[0] + 1j * error[1])
+
+
+def shaken(model, rng, size=0.02):
+    """Other matrices nearby, in which zeros of the padding stay zero."""
+    parts = lambda m: (m.A, m.B, m.C, m.D)  # noqa: E731
+    return eqx.tree_at(
+        parts, model, tuple(x * (1 + size * rng.normal(size=x.shape)) for x in parts(model))
+    )
+
+
+def test_the_coordinates_are_as_many_as_there_are_models(model, exact):
+    """Entries of all matrices less those of changes of state, and the data show every one."""
+    coordinates = local_coordinates(PeriodicModel.of(model, ONE), direct=True)
+    dims = np.asarray(model.dims)
+    after = np.roll(dims, -1)
+    entries = (after * dims + after * 2 + 2 * dims + 4).sum()
+    assert coordinates.size == entries - (dims**2).sum()
+    J = np.concatenate([s.reshape(len(s), -1) for _, s in
+                        transfer_slopes(coordinates, F, exact.harmonics)], axis=1)  # fmt: skip
+    assert np.linalg.matrix_rank(np.concatenate([J.real, J.imag], axis=1)) == coordinates.size
+
+
+def test_a_change_of_states_changes_nothing(model, exact):
+    normal = local_coordinates(PeriodicModel.of(model, ONE), direct=True).model
+    found = transfer(normal, F, exact.harmonics)
+    np.testing.assert_allclose(found, exact.H, atol=1e-12)
+    for A, C in zip(normal.A, normal.C, strict=True):
+        np.testing.assert_allclose(A.T @ A + C.T @ C, np.eye(A.shape[1]), atol=1e-12)
+
+
+def test_derivatives_are_those_of_jax(model):
+    coordinates = local_coordinates(PeriodicModel.of(model, ONE), direct=True)
+    rng = np.random.default_rng(0)
+    step = rng.normal(size=coordinates.size)
+    arrays = lambda m: [  # noqa: E731
+        jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x)) for x in "ABCD"
+    ]
+    here, there = arrays(coordinates.model), arrays(coordinates.moved(step))
+    change = [b - a for a, b in zip(here, there, strict=True)]
+    _, true = jax.jvp(lambda *x: harmonic_transfer(*x, jnp.asarray(F)), tuple(here), tuple(change))
+    harmonics = (-2, 0, 1)
+    slopes = np.concatenate([s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2)
+    np.testing.assert_allclose(
+        np.tensordot(step, slopes, 1), np.asarray(true)[np.array(harmonics)], atol=1e-11
+    )
+    c, by_step = characteristic_slopes(coordinates)
+    np.testing.assert_allclose(c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12)
+    ahead, back = (
+        characteristic_slopes(local_coordinates(coordinates.moved(h * step), True))[0]
+        for h in (1e-6, -1e-6)
+    )
+    np.testing.assert_allclose(by_step @ step, (ahead - back) / 2e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("variance", (None, 4e-4))
+def test_exact_values_are_met_exactly(model, exact, variance):
+    htf = with_values(exact, exact.H, variance)
+    fit = hj.fit_ldtp(htf, shaken(model, np.random.default_rng(1)))
+    assert fit.result == hj.Result.OK
+    off = 1e-8 if variance is None else 1e-5  # (where they are known, 0.1 standard errors do)
+    assert fit.compare(model.multipliers).max_error < off
+    assert np.max(fit.model.htf(F).error(exact)) < off
+    np.testing.assert_allclose(fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12)
+
+
+def test_what_is_not_direct_stays_so(model):
+    silent = eqx.tree_at(lambda m: m.D, model, jnp.zeros_like(model.D))
+    htf = silent.htf(F)
+    fit = hj.fit_ldtp(htf, shaken(silent, np.random.default_rng(2)), direct=False)
+    assert not np.asarray(fit.model.D).any()
+    assert fit.compare(model.multipliers).max_error < 1e-8
+    assert fit.unknowns == hj.fit_ldtp(htf, silent).unknowns - 6 * 4
+
+
+def test_errors_are_those_of_the_bound(model, exact):
+    """The rms error, the misfit and the coverage of 60 draws, each at the level of 0.1 %."""
+    rng, draws = np.random.default_rng(3), 60
+    bound = hj.identify.ldtp_bound(model, exact)
+    fits = [hj.fit_ldtp(noisy(exact, rng), model) for _ in range(draws)]
+    error = np.array([fit.coefficients - bound.coefficients for fit in fits])
+    square = np.einsum("si,ij,sj->", error, np.linalg.inv(bound.covariance), error)
+    assert 1e-3 < stats.chi2(2 * draws).cdf(square) < 1 - 1e-3
+    cost = sum(fit.cost for fit in fits)
+    assert 1e-3 < stats.chi2(sum(fit.freedom for fit in fits)).cdf(cost) < 1 - 1e-3
+    hits = sum(int(fit.contains(model.multipliers).all()) for fit in fits)
+    assert stats.binomtest(hits, draws, 0.95).pvalue > 1e-3
+    H = np.array([fit.htf(F).H for fit in fits])
+    said = np.mean([fit.htf(F).variance for fit in fits], axis=0)
+    found = np.mean(np.abs(H - np.asarray(exact.H)) ** 2, axis=0)
+    assert abs(np.mean(found / said) - 1) < 0.1
+
+
+def test_without_variances_the_misfit_says_them(model, exact):
+    draw = noisy(exact, np.random.default_rng(4))
+    known = hj.fit_ldtp(draw, model)
+    found = hj.fit_ldtp(with_values(draw, draw.H), model)
+    np.testing.assert_allclose(found.standard_errors, known.standard_errors, rtol=0.1)
+    assert found.cost == pytest.approx(found.freedom)
+
+
+def test_with_one_section_the_bound_is_that_of_free_numerators():
+    """Then both have as many unknowns, and describe the same systems."""
+    one = hj.LDTP([[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]])
+    f = np.linspace(0.02, 0.48, 30)
+    htf = with_values(one.htf(f), one.htf(f).H, 1e-4)
+    free = hj.identify.multiplier_bound(one, htf, overhang=0)
+    joint = hj.identify.ldtp_bound(one, htf)
+    np.testing.assert_allclose(joint.covariance, free.covariance, rtol=1e-8)
+
+
+def test_structure_is_worth_something(model, exact):
+    joint, free = hj.identify.ldtp_bound(model, exact), hj.identify.multiplier_bound(model, exact)
+    np.testing.assert_allclose(joint.multipliers, free.multipliers, atol=1e-12)
+    assert (joint.standard_errors < free.standard_errors).all()
+
+
+def test_bad_input_is_refused_in_a_sentence(model, exact):
+    with pytest.raises(hj.DefinitionError, match="`start` and HTFs have different inputs"):
+        hj.fit_ldtp(exact, hj.LDTP(model.A, model.B, model.C, inputs=("a", "b")))
+    with pytest.raises(hj.DefinitionError, match="too few for"):
+        few = model.htf(F[:2], (0,))
+        hj.fit_ldtp(few, model)
+    hidden = eqx.tree_at(lambda m: m.C, model, jnp.zeros_like(model.C))
+    with pytest.raises(hj.DefinitionError, match="never seen in the outputs"):
+        hj.fit_ldtp(exact, hidden)
+    with pytest.raises(hj.DefinitionError, match="a bound needs the variances"):
+        hj.identify.ldtp_bound(model, model.htf(F))
