@@ -94,8 +94,7 @@ class OptimalDesign(eqx.Module):
             )
         return (
             f"With the rms of {what} limited the usual design is nearly optimal (one stride does "
-            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator, and in "
-            "when in the cycle one pushes."
+            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator."
         )
 
     def __repr__(self) -> str:
