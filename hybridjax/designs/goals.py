@@ -3,12 +3,15 @@
 from typing import Literal
 
 import equinox as eqx
+import numpy as np
 
+from .._core import limits
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, SignalNames
+from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..orbits.cycle import LimitCycle
-from ..sections.section_list import FamilyLike
+from ..sections.section_list import FamilyLike, as_family
 
 
 Criterion = Literal["A", "D"]
@@ -33,6 +36,9 @@ class Multipliers(eqx.Module):
     harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
     overhang: Index | None = eqx.field(static=True, default=None)
 
+    def __check_init__(self):
+        _check_harmonics(self.harmonics)
+
 
 @checked
 class Parameters(eqx.Module):
@@ -55,5 +61,18 @@ class Parameters(eqx.Module):
     criterion: Criterion = eqx.field(static=True, default="A")
     harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
 
+    def __check_init__(self):
+        _check_harmonics(self.harmonics)
+        as_family(self.sections)
+
 
 Goal = Multipliers | Parameters
+
+
+def _check_harmonics(harmonics: Harmonics) -> None:
+    """**Raises:** `DefinitionError` for harmonics that no number of sections has."""
+    given = np.atleast_1d(harmonics)
+    if not len(given) or len(np.unique(given)) < len(given):
+        raise DefinitionError(f"`harmonics` must be distinct and at least one: {harmonics}.")
+    if np.abs(given).max() > limits.SECTIONS:
+        raise DefinitionError(f"`harmonics` must lie within {limits.SECTIONS}, not {harmonics}.")

@@ -10,6 +10,9 @@ from .candidates import Candidates
 
 # Sweeps by which experiments are brought to the same power: to 1e-6 or better.
 _SWEEPS = 100
+# What these leave of a cosine in an experiment, relative to its largest share, to be nothing.
+# Doubled: experiments differ in power by as little.
+_WEAK = 1e-4
 
 
 def worthwhile(
@@ -57,10 +60,11 @@ def to_design(
     for _ in range(_SWEEPS):
         share *= use.sum() / experiments / share.sum(axis=0)
         share *= (use / np.where(use > 0, share.sum(axis=1), 1.0))[:, None]
+    share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
     member, experiment = np.nonzero(share)
     order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
     member, experiment = member[order], experiment[order]
-    part = share[member, experiment] / use[member]
+    part = share[member, experiment] / share.sum(axis=1)[member]
     return Design(
         experiment=experiment,
         line=cosines.line[member],

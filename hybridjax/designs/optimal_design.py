@@ -94,8 +94,7 @@ class OptimalDesign(eqx.Module):
             )
         return (
             f"With the rms of {what} limited the usual design is nearly optimal (one stride does "
-            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator, and in "
-            "when in the cycle one pushes."
+            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator."
         )
 
     def __repr__(self) -> str:
@@ -107,7 +106,7 @@ class OptimalDesign(eqx.Module):
         rows.append(f"  {self.advice}")
         rows.append(
             f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
-            f"needs less than {1 / self.certificate:.0%} of these strides"
+            f"needs less than {1 / self.certificate:.1%} of these strides"
         )
         rows += [
             f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"

@@ -70,7 +70,7 @@ def optimal_design(
       all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
       `"output"`, of each.
     - `noise`: standard deviation of the white noise of each output that is measured, by name. By
-      default all are, 20 dB below their rms deviation in `design`.
+      default all are, 20 dB below their rms deviation in `design` within the limits.
     - `largest`: amplitude that no cosine may exceed; a number, or a function of an array of f. Zero
       forbids a frequency.
     - `experiments`: their number, by default that of `design`. `seed` of phases and division.
@@ -88,7 +88,6 @@ def optimal_design(
     cosines = Candidates.of(usual)
     usual_power = cosines.power_of(usual)
     squares = _squares(model, cosines)
-    given_rms = _rms(squares, usual_power)
     count = usual.experiments if experiments is None else experiments
     most = _largest(largest, cosines, count)
     limits = make_limits(limit, squares, model.inputs, usual_power, most)
@@ -96,13 +95,14 @@ def optimal_design(
         raise DefinitionError(
             f"{count} experiments are more than the {len(cosines.f)} cosines that there are."
         )
-    goal = Multipliers() if isinstance(goal, str) else goal
-    question = question_of(goal, model, cosines, _noise(model, noise, given_rms))
 
     # The usual proportions, as large as the limits allow.
     factor = 1 / limits.use(usual_power).max()
     usual_power = usual_power * factor
     usual = dataclasses.replace(usual, amplitude=usual.amplitude * np.sqrt(factor))
+    usual_rms = _rms(squares, usual_power)
+    goal = Multipliers() if isinstance(goal, str) else goal
+    question = question_of(goal, model, cosines, _noise(model, noise, usual_rms))
 
     before = answer(question, usual_power)
     allowed = np.flatnonzero(most > 0)
@@ -134,7 +134,7 @@ def optimal_design(
         sensitivity=relative,
         limited=limits.names,
         rms=_rms(squares, power),
-        usual_rms=_rms(squares, usual_power),
+        usual_rms=usual_rms,
     )
 
 
@@ -176,8 +176,10 @@ def _largest(
     """The largest mean square of each cosine, if it stands in one experiment only."""
     if largest is None:
         return np.full(len(cosines.f), np.inf)
-    given = largest(cosines.f) if callable(largest) else largest
-    amplitude = np.broadcast_to(np.asarray(given, float), cosines.f.shape)
+    given = np.asarray(largest(cosines.f) if callable(largest) else largest)
+    if given.dtype.kind not in "fiu" or given.shape not in ((), cosines.f.shape):
+        raise DefinitionError("`largest` must give a real number for each frequency.")
+    amplitude = np.broadcast_to(given, cosines.f.shape)
     if not (amplitude >= 0).all():
         raise DefinitionError("`largest` must give amplitudes that are not negative.")
     return amplitude**2 / (2 * count)

@@ -57,9 +57,9 @@ def _wanted(
     """Derivatives of real and imaginary parts, or moduli, by c, and their names."""
     d = len(c)
     if d == 0:
-        raise DefinitionError("the model has no multipliers but zero: nothing decays slowly.")
+        raise DefinitionError("the model has no multipliers but zero: there is nothing to ask for.")
     if goal.which is not None and goal.which >= d:
-        raise DefinitionError(f"there is no multiplier {goal.which}: the model has {d}.")
+        raise DefinitionError(f"`goal`: there is no multiplier {goal.which}, the model has {d}.")
     slope = np.polyval(np.polyder([1.0, *c]), multipliers)
     wanted, names = [], []
     for k in range(d) if goal.which is None else [goal.which]:
@@ -92,7 +92,7 @@ def _about_parameters(
     wanted = free if goal.wanted is None else goal.wanted
     strange = [name for name in wanted if name not in free]
     if strange:
-        raise DefinitionError(f"'{strange[0]}' is wanted, but not one of `free`: {free}.")
+        raise DefinitionError(f"`goal`: '{strange[0]}' is wanted, but not one of `free`, {free}.")
     slopes, candidate = [], []
     for i, here in _by_channel(cosines):
         htf = _measured(model, cosines, here, goal.harmonics, noise, i)

@@ -126,7 +126,9 @@ def _channel(
     weight = error_weights(htf, check_values(htf))
     weighted = dict(zip(htf.harmonics, np.asarray(htf.H) * weight, strict=True))
     if not all((-m) % N in {k % N for k in weighted} for m in weighted):
-        raise DefinitionError(f"`harmonics` must be symmetric about 0, not {htf.harmonics}.")
+        raise DefinitionError(
+            f"the harmonics of `goal` must be symmetric about 0, not {htf.harmonics}."
+        )
     delay = np.exp(-2j * np.pi * f)
     size_of_chi = np.abs(chi(delay, c))
     columns = []

@@ -183,7 +183,7 @@ NEAR = hj.LDTP(
         (dict(noise={"z": 1.0}), "`noise` names 'z'; the outputs are yM, vM"),
         (dict(largest=lambda f: 0 * f), "`largest` is zero at all frequencies"),
         (dict(largest=lambda f: f - 1), "amplitudes that are not negative"),
-        (dict(goal=hj.designs.Multipliers(5)), "there is no multiplier 5: the model has 2"),
+        (dict(goal=hj.designs.Multipliers(5)), "there is no multiplier 5, the model has 2"),
         (dict(goal=hj.designs.Multipliers(harmonics=1)), "symmetric about 0"),
         (dict(design=hj.multisine(8)), "the design has 8 sections"),
         (dict(design=hj.multisine(lines="two-phase", periods=4)), "is a multiple of 1/2"),
