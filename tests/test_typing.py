@@ -145,7 +145,7 @@ UNCHECKED = {
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses", "Inspection",
-        "IntervalForecast", "Lanes",
+        "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
         "NaturalMultipliers", "OutputLevels", "ParameterGuesses", "Phase", "PhaseResponse",

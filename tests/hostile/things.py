@@ -102,6 +102,10 @@ class Things:
         return hj.fit_multipliers(self.estimate, 2, overhang=6)
 
     @ft.cached_property
+    def joint(self):
+        return hj.fit_ldtp(self.uncertain, self.model)
+
+    @ft.cached_property
     def record(self):
         u = np.random.default_rng(0).normal(size=(300, 2))
         y = np.asarray(self.model.simulate(u))
