@@ -147,7 +147,7 @@ UNCHECKED = {
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses", "Inspection",
-        "IntervalForecast", "Lanes",
+        "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
         "NaturalMultipliers", "OptimalDesign", "OutputLevels", "ParameterGuesses", "Phase",

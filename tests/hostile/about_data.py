@@ -128,6 +128,15 @@ def estimates(t):
     yield "multiplier_bound", hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain), {
         "model": instance(t.design), "htf": htf, "overhang": optional([*WHOLE, 10**6]),
     }  # fmt: skip
+    yield "fit_ldtp", hj.fit_ldtp, dict(htf=t.uncertain, start=t.model), {
+        "htf": htf, "start": instance(t.design), "direct": FLAG, "max_steps": COUNT,
+    }  # fmt: skip
+    yield "LDTPFit.htf", t.joint.htf, dict(f=np.array([0.1, 0.2])), {
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
+    }  # fmt: skip
+    yield "ldtp_bound", hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain), {
+        "model": instance(t.design), "htf": htf,
+    }  # fmt: skip
     dims = ["x", 2.5, NAN, 0, -1, [3], [2.5] * 6, ["2"] * 6, 10**6, Other()]
     yield "realize", hj.identify.realize, dict(source=t.exact), {
         "source": [None, "x", 3, NAN, np.zeros(3), t.design, Other()], "dims": dims,

@@ -107,6 +107,10 @@ class Things:
         return hj.optimal_design(self.model, self.design, goal=goal, max_steps=1)
 
     @ft.cached_property
+    def joint(self):
+        return hj.fit_ldtp(self.uncertain, self.model)
+
+    @ft.cached_property
     def record(self):
         u = np.random.default_rng(0).normal(size=(300, 2))
         y = np.asarray(self.model.simulate(u))

@@ -53,8 +53,12 @@ def shaken(model, rng, size=0.02):
     )
 
 
-def test_the_coordinates_are_as_many_as_there_are_models(model, exact):
-    """Entries of all matrices less those of changes of state, and the data show every one."""
+@pytest.mark.parametrize("growth", (1.0, 1.4))
+def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
+    """Entries of all matrices less those of changes of state, and the data show every one; also of
+    an unstable system."""
+    model = eqx.tree_at(lambda m: m.A, model, growth * model.A)
+    assert (np.abs(model.multipliers).max() > 1) == (growth > 1)
     coordinates = local_coordinates(PeriodicModel.of(model, ONE), direct=True)
     dims = np.asarray(model.dims)
     after = np.roll(dims, -1)

@@ -35,7 +35,7 @@ def fit_ldtp(htf: HTF, start: LDTP, *, direct: bool = True, max_steps: StepCount
     states does not count (McKelvey, Helmersson and Ribarits 2004).
 
     ```python
-    start = hj.identify.realize(estimate)
+    start = hj.identify.realize(estimate, dims)
     fit = hj.fit_ldtp(estimate, start)
     ```
 
@@ -66,10 +66,10 @@ def fit_ldtp(htf: HTF, start: LDTP, *, direct: bool = True, max_steps: StepCount
     if not direct:
         model = model._replace(D=[0.0 * D for D in model.D])
     unknowns = local_coordinates(model, direct).size
-    freedom = problem.count - unknowns
+    freedom = problem.residuals - unknowns
     if freedom < 1:
         raise DefinitionError(
-            f"the HTFs hold {problem.count} numbers, too few for {unknowns} unknowns."
+            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns."
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("`start` is resonant at a frequency of the HTFs.")

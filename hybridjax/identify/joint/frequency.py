@@ -49,8 +49,8 @@ class FrequencyProblem(NamedTuple):
         return cls(np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size)
 
     @property
-    def count(self) -> int:
-        """Real residuals."""
+    def residuals(self) -> int:
+        """How many there are, of real ones."""
         return 2 * self.target.size
 
     def errors(self, model: PeriodicModel) -> Complex[np.ndarray, "M F ny nu"]:

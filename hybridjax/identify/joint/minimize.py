@@ -18,8 +18,9 @@ _FIRST_DAMPING = 1e-4
 _LESS, _MORE = 0.1, 4.0
 # Largest damping. Doubled: one attempt more before an iteration stalls.
 _MOST_DAMPING = 1e8
-# Expected decrease of the cost, in units of variances or relative to a cost below 1, that is the
-# last. Doubled: the minimum is missed by up to 0.14 instead of 0.1 standard errors.
+# Decrease of the cost, expected or found, in units of variances or relative to a cost below 1, that
+# is the last. Doubled: the minimum is missed by 0.14 instead of 0.1 standard errors of one
+# combination; more where steps are short, since the data show some combinations badly.
 _SETTLED_GAIN = 1e-2
 # If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
 # rounding explains. Doubled: iterations that stall count as converged more often.
@@ -54,7 +55,10 @@ def minimize(
                 return Minimum(coordinates, equations, cost, bool(small))
             damping *= _MORE
             model = coordinates.moved(equations.step(damping)[0])
+        settled = cost - lower <= _SETTLED_GAIN * min(1.0, cost)
         cost, damping = lower, damping * _LESS
         coordinates = local_coordinates(model, direct)
         equations = problem.linearize(coordinates)
+        if settled:
+            return Minimum(coordinates, equations, cost, True)
     return Minimum(coordinates, equations, cost, False)
