@@ -1,5 +1,7 @@
 """Other libraries get the same numbers, and give them back."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -106,7 +108,8 @@ def test_nyquist_plots_and_controllers_of_python_control():
     control = pytest.importorskip("control")
     model = _model([2] * N, nu=1)
     system, lti = convert.to_control(model), convert.to_lti(model)
-    nyquist = control.nyquist_response(system[0, 0])
+    with warnings.catch_warnings(action="ignore"):  # (of python-control, about its own NumPy)
+        nyquist = control.nyquist_response(system[0, 0])
     f = np.angle(nyquist.contour) / (2 * np.pi)
     assert len(f) > 100
     np.testing.assert_allclose(nyquist.response, lti.htf(f).H[0][:, 0, 0], rtol=0, atol=1e-10)

@@ -152,7 +152,7 @@ def _method(name: str, a, b, c, error, order: float, **rest: float) -> Method:
 
 def _radau(s: int) -> Method:
     legendre = np.polynomial.legendre
-    c = legendre.legroots([*[0] * (s - 1), -1, 1])
+    c = legendre.legroots([*[0] * (s - 1), -1, 1]).real
     for _ in range(3):  # Newton's steps to full precision
         value, slope = (legendre.legval(c, x) for x in _with_derivative([*[0] * (s - 1), -1, 1]))
         c = c - value / slope

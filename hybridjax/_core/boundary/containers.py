@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -63,11 +63,12 @@ class Having(Kind):
         return value
 
 
+@runtime_checkable
 class _Empty(Protocol):
     pass
 
 
-_OF_EVERY_PROTOCOL = {*vars(_Empty), "_is_runtime_protocol"}
+_OF_EVERY_PROTOCOL = set(vars(_Empty))
 
 
 class Subclass(Kind):

@@ -167,7 +167,6 @@ def _about(address: str) -> Mapping[str, Any] | None:
 
     **Raises:** `DefinitionError` for something else in its place.
     """
-    zarr = package("zarr")
     try:
         group = _group(address, "r")
     except FileNotFoundError:
