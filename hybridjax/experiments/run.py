@@ -5,7 +5,6 @@ from typing import Unpack, overload
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Index, Path
-from .._core.execution import Execution
 from .._core.pieces.place import check_share
 from .._core.pieces.run import DaskClient
 from .._core.progress import working
@@ -16,9 +15,7 @@ from ..systems.output import OutputNames
 from .campaign import chunks, prepare
 from .data import ExperimentData
 from .inputs import DesignLike
-from .noise import ProcessNoise
-from .options import CHUNK, Options, OptionsByName, StartName, options_of
-from .stepping.plan import Accuracy
+from .options import CHUNK, OptionsByName, options_of
 from .stored.pieces import prepare_pieces
 from .stored.store import StoredExperiments, store_experiments
 
@@ -58,16 +55,11 @@ def run_experiments(
     design: DesignLike,
     outputs: OutputNames,
     *,
-    start: StartName = "cycle",
-    discard: Index | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy | None = None,
-    record_events: bool = False,
-    execution: Execution | None = None,
     store: Path | None = None,
     chunk: ExperimentCount = CHUNK,
     client: DaskClient | None = None,
     share: tuple[Index, ExperimentCount] = (0, 1),
+    **options: Unpack[OptionsByName],
 ) -> ExperimentData | StoredExperiments:
     """Excite the system around its limit cycle and record its outputs at the sections.
 
@@ -87,9 +79,9 @@ def run_experiments(
     - `design`: a `Design`, or inputs (S, n, nu) that are held from section to section, with n a
         whole number of periods; all that are not discarded are then for estimation.
     - `outputs`: names or `Output`s, recorded at each section before the new input acts.
-    - `start`: "cycle" starts on the limit cycle, "periodic" in the periodic response that the
-        linearization predicts, which leaves a transient of second order in the inputs, and "steady"
-        in the periodic response itself, found by Newton's method, with none.
+    - `start`: "cycle", the default, starts on the limit cycle, "periodic" in the periodic response
+        that the linearization predicts, which leaves a transient of second order in the inputs, and
+        "steady" in the periodic response itself, found by Newton's method, with none.
     - `discard`: cycles that come before the design's periods and are meant to be discarded. By
         default 20 from the cycle (the paper's) and 0 from a periodic start.
     - `process_noise`: a random input beside the excitation, which is not recorded.
@@ -113,16 +105,16 @@ def run_experiments(
     single precision cannot give, if the store holds other experiments (with the difference) or
     cannot be written, or for a client whose workers cannot do it; `ComputationError` for an
     unstable cycle, from which any experiment would run away, where a steady start is not found, and
-    if the cluster is lost.
+    if the cluster is lost; `TypeError` for an argument that does not exist.
     """
-    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    chosen = options_of(run_experiments, options)
     check_share(share)
     if store is not None:
-        job = prepare_pieces(cycle, sections, design, outputs, options, chunk)
+        job = prepare_pieces(cycle, sections, design, outputs, chosen, chunk)
         return store_experiments(store, job, client, share)
     if client is not None or share != (0, 1):
         raise DefinitionError("a `client` or a `share` needs a `store` to put records into.")
-    return prepare(cycle, sections, design, outputs, options).run()
+    return prepare(cycle, sections, design, outputs, chosen).run()
 
 
 @checked

@@ -13,12 +13,10 @@ from .._core.pieces.blocks import Blocks
 from .._core.pieces.layout import Variable
 from .._core.pieces.run import call
 from .._core.progress import say
-from ..engine.settings import Settings
 from ..orbits.cycle import LimitCycle
 from ..orbits.return_map import ReturnMap
 from ..orbits.sweep.batches import Known, Rounds, Tiles
 from ..orbits.sweep.limit_cycles import BATCH, LimitCycles, as_cycles, map_for_sweep, programs_for
-from ..systems.system import HybridSystem
 from .family import Family
 from .points import Grid, Points, spread_out
 from .wanted import Wanted
@@ -55,7 +53,7 @@ class Begun:
     @classmethod
     def first(cls, job: "SweepJob", guess: LimitCycle) -> "Begun":
         """With the points of the coarse pass, before their cycles are known."""
-        map = _rounded(map_for_sweep(guess, None, job.settings))
+        map = _rounded(map_for_sweep(guess, None, None))
         index = spread_out(job.blocks.shape, _COARSE)
         n, d = len(index[0]), map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
@@ -74,13 +72,12 @@ class Begun:
 @dataclasses.dataclass(frozen=True)
 class SweepJob:
     """**Fields:** `family` of systems at `points`, cut into `blocks`; what is `wanted` of their
-    cycles, as `variables`; `settings` of the flow; what pieces begin with (`begun`)."""
+    cycles, as `variables`; what pieces begin with (`begun`)."""
 
     family: Family
     points: Grid | Points
     blocks: Blocks
     wanted: Wanted
-    settings: Settings
     begun: Begun | None = None
     variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
 
@@ -91,7 +88,7 @@ class SweepJob:
         shape = tuple(x.stop - x.start for x in place)
         index = np.meshgrid(*(np.arange(x.start, x.stop) for x in place), indexing="ij")
         tiles = self._tiles(tuple(x.ravel() for x in index), workers)
-        coarse = self._systems(self.begun.index)
+        coarse = self.family.systems(self.points.at(self.begun.index))
         tiles = tiles._replace(known=self.begun.known._replace(systems=coarse))
         cycles = as_cycles(tiles, tiles.solve(int(np.prod(shape))))
         found = self.wanted.values(cycles, self.variables)
@@ -107,14 +104,11 @@ class SweepJob:
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
+        systems = self.family.systems(self.points.at(index))
         programs = programs_for(int(np.prod(self.blocks.shape)))
         # (One size for all, whatever is left at the edges: there is one program.)
         size = min(BATCH, int(np.prod(self.blocks.block)))
-        threads = Execution(workers=workers).threads
-        return Tiles(self._systems(index), self.begun.map, size, threads, programs)
-
-    def _systems(self, index: tuple[np.ndarray, ...]) -> HybridSystem:
-        return self.settings.system(self.family.systems(self.points.at(index)))
+        return Tiles(systems, self.begun.map, size, Execution(workers=workers).threads, programs)
 
 
 def coarse_pass(job: SweepJob, guess: LimitCycle, client: Any) -> tuple[Begun, LimitCycles]:

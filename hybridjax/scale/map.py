@@ -16,7 +16,6 @@ from .._core.pieces.place import check_share, filled
 from .._core.pieces.run import DaskClient
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..engine.settings import Settings
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
@@ -46,7 +45,6 @@ def sweep(
     *,
     measures: Mapping[str, Measure] | None = None,
     guess: LimitCycle | None = None,
-    settings: Settings | None = None,
     chunk: Count | None = None,
     store: Path | None = None,
     client: DaskClient | None = None,
@@ -80,7 +78,6 @@ def sweep(
         always the same shape (`lambda cycle: hj.linearize(cycle, phase, "y").htf(0.3).H`). NaN
         where they raise `ComputationError`.
     - `guess`: the cycle of a system nearby. By default that of the model in the middle.
-    - `settings`: accuracy of the flow; by default 1e-9 per step; and its `solver`.
     - `chunk`: points of a piece at most; by default up to 4000, with `measures` 250.
     - `store`: a folder, or an address that fsspec knows, for a Zarr group. What is there already is
         not computed again: after an interruption, make the same call.
@@ -122,13 +119,12 @@ def sweep(
         "want": list(wanted.names),
         "measures": {name: function_digest(f) for name, f in wanted.measures.items()},
         "guess": None if guess is None else rough(guess),
-        "settings": None if settings is None else _in_words(settings),
         "piece": list(blocks.block),
     }
-    job = SweepJob(family, points, blocks, wanted, Settings() if settings is None else settings)
+    job = SweepJob(family, points, blocks, wanted)
 
     def begin() -> tuple[SweepJob, Layout, list[np.ndarray]]:
-        begun, cycles = coarse_pass(job, _guess(guess, system, settings), client)
+        begun, cycles = coarse_pass(job, _guess(guess, system), client)
         variables = wanted.variables(cycles)
         constants = points.constants(family.units(system))
         more = wanted.constants(cycles)
@@ -139,7 +135,7 @@ def sweep(
         return dataclasses.replace(job, begun=begun, variables=variables), layout, begun.arrays()
 
     def again(layout: Layout, start: list[np.ndarray]) -> SweepJob:
-        begun = Begun.restored(job, _guess(guess, system, settings), start)
+        begun = Begun.restored(job, _guess(guess, system), start)
         return dataclasses.replace(job, begun=begun, variables=layout.variables)
 
     return filled(begin, again, description, store, client, share).dataset()
@@ -155,22 +151,16 @@ def _axes(over: Axes) -> dict[str, np.ndarray]:
     return axes
 
 
-def _in_words(settings: Settings) -> dict[str, Any]:
-    numbers = {"rtol": settings.rtol, "atol": settings.atol, "scale": settings.scale}
-    known = {name: None if x is None else array_digest(x) for name, x in numbers.items()}
-    return known | {"max_steps": settings.max_steps, "solver": repr(settings.solver)}
-
-
 def _middle(values: np.ndarray) -> float:
     return float(np.sort(values)[len(values) // 2])
 
 
-def _guess(guess: LimitCycle | None, system: HybridSystem, settings: Settings | None) -> LimitCycle:
+def _guess(guess: LimitCycle | None, system: HybridSystem) -> LimitCycle:
     if guess is not None:
         return guess
     say("a cycle in the middle")
     try:
-        return find_limit_cycle(system, settings=settings)
+        return find_limit_cycle(system)
     except (ComputationError, DefinitionError) as error:
         raise type(error)(
             f"no limit cycle was found in the middle of the axes, so give one by `guess=`: {error}"

@@ -76,7 +76,6 @@ def scale(t):
             "want": WORD,
             "measures": measures,
             "guess": [3, "cycle", Other()],
-            "settings": ["fast", 1e-9, PHASE],
             "force": FLAG,
             **pieces,
         },

@@ -10,7 +10,6 @@ are left of the state (the others die within the overhang). Multipliers are the 
 For given A and B the state is simulated; C and b are then linear unknowns, section by section.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +42,33 @@ class ProductInputs(NamedTuple):
     """The section from which on each may act."""
 
 
+class Direct(NamedTuple):
+    """Orthonormal bases of what is linear in an output at a section."""
+
+    drift: Float[np.ndarray, "S T k"]
+    """Record by record; zero at rows that are not sampled."""
+    inputs: Float[np.ndarray, "rows r"]
+    """At the rows sampled, of what the drift leaves of inputs."""
+
+    @property
+    def size(self) -> float:
+        """How many unknowns these are."""
+        return float((self.drift**2).sum()) + self.inputs.shape[1]
+
+    def without(
+        self, v: Float[np.ndarray, "rows C"], rows: Bool[np.ndarray, "S T"]
+    ) -> Float[np.ndarray, "rows C"]:
+        """What they leave of columns."""
+        if self.drift.shape[2]:
+            everywhere = np.zeros((*rows.shape, v.shape[1]))
+            everywhere[rows] = v
+            v = self.without_drift(everywhere)[rows]
+        return v - self.inputs @ (self.inputs.T @ v)
+
+    def without_drift(self, v: Float[np.ndarray, "S T C"]) -> Float[np.ndarray, "S T C"]:
+        return v - self.drift @ (self.drift.swapaxes(1, 2) @ v)
+
+
 class SharedStateProblem(NamedTuple):
     """What does not depend on A and B."""
 
@@ -53,8 +79,10 @@ class SharedStateProblem(NamedTuple):
     sampled: Bool[np.ndarray, "S T N ny"]
     back: list[int]
     """k_n, for each section."""
-    direct: list[list[Float[np.ndarray, "rows k"]]]
-    """For each section and output an orthonormal basis of what is linear, at the rows sampled."""
+    direct: list[list[Direct]]
+    """For each section and output."""
+    starts: range
+    """Which columns of the inflow are the states at the beginning of records, one for each."""
     noise: Float[np.ndarray, "N ny"]
     """Standard deviation of the noise that residuals are divided by."""
 
@@ -62,9 +90,9 @@ class SharedStateProblem(NamedTuple):
     def smallest_share_left(self) -> float:
         """Of the samples of a section, by the unknowns of that section and those of B."""
         return min(
-            1 - (basis.shape[1] + self.inflow.shape[2]) / self.sampled[:, :, n, i].sum()
-            for n, bases in enumerate(self.direct)
-            for i, basis in enumerate(bases)
+            1 - (one.size + self.inflow.shape[2]) / self.sampled[:, :, n, i].sum()
+            for n, each in enumerate(self.direct)
+            for i, one in enumerate(each)
         )
 
     def with_noise(self, noise: Float[np.ndarray, "N ny"]) -> "SharedStateProblem":
@@ -113,6 +141,7 @@ def set_up(
         sampled=sampled,
         back=back,
         direct=[_direct(grid, n, back[n], sampled[:, :, n], products) for n in range(N)],
+        starts=range(later.shape[2], later.shape[2] + starts.shape[2]),
         noise=noise,
     )
 
@@ -123,26 +152,27 @@ def _direct(
     back: int,
     sampled: Bool[np.ndarray, "S T ny"],
     products: ProductInputs | None,
-) -> list[Float[np.ndarray, "rows k"]]:
-    """Bases, for each output at section n, of the inputs since cycle p - k_n, and of drift."""
-    S, T, N, ny = grid.y.shape
-    lags = grid.lead + n + back * N + 1
+) -> list[Direct]:
+    """For each output at section n: drift, and the inputs since cycle p - k_n."""
+    lags = grid.lead + n + back * grid.n_sections + 1
     size = np.sqrt((grid.u**2).mean())
-    drift = np.zeros((S, T, S, grid.drift.shape[2]))  # each record has its own
-    drift[np.arange(S), :, np.arange(S)] = grid.drift
-    columns = [lagged_inputs(grid.u, n, lags, grid.lead) / size, drift.reshape(S, T, -1)]
+    columns = [lagged_inputs(grid.u, n, lags, grid.lead) / size]
     if products is not None:
         columns += [delay_cycles(products.values, j) for j in range(1, back + 1)]
         columns.append(products.values[:, :, products.first_section <= n + grid.lead])
     every = np.concatenate(columns, axis=2)
-    bases = []
-    for i in range(ny):
+    found: list[Direct] = []
+    for i in range(sampled.shape[2]):
         if i and np.array_equal(sampled[..., i], sampled[..., i - 1]):
-            bases.append(bases[-1])
+            found.append(found[-1])
             continue
-        left, s, _ = np.linalg.svd(every[sampled[..., i]], full_matrices=False)
-        bases.append(left[:, s > RANK * s.max(initial=0)])
-    return bases
+        rows = sampled[..., i]
+        drift, s, _ = np.linalg.svd(grid.drift * rows[..., None], full_matrices=False)
+        drift = drift * (s > RANK * s.max(axis=1, initial=0, keepdims=True))[:, None]
+        nothing = Direct(drift, np.zeros((int(rows.sum()), 0)))
+        left, s, _ = np.linalg.svd(nothing.without(every[rows], rows), full_matrices=False)
+        found.append(Direct(drift, left[:, s > RANK * s.max(initial=0)]))
+    return found
 
 
 def simulate_state(
@@ -156,83 +186,3 @@ def simulate_state(
         now = now @ model.A.T + drive[:, p]
         x[:, p] = now
     return x
-
-
-def _state_slopes(
-    problem: SharedStateProblem, model: SharedStateModel, x: Float[np.ndarray, "S T d"]
-) -> Float[np.ndarray, "S T d P"]:
-    """Derivatives of x with respect to the entries of A and B, row by row."""
-    S, T, d = x.shape
-    K = problem.inflow.shape[2]
-    slopes = np.zeros((S, T, d, d * (d + K)))
-    for j in range(d):
-        slopes[:, 1:, j, j * d : (j + 1) * d] = x[:, :-1]
-        slopes[:, :, j, d * d + j * K : d * d + (j + 1) * K] = problem.inflow
-    for p in range(1, T):
-        slopes[:, p] += model.A @ slopes[:, p - 1]
-    return slopes
-
-
-class ChannelMisfit(NamedTuple):
-    """What C_n and b_n leave of one output at one section, at the rows sampled."""
-
-    section: int
-    output: int
-    rows: Bool[np.ndarray, "S T"]
-    error: Float[np.ndarray, " rows"]
-    """Over its noise."""
-    jacobian: Float[np.ndarray, "rows P"] | None
-    """Derivative of what is fitted, over the noise; None where it was not asked for."""
-    leverage: Float[np.ndarray, " rows"]
-    """The share of its own error that the fit takes from each sample."""
-
-
-def channel_misfits(
-    problem: SharedStateProblem, model: SharedStateModel, slopes: bool = True
-) -> Iterator[ChannelMisfit]:
-    """For each section and output; `slopes`: whether derivatives are wanted."""
-    x = simulate_state(problem, model)
-    dx = _state_slopes(problem, model, x) if slopes else None
-    for n, k in enumerate(problem.back):
-        before = delay_cycles(x, k)
-        slopes_before = None if dx is None else delay_cycles(dx, k)
-        for i, Q in enumerate(problem.direct[n]):
-            rows = problem.sampled[:, :, n, i]
-
-            def rest(v, Q=Q):
-                return v - Q @ (Q.T @ v)
-
-            X, _ = np.linalg.qr(rest(before[rows]))
-            y = rest(rest(problem.y[rows][:, n, i]))  # the second time for accuracy
-            C = np.linalg.lstsq(rest(before[rows]), y)[0]
-            error, jacobian = y - X @ (X.T @ y), None
-            if slopes_before is not None:
-                jacobian = rest(np.einsum("rdk,d->rk", slopes_before[rows], C))
-                jacobian = (jacobian - X @ (X.T @ jacobian)) / problem.noise[n, i]
-            leverage = (Q**2).sum(axis=1) + (X**2).sum(axis=1)
-            yield ChannelMisfit(n, i, rows, error / problem.noise[n, i], jacobian, leverage)
-
-
-class Misfit(NamedTuple):
-    """All outputs together."""
-
-    cost: float
-    residual: Float[np.ndarray, "S T N ny"]
-    """Over the noise."""
-    freedom: Float[np.ndarray, "N ny"]
-    """Samples less the unknowns C and b."""
-    hessian: Float[np.ndarray, "P P"]
-    """Of Gauss and Newton, by entries of A and B; zero where slopes were not asked for."""
-    gradient: Float[np.ndarray, " P"]
-
-
-def misfit_of(problem: SharedStateProblem, model: SharedStateModel, slopes: bool = True) -> Misfit:
-    residual, freedom = np.zeros(problem.y.shape), np.zeros(problem.noise.shape)
-    P = model.A.size + model.B.size
-    hessian, gradient = np.zeros((P, P)), np.zeros(P)
-    for n, i, rows, error, jacobian, leverage in channel_misfits(problem, model, slopes):
-        residual[rows, n, i], freedom[n, i] = error, len(error) - leverage.sum()
-        if jacobian is not None:
-            hessian += jacobian.T @ jacobian
-            gradient += jacobian.T @ error
-    return Misfit(float((residual**2).sum()), residual, freedom, hessian, gradient)

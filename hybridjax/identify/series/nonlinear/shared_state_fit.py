@@ -7,13 +7,8 @@ from jaxtyping import Float
 
 from ...multipliers.covariance import Covariance, correlated_cycles, serial_covariance
 from ...multipliers.denominator import Denominator
-from .shared_state import (
-    SharedStateModel,
-    SharedStateProblem,
-    channel_misfits,
-    misfit_of,
-    simulate_state,
-)
+from .channels import Columns, channel_misfits, misfit_of
+from .shared_state import SharedStateModel, SharedStateProblem, simulate_state
 
 
 HORIZON = 8  # cycles of inputs from which the first model is made; doubled: more noise, less bias
@@ -170,9 +165,10 @@ def denominator_of(fit: SharedStateFit, errors: Literal["residuals", "white"]) -
     root = vectors * np.sqrt(np.maximum(values, 0))
     S, T, N, ny = problem.y.shape
     error, slopes = np.zeros((S, T, N, ny)), np.zeros((S, T, N, ny, len(inverse)), np.float32)
-    for n, i, rows, e, jacobian, leverage in channel_misfits(problem, model):
+    columns = Columns.of(problem, model)
+    for n, i, rows, e, found, leverage in channel_misfits(problem, model):
         error[rows, n, i] = e / np.maximum(1 - leverage, _SMALLEST_REMAINDER)
-        slopes[rows, n, i] = jacobian @ root
+        slopes[rows, n, i] = found.dense(columns, rows) @ root
     error, slopes = error.reshape(S, T, -1), slopes.reshape(S, T, N * ny, -1)
     # What each cycle would miss a fit to the others by: errors that are large where inputs are, as
     # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
