@@ -98,8 +98,8 @@ class TorsoWalker(HybridSystem):
     swing leg. A step ends where the stance leg has come to the angle `stride`; there the swing leg
     takes over, sticks where it lands, and the legs change their names.
 
-    Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt, J.
-    W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
+    Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt,
+    J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
     Locomotion, 2007 (there with g = 9.8); the paper itself could not be compared.
     """
 
