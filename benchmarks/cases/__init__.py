@@ -6,7 +6,7 @@ from typing import NamedTuple
 # In the order in which they run.
 NAMES = (
     "experiments", "honesty", "precision", "sizes", "size", "jacobians", "gradients", "grid",
-    "steps", "solvers", "cores", "compile",
+    "steps", "solvers", "walkers", "cores", "compile",
 )  # fmt: skip
 
 

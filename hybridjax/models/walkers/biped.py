@@ -14,7 +14,7 @@ from ...systems.chart import Chart
 from ...systems.output import Output
 from ...systems.system import Guess, HybridSystem, Parameter, parameter
 from ...systems.transition import Transition
-from .torso_walker import accelerations_under_feedback, chain, held, on_its_foot, tips
+from .torso_walker import accelerations_under_feedback, chain, held, tips
 
 
 class Step(Chart):
@@ -26,7 +26,7 @@ class Step(Chart):
     biped: "FiveLinkBiped"
 
     def field(self, t, state, u):
-        p, mechanism = self.biped, self.biped.standing()
+        p, mechanism = self.biped, self.biped.mechanism()
         q, v = state[:5], state[5:]
         leg, leg_rate = (q[0] + q[1]) / 2, (v[0] + v[1]) / 2
         # The swing knee bends while the stance leg passes from -stride to stride.
@@ -89,8 +89,9 @@ class FiveLinkBiped(HybridSystem):
     lift: Parameter = parameter(0.4, unit="rad", doc="further flexion of the swing knee")
     stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
 
-    def floating(self) -> Mechanism:
-        """The biped with free feet, by five angles and the place (x, y) of the stance foot."""
+    def mechanism(self) -> Mechanism:
+        """The biped by five angles, and where its feet are free, by the place (x, y) of the stance
+        foot."""
         order = np.array([0, 1, 2, 1, 0])
         m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])[order]
         about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]
@@ -101,10 +102,6 @@ class FiveLinkBiped(HybridSystem):
         )
         arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
         return chain(arms, m, about_joint - m * center**2, self.g)
-
-    def standing(self) -> Mechanism:
-        """The biped on its stance foot, by five angles."""
-        return on_its_foot(self.floating())
 
     def _swing_foot(self, q):
         """Its place relative to the stance foot, (x, y)."""
@@ -132,7 +129,7 @@ class FiveLinkBiped(HybridSystem):
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
         foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
-        after = self.floating().impact(q, v, foot).velocity
+        after = self.mechanism().impact(q, v, foot).velocity
         return jnp.concatenate([q[4::-1], after[4::-1]])
 
     def guess(self):

@@ -30,20 +30,18 @@ def chain(
     inertias: Float[Array, " n"] | float,
     g: Array,
 ) -> Mechanism:
-    """A chain of n links in a plane, by their angles and the place (x, y) of its foot."""
+    """A chain of n links in a plane, by their angles and the place (x, y) of its foot, or by their
+    angles alone, with its foot at the origin."""
     n = arms.shape[1]
-    places = lambda q: q[n:, None] + tips(arms, q[:n])  # noqa: E731
+
+    def places(q):
+        return tips(arms, q[:n]) + (q[n:, None] if len(q) > n else 0.0)
 
     def kinetic(q, v):
         speeds = jax.jvp(places, (q,), (v,))[1]
         return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
 
     return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]))
-
-
-def on_its_foot(mechanism: Mechanism) -> Mechanism:
-    """A chain whose foot stands at the origin, by its angles."""
-    return mechanism.along(lambda q: jnp.append(q, jnp.zeros(2)))
 
 
 def accelerations_under_feedback(
@@ -78,7 +76,7 @@ class Step(Chart):
     walker: "TorsoWalker"
 
     def field(self, t, state, u):
-        p, mechanism = self.walker, self.walker.standing()
+        p, mechanism = self.walker, self.walker.mechanism()
         q, v = state[:3], state[3:]
         upright = held(q[2] - p.lean, v[2], p.stiffness)
         mirrored = held(q[0] + q[1], v[0] + v[1], p.stiffness)
@@ -98,8 +96,8 @@ class TorsoWalker(HybridSystem):
     swing leg. A step ends where the stance leg has come to the angle `stride`; there the swing leg
     takes over, sticks where it lands, and the legs change their names.
 
-    Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt, J.
-    W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
+    Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt,
+    J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
     Locomotion, 2007 (there with g = 9.8); the paper itself could not be compared.
     """
 
@@ -116,16 +114,13 @@ class TorsoWalker(HybridSystem):
     stride: Parameter = parameter(math.pi / 8, unit="rad", doc="angle of the leg that ends a step")
     stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
 
-    def floating(self) -> Mechanism:
-        """The walker with free feet, by three angles and the place (x, y) of the stance foot."""
+    def mechanism(self) -> Mechanism:
+        """The walker by three angles, and where its feet are free, by the place (x, y) of the
+        stance foot."""
         half = self.r / 2
         legs = half * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
         arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
         return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
-
-    def standing(self) -> Mechanism:
-        """The walker on its stance foot, by three angles."""
-        return on_its_foot(self.floating())
 
     def charts(self):
         return {"step": Step(self)}
@@ -144,7 +139,7 @@ class TorsoWalker(HybridSystem):
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
-        after = self.floating().impact(q, v, self._swing_foot).velocity
+        after = self.mechanism().impact(q, v, self._swing_foot).velocity
         swapped = np.array([1, 0, 2])
         return jnp.concatenate([q[swapped], after[swapped]])
 
