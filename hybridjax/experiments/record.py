@@ -12,6 +12,7 @@ from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
 from .._core.boundary.scalars import Number
+from .._core.boundary.stream import Stream
 from .._core.text import listed
 from ..errors import DefinitionError
 
@@ -115,7 +116,7 @@ class HasRecords(Protocol):
     def records(self) -> Sequence[Record]: ...
 
 
-RecordedData = HasRecords | Iterable[HasRecords]
+RecordedData = HasRecords | Annotated[Iterable[HasRecords], Stream(HasRecords, "data")]
 """What fits to series take: data made of records, or several such data."""
 
 

@@ -24,10 +24,21 @@ class Stream(Kind):
         others = np.ndarray | jax.Array | Mapping
         if isinstance(value, others) or not isinstance(value, Iterable):
             raise self.refused(value)
-        return self._checked(value)
+        once = iter(value) is value
+        return self.checked(value) if once else _Again(self, value)
 
-    def _checked(self, value: Iterable) -> Iterator[Any]:
+    def checked(self, value: Iterable) -> Iterator[Any]:
         for i, item in enumerate(value):
             if not isinstance(item, self.item.cls):
                 raise self.item.refused(item).inside(i).of(self.argument)
             yield item
+
+
+class _Again:
+    """What can be iterated over more than once, checked each time."""
+
+    def __init__(self, stream: Stream, value: Iterable):
+        self._stream, self._value = stream, value
+
+    def __iter__(self) -> Iterator[Any]:
+        return self._stream.checked(self._value)

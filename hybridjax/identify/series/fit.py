@@ -72,7 +72,7 @@ def fit_series(
 
     - `data`: a `Record`, which may have gaps and any length, `ExperimentData` (all cycles are used,
       not only its window; failed experiments are left out), `SectionData`, or several of them.
-      `StoredExperiments` are read part by part, some ten times over.
+      `StoredExperiments` are read part by part, some thirty times over.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
     - `overhang`: lags of the numerators beyond d N; None means N.
     - `start`: "free": whatever happened before a record, the state at its start is unknown.
