@@ -1,7 +1,5 @@
 """Goals as questions to the data: unknowns, what cosines say of them, and what is wanted."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
@@ -9,6 +7,7 @@ from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
 from ..identify.multipliers.structured import StructuredFit
+from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from .allocation import Question
@@ -33,8 +32,9 @@ def question_of(
     **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
     that do not exist, and combinations that the data cannot see, which are named.
     """
-    about = _about_multipliers if isinstance(goal, Multipliers) else _about_parameters
-    return about(goal, model, cosines, noise)
+    if isinstance(goal, Multipliers):
+        return _about_multipliers(goal, model, cosines, noise)
+    return _about_parameters(goal, model, cosines, noise)
 
 
 def _about_multipliers(
@@ -88,8 +88,8 @@ def _wanted(
 def _about_parameters(
     goal: Parameters, model: Model, cosines: Candidates, noise: Float[np.ndarray, " ny"]
 ) -> Question:
-    free = goal.free
-    wanted = free if goal.wanted is None else goal.wanted
+    free = tuple(goal.free)
+    wanted = free if goal.wanted is None else tuple(goal.wanted)
     strange = [name for name in wanted if name not in free]
     if strange:
         raise DefinitionError(f"`goal`: '{strange[0]}' is wanted, but not one of `free`, {free}.")
@@ -106,7 +106,7 @@ def _about_parameters(
         candidate.append(np.broadcast_to(here[:, None], shape).ravel())
     sensitivities = DirectSensitivities(np.concatenate(candidate), np.concatenate(slopes, axis=1))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
-    return Question(sensitivities, rows, tuple(wanted), free, goal.criterion)
+    return Question(sensitivities, rows, wanted, free, goal.criterion)
 
 
 def _by_channel(cosines: Candidates) -> list[tuple[int, Int[np.ndarray, " k"]]]:
@@ -118,7 +118,7 @@ def _measured(
     model: Model,
     cosines: Candidates,
     here: np.ndarray,
-    harmonics: Sequence[int] | int,
+    harmonics: Harmonics,
     noise: Float[np.ndarray, " ny"],
     channel: int,
 ) -> HTF:
