@@ -8,7 +8,7 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
   input or output limited, what is saved, the certificate, and seconds of the process to find it.
 - `known`: rms errors of draws with new noise, four draws of the phases; the model is known. The
   input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise.
-- `nothing`: from nothing: 640 strides of equal amplitudes, a design from what they say, 2560 of
+- `nothing`: from nothing: 1280 strides of equal amplitudes, a design from what they say, 2560 of
   that, and one fit to both, against the bound of as many strides of equal amplitudes. Four
   first blocks; the harmonic mean of what they save, and the least.
 

@@ -3,7 +3,6 @@
 from typing import Literal
 
 import equinox as eqx
-import numpy as np
 
 from .._core import limits
 from .._core.boundary.checked import checked
@@ -71,8 +70,8 @@ Goal = Multipliers | Parameters
 
 def _check_harmonics(harmonics: Harmonics) -> None:
     """**Raises:** `DefinitionError` for harmonics that no number of sections has."""
-    given = np.atleast_1d(harmonics)
-    if not len(given) or len(np.unique(given)) < len(given):
+    given = [harmonics] if isinstance(harmonics, int) else list(harmonics)
+    if not given or len(set(given)) < len(given):
         raise DefinitionError(f"`harmonics` must be distinct and at least one: {harmonics}.")
-    if np.abs(given).max() > limits.SECTIONS:
+    if max(map(abs, given)) > limits.SECTIONS:
         raise DefinitionError(f"`harmonics` must lie within {limits.SECTIONS}, not {harmonics}.")

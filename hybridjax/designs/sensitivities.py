@@ -64,14 +64,15 @@ class DenominatorSensitivities(Sensitivities):
     """Of the coefficients c of the denominator, as `fit_multipliers` finds them: all numerators
     are unknown."""
 
+    candidate: Int[np.ndarray, " rows"]
     channels: tuple[Channel, ...]
     order: int
 
-    @property
-    def candidate(self) -> Int[np.ndarray, " rows"]:
-        entries = [one.slopes.shape[1] // self.order for one in self.channels]
-        each = [np.repeat(one.cosine, n) for one, n in zip(self.channels, entries, strict=True)]
-        return np.concatenate(each)
+    @classmethod
+    def of(cls, channels: list[Channel], order: int) -> "DenominatorSensitivities":
+        entries = [one.slopes.shape[1] // order for one in channels]
+        each = [np.repeat(one.cosine, n) for one, n in zip(channels, entries, strict=True)]
+        return cls(np.concatenate(each), tuple(channels), order)
 
     def only(self, some: Int[np.ndarray, " k"]) -> "DenominatorSensitivities":
         channels = []
@@ -80,7 +81,7 @@ class DenominatorSensitivities(Sensitivities):
             if len(kept):
                 basis, _ = powers_basis(one.basis[kept])
                 channels.append(Channel(number, basis, one.slopes[kept]))
-        return DenominatorSensitivities(tuple(channels), self.order)
+        return self.of(channels, self.order)
 
     def at(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, "d rows"]:
         left = []
@@ -110,7 +111,7 @@ def denominator_sensitivities(
         size = len(c) * htf.n_sections + (htf.n_sections if overhang is None else overhang) + 1
         require_frequencies(htf, len(c), size)
         channels.append(_channel(htf, cosine, c, size))
-    return DenominatorSensitivities(tuple(channels), len(c))
+    return DenominatorSensitivities.of(channels, len(c))
 
 
 def _channel(

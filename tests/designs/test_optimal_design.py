@@ -199,3 +199,24 @@ def test_multipliers_that_are_not_simple():
     with pytest.raises(hj.DefinitionError, match="is not simple"):
         goal = hj.designs.Multipliers(harmonics=0)
         hj.optimal_design(NEAR, hj.multisine(2, 32, band=(0, 1)), goal=goal)
+
+
+@pytest.mark.slow
+def test_physical_parameters():
+    """Their standard errors with the usual design are those of `fit_model`'s sensitivities."""
+    cycle = hj.find_limit_cycle(hj.models.Duffing())
+    sections = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
+    model = hj.linearize(cycle, sections, outputs=("x", "v"))
+    usual, free = hj.multisine(8, periods=16).scaled(0.001), ("damping", "amplitude")
+    goal = hj.designs.Parameters(cycle, sections, free, harmonics=(-1, 0, 1))
+    plan = hj.optimal_design(model, usual, goal=goal, noise={"x": 1e-4})
+    assert plan.certificate < 1.03 and plan.saved > 10
+
+    htf = model.htf(usual.frequencies, (-1, 0, 1))
+    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
+    seen = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
+    S = hj.fitting.identifiability(
+        cycle.system, hj.ObservedHTF(seen, sections), free, guess=cycle
+    ).sensitivity
+    bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
+    np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)
