@@ -175,7 +175,8 @@ class LDTP(eqx.Module):
     def _dimension(self) -> str:
         if is_traced(self.dims):
             return "traced"
-        low, high = np.min(self.dims), np.max(self.dims)
+        dims = np.asarray(self.dims)
+        low, high = dims.min(), dims.max()
         one = self.A.ndim == 3 and not is_traced(self)  # not a batch of them
         lost = int(low) - self.rank() if one else 0
         besides = f" (multipliers zero or below resolution: {lost})" if lost else ""

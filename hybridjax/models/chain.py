@@ -41,12 +41,19 @@ class Contact(eqx.Module):
     chain: "BouncingChain"
     i: int
 
+    def table(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Its height and speed."""
+        chain = self.chain
+        rate = 2 * jnp.pi / chain.T
+        phase = rate * t - 2 * jnp.pi * self.i / chain.n
+        return chain.A * jnp.sin(phase), chain.A * rate * jnp.cos(phase)
+
     def gap(self, t, q, u):
-        return q[self.i] - self.chain.table(t, self.i)[0]
+        return q[self.i] - self.table(t)[0]
 
     def impact(self, t, q, u):
         e, n = self.chain.restitution, self.chain.n
-        _, speed = self.chain.table(t, self.i)
+        _, speed = self.table(t)
         return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
 
 
@@ -62,7 +69,7 @@ class BouncingChain(HybridSystem):
     input_units = ("N",)
     time_unit = "s"
 
-    n: Count = eqx.field(static=True, default=2)
+    n: Count = eqx.field(static=True, default=2, metadata={"unit": "", "doc": "number of masses"})
     m: Parameter = parameter(1.0, unit="kg", doc="mass of each")
     k: Parameter = parameter(0.3, unit="N/m", doc="stiffness between neighbors")
     c: Parameter = parameter(0.05, unit="N s/m", doc="damping between neighbors")
@@ -70,12 +77,6 @@ class BouncingChain(HybridSystem):
     restitution: Parameter = parameter(0.5, doc="relative speed kept at an impact")
     A: Parameter = parameter(0.3, unit="m", doc="amplitude of the table")
     T: Parameter = parameter(1.0, unit="s", doc="period of the table")
-
-    def table(self, t: ArrayLike, i: ArrayLike) -> tuple[Array, Array]:
-        """Height and speed of the table below mass `i`, counted from 0."""
-        rate = 2 * jnp.pi / self.T
-        phase = rate * t - 2 * jnp.pi * i / self.n
-        return self.A * jnp.sin(phase), self.A * rate * jnp.cos(phase)
 
     def charts(self):
         return {"flight": Flight(self)}
