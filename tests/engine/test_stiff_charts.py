@@ -1,4 +1,4 @@
-"""A stiff chart beside one that is not, against a closed form.
+"""A stiff chart beside one that is not, in all that is computed from a cycle: closed forms.
 
 A room is heated until its sensor shows 0.7, and cools until it shows 0.3. The sensor follows at
 once while the room is heated, and slowly while it cools.
@@ -63,6 +63,14 @@ def exact(fast=1e4, slow=5.0):
     return heating + cooling, on
 
 
+def by_differences(order):
+    """Derivatives of the period by `slow`."""
+    d, at = 0.02, np.arange(-2, 3)
+    values = [exact(slow=5.0 + d * k)[0] for k in at]
+    weights = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}[order]
+    return np.dot(weights, values) / 12 / d**order
+
+
 @pytest.fixture(scope="module")
 def cycle():
     """(The longest time to wait for it follows from the slow modes.)"""
@@ -77,11 +85,57 @@ def test_the_cycle(cycle):
     np.testing.assert_array_equal(cycle.multipliers, [0.0])
 
 
+def period(cycle):
+    return lambda slow: hj.find_limit_cycle(Thermostat(slow=slow), cycle).period
+
+
+@pytest.mark.slow
+def test_derivatives_under_all_transformations(cycle):
+    slow = jnp.array([5.0, 5.5])
+    first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(slow)
+    np.testing.assert_allclose(first[0], by_differences(1), rtol=1e-6)
+    backwards = jax.jit(jax.grad(period(cycle)))(5.5)
+    np.testing.assert_allclose(backwards, first[1], rtol=1e-8)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(period(cycle))))(5.0)
+    np.testing.assert_allclose(twice, by_differences(2), rtol=1e-4)
+
+
 @pytest.mark.slow
 def test_a_sweep(cycle):
     slow = np.array([4.0, 5.0, 7.0])
     found = hj.find_limit_cycles([Thermostat(slow=x) for x in slow], cycle)
     np.testing.assert_allclose(found.period, [exact(slow=x)[0] for x in slow], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_branch(cycle):
+    branch = hj.continuation(cycle, "slow", (5.0, 6.0), step=0.5)
+    expected = [exact(slow=x)[0] for x in branch.values]
+    np.testing.assert_allclose(branch.cycles.period, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_fit(cycle):
+    data = hj.ObservedCycle([hj.AtEvent("on")], period=exact(slow=5.3)[0], period_std=1e-6)
+    fit = hj.fit_model(Thermostat(), data, free=("slow",), guess=cycle)
+    np.testing.assert_allclose(fit.system.slow, 5.3, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
+def test_experiments(cycle, start):
+    sections = [hj.AtEvent("on"), hj.AtEvent("off")]
+    placed = hj.place_sections(cycle, sections)
+    model = hj.linearize(cycle, placed, outputs="x")
+    u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
+    data = hj.run_experiments(
+        cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12
+    )
+    assert (data.result == 0).all()
+    x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
+    np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
+    there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
+    np.testing.assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
 
 
 class Counted(Thermostat):
