@@ -176,9 +176,8 @@ class LDTP(eqx.Module):
         if is_traced(self.dims):
             return "traced"
         dims = np.asarray(self.dims)
-        low, high = dims.min(), dims.max()
-        one = self.A.ndim == 3 and not is_traced(self)  # not a batch of them
-        lost = int(low) - self.rank() if one else 0
+        low, high, batch = dims.min(), dims.max(), self.A.ndim > 3
+        lost = 0 if batch or is_traced(self) else int(low) - self.rank()
         besides = f" (multipliers zero or below resolution: {lost})" if lost else ""
         return f"{low}{'' if low == high else f' to {high}'}{besides}"
 

@@ -128,9 +128,7 @@ def test_experiments(cycle, start):
     placed = hj.place_sections(cycle, sections)
     model = hj.linearize(cycle, placed, outputs="x")
     u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
-    data = hj.run_experiments(
-        cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12
-    )
+    data = hj.run_experiments(cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12)
     assert (data.result == 0).all()
     x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
     np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
