@@ -200,11 +200,10 @@ def _make(address: str, layout: Layout, start: list[np.ndarray]) -> None:
 
     def constant(where: Any, name: str, x: Constant) -> None:
         values = np.asarray(x.values)
-        kept = where.create_array(
-            name, shape=values.shape, dtype=values.dtype, chunks=values.shape or "auto",
-            dimension_names=x.dims, attributes=dict(x.attributes), **common,
+        where.create_array(
+            name, data=values, chunks=values.shape or "auto", dimension_names=x.dims,
+            attributes=dict(x.attributes), **common,
         )  # fmt: skip
-        kept[...] = values
 
     for name, x in layout.variables.items():
         group.create_array(
