@@ -160,8 +160,8 @@ def _write_sections(found: Identification, folder: Path) -> None:
             place = np.divmod(record.first_section + np.arange(len(record.u)), data.n_sections)
             start = io.StringIO()
             trial = found.recording.trials[data.trials[k]].name
-            csv.writer(start, lineterminator=",").writerow([trial, k])
-            line = start.getvalue().replace("%", "%%") + numbers
+            csv.writer(start, lineterminator="").writerow([trial, k])
+            line = start.getvalue().replace("%", "%%") + "," + numbers
             np.savetxt(
                 file, np.column_stack([*place, times, record.u, record.y]), line, newline="\r\n"
             )

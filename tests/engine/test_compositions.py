@@ -14,13 +14,14 @@ import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
+from hybridjax._core.compilation.compile import compiler_options
 from hybridjax.engine.settings import Settings
 
 from ..conftest import APEX
 
 
 # Compiled in a third of the time, to slower programs.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = compiler_options()
 compiled = ft.partial(jax.jit, compiler_options=QUICK)
 TIGHT = Settings(rtol=1e-13, atol=1e-13)
 

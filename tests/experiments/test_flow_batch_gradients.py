@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compilation.compile import compiler_options
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.stepping.plan import make_plan
@@ -17,7 +18,7 @@ from ..conftest import APEX, OUTPUTS
 
 
 # Compiled in a third of the time, to slower programs.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = compiler_options()
 compiled = ft.partial(jax.jit, compiler_options=QUICK)
 PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g")
 SETTINGS = Settings(1e-12, 1e-12, 1024, np.ones((2, 4)))

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compilation.compile import compiler_options
 
 from ..conftest import APEX
 
 
 # Compiled in a third of the time, to slower programs.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = compiler_options()
 compiled = ft.partial(jax.jit, compiler_options=QUICK)
 SECTIONS = hj.ClockPhase(4, anchor=APEX)
 STIFFNESS = jnp.array([[9.8, 10.0], [10.1, 10.3]])

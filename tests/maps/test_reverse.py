@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
+from hybridjax._core.compilation.compile import compiler_options
 
 
 # Compiled in a third of the time, to slower programs.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = compiler_options()
 
 
 def test_the_trace_of_the_jugglers_monodromy():

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compilation.compile import compiler_options
 
 from ..conftest import APEX
 
 
 # Compiled in a third of the time, to slower programs.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = compiler_options()
 
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -200,8 +200,9 @@ def _make(address: str, layout: Layout, start: list[np.ndarray]) -> None:
 
     def constant(where: Any, name: str, x: Constant) -> None:
         values = np.asarray(x.values)
+        whole = tuple(max(n, 1) for n in values.shape)
         where.create_array(
-            name, data=values, chunks=values.shape or "auto", dimension_names=x.dims,
+            name, data=values, chunks=whole or "auto", dimension_names=x.dims,
             attributes=dict(x.attributes), **common,
         )  # fmt: skip
 
