@@ -3,10 +3,9 @@
 import numpy as np
 
 from ..._core.boundary.checked import checked
-from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.bound import MultiplierBound
+from ..multipliers.bound import MultiplierBound, exact_htf
 from ..multipliers.denominator import multipliers_of
 from ..multipliers.error_weights import check_values, error_weights
 from ..series.realization import realize
@@ -39,21 +38,9 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
 
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(model, name) != getattr(htf, name):
-            raise DefinitionError(
-                f"model and HTFs have different {name}: {getattr(model, name)} and "
-                f"{getattr(htf, name)}."
-            )
-    if htf.variance is None:
-        raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
+    exact = exact_htf(model, htf)
     lags = max(_PERIODS * model.n_sections, _LAGS - 1) + 1
     minimal = realize(np.asarray(model.impulse_response(lags)))
-    exact = model.htf(htf.f, htf.harmonics)
-    exact = HTF(
-        htf.f, exact.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-        variance=htf.variance,
-    )  # fmt: skip
     scale = check_values(exact)
     problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
     direct = bool(np.asarray(model.D).any())

@@ -32,6 +32,26 @@ class MultiplierBound(MultiplierEstimate):
         return f"MultiplierBound({self.show_multipliers()})"
 
 
+def exact_htf(model: LDTP, htf: HTF) -> HTF:
+    """The exact HTFs of a model, with the frequencies, harmonics and variances of others.
+
+    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
+    """
+    for name in ("n_sections", "inputs", "outputs"):
+        if getattr(model, name) != getattr(htf, name):
+            raise DefinitionError(
+                f"model and HTFs have different {name}: {getattr(model, name)} and "
+                f"{getattr(htf, name)}."
+            )
+    if htf.variance is None:
+        raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
+    H = model.htf(htf.f, htf.harmonics).H
+    return HTF(
+        htf.f, H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
+        variance=htf.variance,
+    )  # fmt: skip
+
+
 @checked
 def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> MultiplierBound:
     r"""The Cramer-Rao bound of the multipliers of a known model.
@@ -49,19 +69,7 @@ def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> Mu
     **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
     few frequencies to find the multipliers at all.
     """
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(model, name) != getattr(htf, name):
-            raise DefinitionError(
-                f"model and HTFs have different {name}: {getattr(model, name)} and "
-                f"{getattr(htf, name)}."
-            )
-    if htf.variance is None:
-        raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
-    exact = model.htf(htf.f, htf.harmonics)
-    exact = HTF(
-        htf.f, exact.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs,
-        variance=htf.variance,
-    )  # fmt: skip
+    exact = exact_htf(model, htf)
     multipliers = model.multipliers
     d, N = len(multipliers), model.n_sections
     size = d * N + (N if overhang is None else overhang) + 1
