@@ -38,6 +38,13 @@ class Stubborn(Mark):
         return (q[0] - self.levels[self.i]) if self.i != 1 else q[0] - self.levels[1]
 
 
+class Halving(Mark):
+    """Adds 2^-i."""
+
+    def reset(self, t, q, u):
+        return q.at[2].add(2**-self.i)
+
+
 class Circle(hj.HybridSystem):
     """A point that turns at rate 1, and counts marks in a third state."""
 
@@ -86,6 +93,13 @@ def test_events_are_those_of_transitions_of_their_own(other):
     assert [e.name for e in one.events] == [e.name for e in two.events]
     np.testing.assert_allclose([e.time for e in one.events], [e.time for e in two.events])
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+
+
+def test_numbers_are_those_of_python():
+    """In JAX, an integer to the power of one that is negative is another number."""
+    one, two = run(Circle(mark=Halving)), run(Circle(mark=Halving, apart=True))
+    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+    assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
 
 
 def test_times_of_events_are_exact():

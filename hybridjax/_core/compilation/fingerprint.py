@@ -137,12 +137,12 @@ def _processor() -> list[str]:
 
 def _has_rules(jaxpr: jex.Jaxpr) -> bool:
     return any(
-        eqn.primitive.name in _RULES or any(map(_has_rules, _jaxprs(eqn.params)))
+        eqn.primitive.name in _RULES or any(map(_has_rules, jaxprs(eqn.params)))
         for eqn in jaxpr.eqns
     )
 
 
-def _jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
+def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
     """Those among the parameters of an equation, or in tuples of these. (`jax.extend.core` has a
     function for it since JAX 0.10.)"""
     values = [x for v in params.values() for x in (v if isinstance(v, tuple) else (v,))]
