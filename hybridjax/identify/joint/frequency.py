@@ -66,6 +66,10 @@ class FrequencyProblem(NamedTuple):
             return np.inf
         return cost if np.isfinite(cost) else np.inf
 
+    def reweighted(self, model: PeriodicModel) -> "FrequencyProblem":
+        """Itself: its weights are known."""
+        return self
+
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
         gram, gradient = np.zeros((P, P)), np.zeros(P)
