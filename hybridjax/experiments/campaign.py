@@ -84,7 +84,7 @@ class Campaign:
         start = self.start.states(u, rows.start)
         applied = u
         if self.process_noise is not None:
-            applied = u + self.process_noise.draw(u.shape, rows.start)
+            applied = u + self.process_noise.draw(u.shape, self.placed.n_sections, rows.start)
         cycle_log = self._cycle_log() if self.record_events else None
         capacity = 0 if cycle_log is None else 1 + int(np.asarray(cycle_log.count).max())
         while True:
@@ -235,6 +235,8 @@ def prepare(
     discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
     inputs = check_inputs(design, discard, N, nu)
+    if options.process_noise is not None:
+        options.process_noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
         raise DefinitionError(
             f"a {start} start needs inputs of a whole number of windows: use `discard=0`."

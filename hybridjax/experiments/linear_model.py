@@ -38,8 +38,8 @@ def simulate_experiments(
 
     **Returns:** `ExperimentData` with `discard + P` cycles.
 
-    **Raises:** `DefinitionError` if N or the number of inputs differ, or if a periodic response
-    does not exist (a multiplier that is a P-th root of one).
+    **Raises:** `DefinitionError` if N (also of the process noise) or the number of inputs differ,
+    or if a periodic response does not exist (a multiplier that is a P-th root of one).
     """
     if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
         raise DefinitionError(
@@ -50,7 +50,9 @@ def simulate_experiments(
         discard = DISCARD if start == "cycle" else 0
     u = design.inputs(design.periods + discard)
     x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None
-    applied = u if process_noise is None else u + process_noise.draw(u.shape)
+    applied = u
+    if process_noise is not None:
+        applied = u + process_noise.draw(u.shape, design.n_sections)
     y = _simulate(ldtp, jnp.asarray(applied), x0)
     return ExperimentData(
         u,

@@ -7,10 +7,11 @@ import numpy as np
 
 from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Numbers, Seed
+from .._core.boundary.kinds import NonNegative, Numbers, Seed
 from .._core.results import Result
 from ..errors import DefinitionError
 from .data import ExperimentData, Simulated
+from .noise import with_memory
 
 
 @checked
@@ -19,17 +20,20 @@ def add_noise(
     *,
     std: Annotated[Numbers, Reals(sign="nonnegative")] | None = None,
     snr: float | None = None,
+    memory: NonNegative = 0.0,
     seed: Seed = 0,
 ) -> ExperimentData:
-    """White measurement noise added to all outputs of all samples.
+    """Measurement noise added to all outputs of all samples, independent from output to output.
 
     **Arguments:**
 
-    - `std`: its standard deviation, one number or one for each output; or
+    - `std`: its standard deviation, one number, one for each output, or (N, ny) also by section; or
     - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
       all samples and good experiments) and of the noise, in dB, for each output.
+    - `memory`: its correlation time in cycles, as of `ProcessNoise`; 0 for white noise.
 
-    **Raises:** `DefinitionError` unless exactly one of them is given, for so many outputs.
+    **Raises:** `DefinitionError` unless exactly one of `std` and `snr` is given, for so many
+    outputs and sections.
     """
     if (std is None) == (snr is None):
         raise DefinitionError("add_noise needs either `std` or `snr`.")
@@ -37,11 +41,15 @@ def add_noise(
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
-    ny = data.y.shape[2]
-    if np.shape(std) not in ((), (ny,)):
-        raise DefinitionError(f"`std` must be one number or {ny}, one for each output, not {std}.")
-    noise = np.random.default_rng(seed).normal(size=data.y.shape) * np.asarray(std)
-    return eqx.tree_at(lambda d: d.y, data, data.y + noise)
+    N, ny = data.n_sections, data.y.shape[2]
+    if np.shape(std) not in ((), (ny,), (N, ny)):
+        raise DefinitionError(
+            f"`std` must be one number or {ny}, one for each output, or of shape ({N}, {ny}), not "
+            f"{std}."
+        )
+    white = np.random.default_rng(seed).normal(size=data.y.shape)
+    each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])
+    return eqx.tree_at(lambda d: d.y, data, data.y + each * with_memory(white, memory, N))
 
 
 @checked

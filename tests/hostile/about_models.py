@@ -355,11 +355,12 @@ def experiments(t):
         "discard": optional(WHOLE), "start": WORD, "process_noise": [0.1, "x", PHASE],
     }  # fmt: skip
     yield "ProcessNoise", hj.experiments.ProcessNoise, dict(std=0.1), {
-        "std": NONNEGATIVE, "seed": SEED,
+        "std": ["1", 1j, NAN, True, INF, -1.0, [0.1, -0.1], [[0.1]], Other()], "seed": SEED,
+        "memory": NONNEGATIVE,
     }  # fmt: skip
     yield "add_noise", hj.experiments.add_noise, dict(data=t.data, std=0.1), {
         "data": instance(t.design), "std": ["1", 1j, NAN, True, INF, -1.0, [0.1] * 3, Other()],
-        "seed": SEED,
+        "seed": SEED, "memory": NONNEGATIVE,
         "snr": ["x", 1j, NAN, Other(), 10.0],
     }  # fmt: skip
     yield "odd_part", hj.experiments.odd_part, dict(data=t.data), {"data": instance(t.design)}

@@ -162,7 +162,7 @@ def test_noise_by_its_ratio(model):
         with pytest.raises(hj.DefinitionError):
             hj.experiments.add_noise(data, **bad)
     with pytest.raises(
-        hj.DefinitionError, match="ProcessNoise: `std` must be a number that is not negative"
+        hj.DefinitionError, match="ProcessNoise: `std` must be a nonnegative number"
     ):
         realized(model, 1, process_noise=-1.0)
 

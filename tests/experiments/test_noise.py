@@ -1,0 +1,89 @@
+"""Noise of any color: process noise and measurement noise have the moments that they say."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+N, CYCLES, COUNT = 8, 30, 400
+STD = np.linspace(0.5, 2.0, N)
+ProcessNoise = hj.experiments.ProcessNoise
+
+
+def require_mean(each, expected):
+    """The mean over independent experiments, (S, ...), is what is expected but for four standard
+    errors."""
+    error = each.std(axis=0) / np.sqrt(len(each))
+    assert (np.abs(each.mean(axis=0) - expected) < 4 * error).all()
+
+
+def require_color(x, std, memory):
+    """Of series (S, n, k): the variance at every section (from the first cycle on), and the
+    correlation from each section to later ones, against the closed form."""
+    std = np.broadcast_to(std, (N, x.shape[2]))
+    by_cycle = x.reshape(len(x), -1, *std.shape)
+    require_mean((by_cycle**2).mean(axis=1), std**2)
+    require_mean(x[:, 0] ** 2, std[0] ** 2)
+    later = x / np.resize(std, x.shape[1:])
+    for lag in (1, 3, N, 4 * N):
+        found = (later[:, lag:] * later[:, :-lag]).mean(axis=1)
+        require_mean(found, np.exp(-lag / (N * memory)) if memory else 0.0)
+    require_mean((later[:, :, 0] * later[:, :, 1]).mean(axis=1), 0.0)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.2, 3.0])
+@pytest.mark.parametrize("std", [0.7, STD])
+def test_process_noise_has_the_color_that_it_says(std, memory):
+    noise = ProcessNoise(std, seed=1, memory=memory)
+    x = noise.draw((COUNT, N * CYCLES, 2), N)
+    require_color(x, np.broadcast_to(std, N)[:, None], memory)
+
+
+def test_white_noise_is_one_draw_for_each_sample():
+    x = ProcessNoise(0.7, seed=5).draw((1, 6, 2), 3, first=4)
+    np.testing.assert_array_equal(x[0], 0.7 * np.random.default_rng((5, 4)).normal(size=(6, 2)))
+
+
+def test_noise_does_not_depend_on_the_parts_in_which_it_is_drawn():
+    noise = ProcessNoise(STD, seed=2, memory=1.0)
+    whole = noise.draw((7, 5 * N, 1), N)
+    parts = [noise.draw((k, 5 * N, 1), N, first) for k, first in ((3, 0), (0, 3), (4, 3))]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_process_noise_can_be_compared():
+    assert ProcessNoise(STD) == ProcessNoise(list(STD)) != ProcessNoise(STD, memory=1.0)
+    assert hash(ProcessNoise(STD)) == hash(ProcessNoise(STD.copy()))
+
+
+@pytest.fixture(scope="module")
+def data():
+    shape = COUNT, N * CYCLES
+    return hj.ExperimentData(
+        np.ones((*shape, 1)), np.zeros((*shape, 2)), n_sections=N, periods=CYCLES
+    )
+
+
+@pytest.mark.parametrize("memory", [0.0, 2.0])
+@pytest.mark.parametrize("std", [0.3, [0.3, 2.0], np.stack([STD, STD[::-1]], axis=1)])
+def test_measurement_noise_has_the_color_that_it_says(data, std, memory):
+    noisy = hj.experiments.add_noise(data, std=std, memory=memory, seed=3)
+    require_color(noisy.y, std, memory)
+
+
+def test_other_numbers_of_sections_are_refused(data, hopper_cycle, placed_isochrons):
+    three, match = ProcessNoise([1.0] * 3), "for each of 3 sections, but the experiments have"
+    model = hj.linearize(hopper_cycle, placed_isochrons, "yM")
+    for run in (
+        lambda: hj.experiments.simulate_experiments(model, hj.multisine(), process_noise=three),
+        lambda: hj.run_experiments(
+            hopper_cycle, placed_isochrons, hj.multisine(), "yM", process_noise=three
+        ),
+    ):
+        with pytest.raises(hj.DefinitionError, match=match):
+            run()
+    with pytest.raises(hj.DefinitionError, match=r"or of shape \(8, 2\)"):
+        hj.experiments.add_noise(data, std=np.ones((3, 2)))
+    with pytest.raises(hj.DefinitionError, match="one for each section"):
+        ProcessNoise(np.ones((N, 2)))
