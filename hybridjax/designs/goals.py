@@ -18,7 +18,7 @@ Criterion = Literal["A", "D"]
 
 @checked
 class Multipliers(eqx.Module):
-    """The Floquet multipliers, as `fit_multipliers` finds them, with all numerators unknown.
+    """The Floquet multipliers.
 
     **Arguments:**
 
@@ -26,17 +26,24 @@ class Multipliers(eqx.Module):
       for all, a conjugate pair once.
     - `part`: `"position"`, real and imaginary parts, or `"modulus"`.
     - `criterion`: `"A"`, the sum of the variances, or `"D"`, the volume of the ellipsoid.
-    - `harmonics` and `overhang`: those of the fit.
+    - `estimator`: the function that will find them. `"fit_multipliers"` leaves all numerators
+      free, `"fit_ldtp"` the matrices of a model of this model's (minimal) dimensions.
+    - `harmonics`: those of the fit; None means -2 to 2 for `fit_multipliers`, all for `fit_ldtp`.
+      `overhang`: of `fit_multipliers`.
     """
 
     which: Index | None = eqx.field(static=True, default=None)
     part: Literal["position", "modulus"] = eqx.field(static=True, default="position")
     criterion: Criterion = eqx.field(static=True, default="A")
-    harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
+    estimator: Literal["fit_multipliers", "fit_ldtp"] = eqx.field(
+        static=True, default="fit_multipliers"
+    )
+    harmonics: Harmonics | None = eqx.field(static=True, default=None)
     overhang: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        _check_harmonics(self.harmonics)
+        if self.harmonics is not None:
+            _check_harmonics(self.harmonics)
 
 
 @checked

@@ -26,8 +26,8 @@ class OptimalDesign(eqx.Module):
 
     - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
     - `usual`: the design with which it is compared, scaled to the same limits.
-    - `names` (g,) of the wanted quantities; `covariance` (g, g) with `design`, `usual_covariance`
-      with `usual`.
+    - `names` (g,) of the wanted quantities; `variances` (g,) with `design`, `usual_variances` with
+      `usual`.
     - `criterion` and `usual_criterion`: what was made small, in units of a variance.
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
       to that of this one; with one limit the largest sensitivity of a line per unit of what is
@@ -43,8 +43,8 @@ class OptimalDesign(eqx.Module):
     design: Design
     usual: Design
     names: tuple[str, ...] = eqx.field(static=True)
-    covariance: Float[np.ndarray, "g g"]
-    usual_covariance: Float[np.ndarray, "g g"]
+    variances: Float[np.ndarray, " g"]
+    usual_variances: Float[np.ndarray, " g"]
     criterion: float
     usual_criterion: float
     certificate: float
@@ -60,12 +60,12 @@ class OptimalDesign(eqx.Module):
     @property
     def standard_errors(self) -> Float[np.ndarray, " g"]:
         """Of the wanted quantities, with one run of `design`."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.sqrt(self.variances)
 
     @property
     def usual_standard_errors(self) -> Float[np.ndarray, " g"]:
         """The same with one run of `usual`."""
-        return np.sqrt(np.diag(self.usual_covariance))
+        return np.sqrt(self.usual_variances)
 
     @property
     def strides(self) -> int:

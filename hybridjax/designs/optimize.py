@@ -1,7 +1,7 @@
 """The design that answers a question in the fewest strides."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -13,13 +13,15 @@ from .._core.progress import working
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import allocate, answer
+from .allocation import allocate
 from .candidates import Candidates
 from .goals import Goal, Multipliers
 from .grouping import to_design, worthwhile
 from .limits import Limit, make_limits
+from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
-from .questions import Model, question_of
+from .questions.measured import Model
+from .questions.question_of import question_of
 
 
 # Cosines that together tell less than such a part of all are left out, the largest part of these
@@ -27,9 +29,6 @@ from .questions import Model, question_of
 # distortion hides.
 _NEGLIGIBLE = (2e-3, 1e-4, 0.0)
 _AS_GOOD = 1.01
-# Noise that nobody gave, relative to the rms of the output in the usual design: 20 dB. Doubled: all
-# standard errors are.
-_NOISE = 0.1
 
 
 @checked
@@ -40,7 +39,7 @@ def optimal_design(
     *,
     goal: Literal["multipliers"] | Goal = "multipliers",
     limit: Limit = "input",
-    noise: Mapping[str, Positive] | None = None,
+    noise: NoiseLike | None = None,
     largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
     experiments: ExperimentCount | None = None,
     seed: Seed = 0,
@@ -69,8 +68,10 @@ def optimal_design(
     - `limit`: rms values by name, of inputs or of outputs (their deviation from the cycle), over
       all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
       `"output"`, of each.
-    - `noise`: standard deviation of the white noise of each output that is measured, by name. By
-      default all are, 20 dB below their rms deviation in `design` within the limits.
+    - `noise`: of each output that is measured, by name: the standard deviation of white noise, or
+      a function that gives it by the frequency of the output (0 to N/2 cycles per period), the root
+      of a spectrum. By default all are measured, with white noise 20 dB below their rms deviation
+      in `design` within the limits.
     - `largest`: amplitude that no cosine may exceed; a number, or a function of an array of f. Zero
       forbids a frequency.
     - `experiments`: their number, by default that of `design`. `seed` of phases and division.
@@ -102,9 +103,10 @@ def optimal_design(
     usual = dataclasses.replace(usual, amplitude=usual.amplitude * np.sqrt(factor))
     usual_rms = _rms(squares, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
-    question = question_of(goal, model, cosines, _noise(model, noise, usual_rms))
+    errors = make_noise(model.outputs, model.n_sections, noise, usual_rms)
+    question = question_of(goal, model, cosines, errors, usual_power)
 
-    before = answer(question, usual_power)
+    before = question.answer(usual_power)
     allowed = np.flatnonzero(most > 0)
     ideal = allocate(question.only(allowed), limits.only(allowed), usual_power[allowed], max_steps)
     for negligible in _NEGLIGIBLE:
@@ -122,8 +124,8 @@ def optimal_design(
         design=to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed),
         usual=usual,
         names=question.names,
-        covariance=best.answer.covariance * shorter,
-        usual_covariance=before.covariance,
+        variances=best.answer.variances * shorter,
+        usual_variances=before.variances,
         criterion=best.answer.criterion * shorter,
         usual_criterion=before.criterion,
         certificate=ideal.certificate.excess * worse,
@@ -155,19 +157,6 @@ def _rms(
     squares: dict[str, Float[np.ndarray, " K"]], power: Float[np.ndarray, " K"]
 ) -> dict[str, float]:
     return {name: float(np.sqrt(square @ power)) for name, square in squares.items()}
-
-
-def _noise(
-    model: Model, noise: Mapping[str, float] | None, rms: dict[str, float]
-) -> Float[np.ndarray, " ny"]:
-    """Standard deviation of each output's noise, infinite for those that are not measured."""
-    if noise is None:
-        noise = {name: _NOISE * rms[name] for name in model.outputs if rms[name] > 0}
-    unknown = [name for name in noise if name not in model.outputs]
-    if unknown or not noise:
-        what = f"names '{unknown[0]}'" if unknown else "names no output"
-        raise DefinitionError(f"`noise` {what}; the outputs are {', '.join(model.outputs)}.")
-    return np.array([noise.get(name, np.inf) for name in model.outputs])
 
 
 def _largest(

@@ -12,11 +12,17 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import DefinitionError
-from ..identify.multipliers.denominator import chi
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.variable_projection import powers_basis
-from ..linear.htf import HTF
+from ...errors import DefinitionError
+from ...identify.multipliers.denominator import chi
+from ...identify.multipliers.error_weights import check_values, error_weights, require_frequencies
+from ...identify.multipliers.variable_projection import powers_basis
+from ...linear.htf import HTF
+from .measured import Measured
+
+
+# Decimal digits to which the errors of two entries must agree (up to a factor) to be treated
+# together. One digit less: fewer channels, with errors that are off by as much.
+_EQUAL_WEIGHTS = 9
 
 
 class Sensitivities(eqx.Module):
@@ -50,7 +56,7 @@ class DirectSensitivities(Sensitivities):
 
 
 class Channel(NamedTuple):
-    """All HTFs of one input: E real equations (two for each cosine)."""
+    """HTFs of one input with the same E real equations (two for each cosine, or four)."""
 
     cosine: Int[np.ndarray, " E"]
     """The candidate that each equation belongs to."""
@@ -95,60 +101,89 @@ class DenominatorSensitivities(Sensitivities):
 
 
 def denominator_sensitivities(
-    htfs: list[HTF],
-    cosines: list[Int[np.ndarray, " F"]],
-    c: Float[np.ndarray, " d"],
-    overhang: int | None,
+    seen: list[Measured], c: Float[np.ndarray, " d"], overhang: int | None
 ) -> DenominatorSensitivities:
-    """From the exact HTFs of each input (alone) with the variances that power 1 gives, and which
-    of the candidates their frequencies are.
-
-    **Raises:** `DefinitionError` if they cannot tell the multipliers, or harmonics are not
+    """**Raises:** `DefinitionError` if the HTFs cannot tell the multipliers, or harmonics are not
     symmetric about 0.
     """
     channels = []
-    for htf, cosine in zip(htfs, cosines, strict=True):
+    for htf, cosine, _ in seen:
         size = len(c) * htf.n_sections + (htf.n_sections if overhang is None else overhang) + 1
         require_frequencies(htf, len(c), size)
-        channels.append(_channel(htf, cosine, c, size))
+        channels += _channels(htf, cosine, c, size)
     return DenominatorSensitivities.of(channels, len(c))
 
 
-def _channel(
+def _channels(
     htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], size: int
-) -> Channel:
-    r"""From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z.
+) -> list[Channel]:
+    r"""From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
+    errors depend on the frequency in the same way.
 
     Where H_m and H_{-m} are different, sum and difference of H_m(w) and H_m(-w) = conj H_{-m}(w)
     are explained by cosines and sines times the coefficients of B_m, whose real and imaginary parts
-    are thereby apart: with the same real equations as those of the real B_0.
+    are thereby apart: with the same real equations as those of the real B_0. This needs errors of
+    the same size in both; otherwise all four equations are taken together.
     """
     N, f = htf.n_sections, np.asarray(htf.f)
-    weight = error_weights(htf, check_values(htf))
-    weighted = dict(zip(htf.harmonics, np.asarray(htf.H) * weight, strict=True))
-    if not all((-m) % N in {k % N for k in weighted} for m in weighted):
+    if not all((-m) % N in {k % N for k in htf.harmonics} for m in htf.harmonics):
         raise DefinitionError(
             f"the harmonics of `goal` must be symmetric about 0, not {htf.harmonics}."
         )
-    delay = np.exp(-2j * np.pi * f)
-    size_of_chi = np.abs(chi(delay, c))
-    columns = []
-    for j in range(1, len(c) + 1):
-        for m, H in weighted.items():
-            if m < 0 and -m in weighted:
-                continue
-            slope = H[:, :, 0] * (delay**j / size_of_chi)[:, None]
-            if m == 0 or 2 * m % N == 0:
-                columns.append(np.concatenate([slope.real, slope.imag]))
-                continue
-            mirror = (weighted[-m][:, :, 0] * (delay**j / size_of_chi)[:, None]).conj()
-            even, odd = (slope + mirror) / np.sqrt(2), (slope - mirror) / np.sqrt(2)
-            columns.append(np.concatenate([even.real, odd.imag]))
-            columns.append(np.concatenate([even.imag, -odd.real]))
+    weight = dict(zip(htf.harmonics, error_weights(htf, check_values(htf))[..., 0], strict=True))
+    delay = np.exp(-2j * np.pi * f) ** np.arange(1, len(c) + 1)[:, None]
+    slope = {
+        m: weight[m] * H[:, :, 0] * (delay / np.abs(chi(delay[0], c)))[..., None]
+        for m, H in zip(htf.harmonics, np.asarray(htf.H), strict=True)
+    }  # (d, F, ny)
     angle = 2 * np.pi / N * f[:, None] * np.arange(size)
-    basis, _ = powers_basis(np.concatenate([np.cos(angle), -np.sin(angle)]))
-    basis = basis / np.concatenate([size_of_chi, size_of_chi])[:, None]
-    return Channel(np.concatenate([cosine, cosine]), basis, np.concatenate(columns, axis=1))
+    powers = np.concatenate([np.cos(angle), -np.sin(angle)])
+    groups: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
+
+    def add(basis, factor, entries):
+        # (Only the shape of the factors counts: numerators take any size.)
+        shape = factor / factor.max()
+        key = np.round(shape, _EQUAL_WEIGHTS).tobytes()
+        if key not in groups:
+            size_of_chi = np.tile(np.abs(chi(delay[0], c)), len(shape) // len(f))
+            groups[key] = powers_basis(basis)[0] * (shape / size_of_chi)[:, None], []
+        groups[key][1].extend(entries)
+
+    for m in htf.harmonics:
+        if m < 0 and -m in weight:
+            continue
+        for i in range(len(htf.outputs)):
+            here, w = slope[m][..., i], weight[m][:, i]
+            if 2 * m % N == 0:
+                add(powers, np.tile(w, 2), [_parts(here.real, here.imag)])
+                continue
+            mirror, v = slope[-m][..., i], weight[-m][:, i]
+            if np.allclose(v, w, rtol=10.0**-_EQUAL_WEIGHTS, atol=0):
+                even, odd = (here + mirror.conj()) / 2**0.5, (here - mirror.conj()) / 2**0.5
+                both = _parts(even.real, odd.imag), _parts(even.imag, -odd.real)
+                add(powers, np.tile(w, 2), both)
+                continue
+            entry = _parts(here.real, here.imag, mirror.real, mirror.imag)
+            add(_both_parts(powers), np.concatenate([w, w, v, v]), [entry])
+    return [
+        Channel(
+            np.tile(cosine, len(basis) // len(f)),
+            basis,
+            np.stack(entries, axis=2).reshape(len(basis), -1),
+        )
+        for basis, entries in groups.values()
+    ]
+
+
+def _parts(*parts: Float[np.ndarray, "d F"]) -> Float[np.ndarray, "E d"]:
+    """Real equations, those of one part after those of the other."""
+    return np.concatenate(parts, axis=1).T
+
+
+def _both_parts(powers: Float[np.ndarray, "E R"]) -> Float[np.ndarray, "2*E 2*R"]:
+    """What real and imaginary parts of the coefficients of B_m make of H_m and of H_{-m}."""
+    cosine, sine = np.split(powers, 2)
+    return np.block([[cosine, -sine], [sine, cosine], [cosine, sine], [sine, -cosine]])
 
 
 def _renumbered(
