@@ -28,7 +28,8 @@ from ..vector_math import rewrite
 _PACKAGE = __name__.partition(".")[0]
 # Objects of JAX in the parameters of equations that their names and `repr` describe.
 _BY_REPR = (
-    "UnspecifiedValue", "Mesh", "AbstractMesh", "NamedSharding", "PartitionSpec", "AvalLayout"
+    "UnspecifiedValue", "Mesh", "AbstractMesh", "NamedSharding", "PartitionSpec", "AvalLayout",
+    "FTTuple", "FTPyTree",  # how loops group their variables (JAX 0.12)
 )  # fmt: skip
 # Functions in the parameters of equations. Derivative rules are described by the derivative of the
 # program that has them (see `Program`).

@@ -218,8 +218,10 @@ def _size(matrix, axis):
     """A power of two near the largest number along some axes (any, where all are zero): over it,
     squares neither overflow nor vanish, and nothing is rounded."""
     largest = jnp.max(jnp.abs(jax.lax.stop_gradient(matrix)), axis=axis, keepdims=True)
-    _, exponent = jnp.frexp(jnp.where(jnp.isfinite(largest), largest, 1.0))
-    return jnp.ldexp(jnp.ones_like(largest), exponent - 1)
+    exponent = np.array(np.inf, matrix.dtype).view(f"i{matrix.dtype.itemsize}")  # (all its bits)
+    bits = jax.lax.bitcast_convert_type(largest, exponent.dtype) & exponent
+    power = jax.lax.bitcast_convert_type(bits, matrix.dtype)
+    return jnp.where((power > 0) & jnp.isfinite(power), power, 1.0)
 
 
 def _angle(off, first, second):
