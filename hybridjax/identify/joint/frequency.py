@@ -16,10 +16,11 @@ $\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ...linear.htf import HTF
 from .coordinates import LocalCoordinates
@@ -53,6 +54,13 @@ class FrequencyProblem(NamedTuple):
         """How many there are, of real ones."""
         return 2 * self.target.size
 
+    def thinned(self, step: int) -> "FrequencyProblem":
+        """Only every so many lines."""
+        rows = slice(step // 2, None, step)
+        return FrequencyProblem(
+            self.f[rows], self.harmonics, self.target[:, rows], self.weight[:, rows]
+        )
+
     def errors(self, model: PeriodicModel) -> Complex[np.ndarray, "M F ny nu"]:
         """In units of standard deviations."""
         return self.weight * (self.target - transfer(model, self.f, self.harmonics))
@@ -70,11 +78,44 @@ class FrequencyProblem(NamedTuple):
         """Itself: its weights are known."""
         return self
 
+    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
+        """With the B (and D, if it is free) that fit best, in which the HTFs are linear.
+
+        What cannot be computed, as at a resonance, is left as it is.
+        """
+        N, (ny, nu) = model.n_sections, model.D[0].shape
+        m = np.array(self.harmonics)
+        ends = np.cumsum([0, *[len(B) for B in model.B]])
+        waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
+        size = ends[-1] + (N * ny if direct else 0)
+        gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
+        for rows in _chunks(len(self.f), size * len(m) * ny):
+            J = np.zeros((size, len(m), rows.stop - rows.start, ny), complex)
+            np.concatenate(_after(model, self.f[rows], m), out=J[: ends[-1]])
+            if direct:
+                D = J[ends[-1] :].reshape(N, ny, *J.shape[1:])
+                for i in range(ny):
+                    D[:, i, :, :, i] = waves[:, :, None]
+            for j in range(nu):
+                weight = self.weight[:, rows, :, j]
+                columns = (J * weight).reshape(size, -1).view(float)
+                target = np.ascontiguousarray(weight * self.target[:, rows, :, j])
+                gram[j] += columns @ columns.T
+                along[j] += columns @ target.ravel().view(float)
+        try:
+            each = [NormalEquations(g, a).solution() for g, a in zip(gram, along, strict=True)]
+        except np.linalg.LinAlgError:
+            return model
+        found = np.stack(each, axis=1)
+        B = [found[a:b] for a, b in pairwise(ends.tolist())]
+        D = list(found[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
+        return model._replace(B=B, D=D)
+
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
         gram, gradient = np.zeros((P, P)), np.zeros(P)
-        for rows, slopes in transfer_slopes(coordinates, self.f, self.harmonics):
-            slopes *= self.weight[:, rows]
+        for rows in _chunks(len(self.f), P * self.weight[:, 0].size):
+            slopes = _slopes(coordinates, self.f[rows], self.harmonics, self.weight[:, rows])
             J = slopes.reshape(P, -1).view(float)
             gram += J @ J.T
             gradient += J @ np.ascontiguousarray(error[:, rows]).ravel().view(float)
@@ -86,13 +127,14 @@ def transfer(
 ) -> Complex[np.ndarray, "M F ny nu"]:
     """The harmonic transfer functions of a model."""
     N = model.n_sections
-    states = _states(model, np.exp(2j * np.pi / N * f))
     G = np.stack(
-        [x @ C.T + D.T for x, C, D in zip(states, model.C, model.D, strict=True)]
-    )  # (N, F, nu, ny)
-    n = np.arange(N)
-    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, n)) / N
-    return np.tensordot(waves, G, 1).swapaxes(2, 3)
+        [
+            _real_times(C, x) + D[:, None, :]
+            for x, C, D in zip(states_at(model, f), model.C, model.D, strict=True)
+        ]
+    )  # (N, ny, F, nu)
+    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
+    return np.tensordot(waves, G, 1).swapaxes(1, 2)
 
 
 def transfer_slopes(
@@ -100,70 +142,104 @@ def transfer_slopes(
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
     """Derivatives of the harmonic transfer functions, for some frequencies at a time."""
     ny, nu = coordinates.model.D[0].shape
-    step = max(_HELD // (coordinates.size * len(harmonics) * ny * nu), 1)
-    for first in range(0, len(f), step):
-        rows = slice(first, min(first + step, len(f)))
-        yield rows, _slopes(coordinates, f[rows], np.array(harmonics))
+    for rows in _chunks(len(f), coordinates.size * len(harmonics) * ny * nu):
+        ones = np.ones((len(harmonics), len(f[rows]), ny, nu))
+        yield rows, _slopes(coordinates, f[rows], harmonics, ones)
 
 
-def _slopes(coordinates, f, m):
-    model, places = coordinates.model, coordinates.places
+def _chunks(length: int, size: int) -> list[slice]:
+    """Frequencies in stretches, for each of which so many numbers are held."""
+    step = max(_HELD // size, 1)
+    return [slice(k, min(k + step, length)) for k in range(0, length, step)]
+
+
+def _slopes(
+    coordinates: LocalCoordinates,
+    f: Float[np.ndarray, " F"],
+    harmonics: tuple[int, ...],
+    weight: Float[np.ndarray, "M F ny nu"],
+) -> Complex[np.ndarray, "P M F ny nu"]:
+    """Derivatives of the HTFs times weights."""
+    model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
     N, (ny, nu) = model.n_sections, model.D[0].shape
-    z = np.exp(2j * np.pi / N * f)
-    z_m = np.exp(2j * np.pi / N * (m[:, None] + f)).ravel()
-    states, mu = _states(model, z), adjoints(model, z_m)
-    J = np.zeros((coordinates.size, len(m), len(f), ny, nu), complex)
+    states, after = states_at(model, f), _after(model, f, m)
+    J = np.zeros((coordinates.size, *weight.shape), complex)
     for n, at in enumerate(places):
-        x = states[n]  # (F, nu, d)
-        after = mu[(n + 1) % N] / z_m[:, None, None]
-        wave = np.exp(-2j * np.pi / N * m * n)[:, None, None, None] / N
-        nu_m = after.reshape(len(m), len(f), ny, -1) * wave
+        wave = _waves(m, n, N)[:, None, None]
         shapes = dict(coordinates.blocks(n))
-        left = nu_m @ coordinates.to_A[n] + wave * coordinates.to_C[n]  # (M, F, ny, q)
-        Y = J[at["Y"]].reshape(*shapes["Y"], *J.shape[1:])
-        right = x.transpose(2, 0, 1)[None, :, None, :, None]  # (1, d, 1, F, 1, nu)
-        np.multiply(left.transpose(3, 0, 1, 2)[:, None, ..., None], right, out=Y)
-        B = J[at["B"]].reshape(*shapes["B"], *J.shape[1:])
+        left = _real_times(coordinates.to_A[n].T, after[n])  # (q, M, F, ny)
+        left += coordinates.to_C[n].T[:, None, None, :] * wave
+        Y, B = (J[at[name]].reshape(*shapes[name], *weight.shape) for name in ("Y", "B"))
         for j in range(nu):
-            B[:, j, ..., j] = nu_m.transpose(3, 0, 1, 2)
+            x = states[n][None, :, None, :, None, j]  # (1, d, 1, F, 1)
+            np.multiply((left * weight[..., j])[:, None], x, out=Y[..., j])
+            B[:, j, ..., j] = after[n] * weight[..., j]
         if coordinates.direct:
-            D = J[at["D"]].reshape(*shapes["D"], *J.shape[1:])
+            D = J[at["D"]].reshape(*shapes["D"], *weight.shape)
             for i, j in np.ndindex(ny, nu):
-                D[i, j, ..., i, j] = wave[..., 0, 0]
+                D[i, j, ..., i, j] = wave[..., 0] * weight[..., i, j]
     return J
 
 
-def _states(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
-    """x~ at each section, (F, nu, d)."""
+def _after(model: PeriodicModel, f: Float[np.ndarray, " F"], m: Int[np.ndarray, " M"]):
+    """What a change of the state after each section adds to the HTFs, (d, M, F, ny) each."""
+    N, ny = model.n_sections, len(model.C[0])
+    z = np.exp(2j * np.pi / N * (m[:, None] + f))
+    mu = adjoints(model, z.ravel())
+    factors = [(_waves(m, n, N)[:, None] / z)[..., None] for n in range(N)]
+    return [
+        mu[(n + 1) % N].reshape(-1, len(m), len(f), ny) * factor for n, factor in enumerate(factors)
+    ]
+
+
+def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
+    return np.exp(-2j * np.pi / N * n * m) / N
+
+
+def states_at(
+    model: PeriodicModel, f: Float[np.ndarray, " F"]
+) -> list[Complex[np.ndarray, "d F nu"]]:
+    r"""$\tilde x$ at each section."""
+    N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
+    back = np.exp(-2j * np.pi / N * f)[:, None]
 
     def around(x):
         found = []
         for A, B in zip(model.A, model.B, strict=True):
             found.append(x)
-            x = (x @ A.T + B.T) / z[:, None, None]
+            x = (_real_times(A, x) + B[:, None, :]) * back
         return found, x
 
-    nu, phi = model.B[0].shape[1], model.monodromy()
-    _, forced = around(np.zeros((len(z), nu, len(phi)), complex))
-    return around(forced @ _resolvent(phi.T, z, model.n_sections))[0]
+    _, forced = around(np.zeros((len(phi), len(f), nu), complex))
+    return around(np.einsum("fab,bfj->afj", _resolvent(phi, np.exp(-2j * np.pi * f)), forced))[0]
 
 
 def adjoints(
     model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "F ny d"]]:
-    r"""$\mu$ at each section."""
+) -> list[Complex[np.ndarray, "d F ny"]]:
+    r"""$\mu$ at each section, transposed."""
+    ny, phi = len(model.C[0]), model.monodromy()
+    back = 1 / z[:, None]
 
     def around(mu):
         found = []
         for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
-            mu = C + mu @ A / z[:, None, None]
+            mu = _real_times(A.T, mu)
+            mu *= back
+            mu += C.T[:, None, :]
             found.append(mu)
         return found[::-1]
 
-    ny, phi = len(model.C[0]), model.monodromy()
-    forced = around(np.zeros((len(z), ny, len(phi)), complex))[0]
-    return around(forced @ _resolvent(phi, z, model.n_sections))
+    forced = around(np.zeros((len(phi), len(z), ny), complex))[0]
+    return around(np.einsum("fba,bfi->afi", _resolvent(phi, z**-model.n_sections), forced))
 
 
-def _resolvent(phi: Float[np.ndarray, "d d"], z: Complex[np.ndarray, " F"], N: int):
-    return np.linalg.inv(np.eye(len(phi)) - phi * z[:, None, None] ** -N)
+def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
+    """(a, *rest): a product with a real matrix."""
+    parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
+    return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
+
+
+def _resolvent(phi: Float[np.ndarray, "d d"], z_N: Complex[np.ndarray, " F"]):
+    r"""$(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
+    return np.linalg.inv(np.eye(len(phi)) - phi * z_N[:, None, None])

@@ -59,8 +59,8 @@ def noise_spectrum(
     mu = adjoints(model, z)
     total = np.zeros((len(z), len(noise.outputs)))
     for n in range(N):
-        after = mu[(n + 1) % N] / z[:, None, None]
-        total += (np.abs(model.D[n] + after @ model.B[n]) ** 2).sum(axis=2)
+        after = np.tensordot(model.B[n].T, mu[(n + 1) % N], 1) / z[:, None]  # (inputs, F, ny)
+        total += (np.abs(model.D[n].T[:, None] + after) ** 2).sum(axis=0)
     return total.reshape(len(harmonics), len(f), -1) / N
 
 
