@@ -31,7 +31,10 @@ class OptimalDesign(eqx.Module):
     - `criterion` and `usual_criterion`: what was made small, in units of a variance.
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
       to that of this one; with one limit the largest sensitivity of a line per unit of what is
-      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum.
+      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum, but for
+      peaks, which are taken as no larger than rms values.
+    - `for_peaks`: how many times the strides limits of peaks cost, beside the same limits of the
+      rms; 1 where no peak is limited.
     - `frequencies` (K,) and `channels` (K,) of all cosines that were allowed; `power` and
       `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
       which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
@@ -48,6 +51,7 @@ class OptimalDesign(eqx.Module):
     criterion: float
     usual_criterion: float
     certificate: float
+    for_peaks: float
     frequencies: Float[np.ndarray, " K"]
     channels: np.ndarray
     power: Float[np.ndarray, " K"]
@@ -108,6 +112,8 @@ class OptimalDesign(eqx.Module):
             f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
+        if self.for_peaks > 1:
+            rows.append(f"  peaks cost {self.for_peaks:.3g} times the strides of such rms values")
         rows += [
             f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"
             for name, old in self.usual_rms.items()
