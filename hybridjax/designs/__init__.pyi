@@ -8,6 +8,6 @@ from .goals import (
 from .limits import Limits as Limits
 from .model_draws import draws as draws
 from .optimal_design import OptimalDesign as OptimalDesign
-from .sequences import Sequence as Sequence
+from .sequences import RandomInput as RandomInput
 from .window import Window as Window
 from .windows import WindowChoice as WindowChoice, choose_window as choose_window

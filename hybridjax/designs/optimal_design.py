@@ -11,7 +11,7 @@ from .._core.boundary.kinds import PeriodCount, Positive, Seed
 from .._core.html.parts import card, table, text
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from .sequences import Sequence, random_sequence
+from .sequences import RandomInput, random_sequence
 
 
 # Strides saved by a factor above this are worth another design. Doubled: more designs are said to
@@ -96,11 +96,11 @@ class OptimalDesign(eqx.Module):
         cycles: PeriodCount,
         kind: Literal["gaussian", "binary"] = "gaussian",
         seed: Seed = 0,
-    ) -> Sequence:
+    ) -> RandomInput:
         """A random input with the spectrum of `design`, for a recording (`fit_series`).
 
         **Arguments:** `cycles`, its length; `kind`: normal values, or two values of the same
-        size, whose spectrum is close to that of the design at best: `Sequence.power` says which.
+        size, whose spectrum is close to that of the design at best: `RandomInput.power` says which.
 
         **Raises:** `DefinitionError` for an odd number of samples.
         """

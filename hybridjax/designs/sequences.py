@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from .._core.text import fields
 
 
-class Sequence(eqx.Module):
+class RandomInput(eqx.Module):
     """A random input for a recording.
 
     **Fields:** `u` (n, nu), at the sections, from section 0 on; `power` (K,), the mean square that
@@ -37,7 +37,7 @@ def random_sequence(
     shape: tuple[int, int, int, int],
     kind: Literal["gaussian", "binary"],
     seed: int,
-) -> Sequence:
+) -> RandomInput:
     """**Arguments:** `lines` j, so that f = j / P; `shape`: N, P, the number of cycles and that of
     inputs."""
     N, P, cycles, nu = shape
@@ -68,7 +68,7 @@ def random_sequence(
             spectrum = total * _correlation(clipped, back=True)
         own = channels == i
         found[own] = np.bincount(nearest, spectrum, len(wanted))[lines[own]]
-    return Sequence(u, found)
+    return RandomInput(u, found)
 
 
 def _gaussian(

@@ -35,16 +35,17 @@ class Window(eqx.Module):
     ```
 
     **Arguments:** `weights` (N,), one for each section; zero where nothing pushes.
+
+    **Raises:** `DefinitionError` for weights that are all zero.
     """
 
     weights: Float[np.ndarray, " N"]
 
     def __init__(self, weights: Annotated[Numbers, Reals("N")]):
         weights = np.asarray(weights, float)
-        rms = np.sqrt(np.mean(weights**2))
-        if not rms > 0:
-            raise DefinitionError("a window that is zero at all sections pushes never.")
-        self.weights = weights / rms
+        if not weights.any():
+            raise DefinitionError("`weights` of a window must be different from zero somewhere.")
+        self.weights = weights / np.sqrt(np.mean(weights**2))
 
     def seen_from_signal(self, model: LDTP) -> LDTP:
         """The system from the signal to the outputs."""

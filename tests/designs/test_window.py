@@ -62,7 +62,7 @@ def test_nothing_gained_is_said():
 
 
 def test_bad_windows(model, usual):
-    with pytest.raises(hj.DefinitionError, match="pushes never"):
+    with pytest.raises(hj.DefinitionError, match="different from zero"):
         hj.designs.Window(np.zeros(6))
     with pytest.raises(hj.DefinitionError, match="has 4 sections, the model 6"):
         hj.designs.Window(np.ones(4)).seen_from_signal(model)
