@@ -1,2 +1,13 @@
-from .goals import Multipliers as Multipliers, Parameters as Parameters
+from .goals import (
+    FrequencyResponse as FrequencyResponse,
+    ImpulseResponse as ImpulseResponse,
+    Multipliers as Multipliers,
+    Order as Order,
+    Parameters as Parameters,
+)
+from .limits import Limits as Limits
+from .model_draws import draws as draws
 from .optimal_design import OptimalDesign as OptimalDesign
+from .sequences import RandomInput as RandomInput
+from .window import Window as Window
+from .windows import WindowChoice as WindowChoice, choose_window as choose_window

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linprog
 
-from .limits import Limits
+from .limits import PowerLimits
 from .questions.question import AbstractQuestion, Answer
 
 
@@ -46,7 +46,7 @@ class Certificate(NamedTuple):
     e at most where no limit of single cosines holds."""
 
 
-def certify(found: Answer, power: Float[np.ndarray, " K"], limits: Limits) -> Certificate:
+def certify(found: Answer, power: Float[np.ndarray, " K"], limits: PowerLimits) -> Certificate:
     """**Arguments:** `found`, the answer with these powers."""
     bounds = np.stack([np.zeros_like(power), limits.largest], axis=1)
     total = power @ found.sensitivity
@@ -67,7 +67,7 @@ class Allocation(NamedTuple):
 
 
 def allocate(
-    question: AbstractQuestion, limits: Limits, start: Float[np.ndarray, " K"], max_steps: int
+    question: AbstractQuestion, limits: PowerLimits, start: Float[np.ndarray, " K"], max_steps: int
 ) -> Allocation:
     """The best powers within limits, from others.
 
@@ -94,7 +94,7 @@ def allocate(
 
 
 def _cheapest(
-    a: Float[np.ndarray, " K"], limits: Limits, prices: Float[np.ndarray, " L"]
+    a: Float[np.ndarray, " K"], limits: PowerLimits, prices: Float[np.ndarray, " L"]
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " L"]]:
     r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
     prices $\mu$ of the limits, which rise where a limit is exceeded."""

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 import hybridjax as hj
 from hybridjax.designs.allocation import allocate, certify
-from hybridjax.designs.limits import Limits
+from hybridjax.designs.limits import PowerLimits
 from hybridjax.designs.questions.question import Question
 from hybridjax.designs.questions.sensitivities import DirectSensitivities
 
@@ -21,7 +21,7 @@ def question(slopes, criterion="A"):
 def limits(cost, largest=np.inf):
     cost = np.atleast_2d(cost)
     names = tuple("abc"[: len(cost)])
-    return Limits(names, cost, np.broadcast_to(largest, cost.shape[1]).astype(float))
+    return PowerLimits(names, cost, np.broadcast_to(largest, cost.shape[1]).astype(float))
 
 
 @pytest.mark.parametrize("criterion", ["A", "D"])

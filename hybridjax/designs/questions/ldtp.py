@@ -22,7 +22,8 @@ from ...linear.frequency_response import Harmonics
 from ...linear.ldtp import LDTP
 from ..candidates import Candidates
 from ..noise import Noise
-from .measured import Measured, Model, measured
+from ..signals import Model
+from .measured import Measured, measured
 from .question import Question
 from .sensitivities import DirectSensitivities
 

@@ -6,15 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from ...identify.multipliers.structured import StructuredFit
 from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
-from ...linear.ldtp import LDTP
 from ..candidates import Candidates
 from ..noise import Noise
-
-
-Model = LDTP | StructuredFit
+from ..signals import Model
 
 
 class Measured(NamedTuple):

@@ -7,9 +7,10 @@ from ...errors import DefinitionError
 from ..candidates import Candidates
 from ..goals import Multipliers
 from ..noise import Noise
+from ..signals import Model
 from .ldtp import ldtp_unknowns
-from .measured import Model, measured
-from .question import Question
+from .measured import measured
+from .question import Question, weighted
 from .sensitivities import denominator_sensitivities
 
 
@@ -34,12 +35,13 @@ def about_multipliers(
         multipliers = np.roots([1.0, *c])
         multipliers = multipliers[np.lexsort((-multipliers.imag, -np.abs(multipliers)))]
         wanted, names = _wanted(goal, multipliers, c)
-        return unknowns.question(wanted @ slopes, names, goal.criterion)
+        wanted, names = weighted(wanted @ slopes, names, goal.weights)
+        return unknowns.question(wanted, names, goal.criterion)
     multipliers = np.asarray(model.multipliers)
     c = np.poly(multipliers).real[1:]
     harmonics = _FEW if goal.harmonics is None else goal.harmonics
     seen = list(measured(model, cosines, harmonics, noise))
-    wanted, names = _wanted(goal, multipliers, c)
+    wanted, names = weighted(*_wanted(goal, multipliers, c), goal.weights)
     sensitivities = denominator_sensitivities(seen, c, goal.overhang)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return Question(sensitivities, wanted, names, unknowns, goal.criterion)

@@ -8,8 +8,9 @@ from ...fitting.observations import ObservedHTF
 from ..candidates import Candidates
 from ..goals import Parameters
 from ..noise import Noise
-from .measured import Model, measured
-from .question import Question
+from ..signals import Model
+from .measured import measured
+from .question import Question, weighted
 from .sensitivities import DirectSensitivities
 
 
@@ -32,4 +33,5 @@ def about_parameters(goal: Parameters, model: Model, cosines: Candidates, noise:
         candidate.append(np.broadcast_to(here[:, None], shape).ravel())
     sensitivities = DirectSensitivities(np.concatenate(candidate), np.concatenate(slopes, axis=1))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
-    return Question(sensitivities, rows, wanted, free, goal.criterion)
+    rows, names = weighted(rows, wanted, goal.weights)
+    return Question(sensitivities, rows, names, free, goal.criterion)

@@ -15,6 +15,10 @@ from .sensitivities import Sensitivities
 # goals known that much less well count as unseen.
 _SINGULAR = 1e-12
 
+# Part of a sum of squares, in units of the usual errors, that is left out to have fewer rows. Ten
+# times more: variances are smaller by as little as it is.
+_NEGLIGIBLE = 1e-8
+
 
 class Answer(NamedTuple):
     """What some powers tell."""
@@ -80,6 +84,37 @@ class Question(AbstractQuestion):
         if self.criterion == "D":
             squares = squares * criterion / len(influence)
         return Answer(variances, squares / power, criterion)
+
+
+def weighted(
+    wanted: Float[np.ndarray, "g d"], names: tuple[str, ...], weights: tuple[float, ...] | None
+) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
+    """The sum of the wanted quantities with weights, or without weights themselves.
+
+    **Raises:** `DefinitionError` for another number of weights.
+    """
+    if weights is None:
+        return wanted, names
+    if len(weights) != len(names):
+        raise DefinitionError(
+            f"`weights` of the goal must be {len(names)} numbers: one for each of "
+            f"{', '.join(names)}."
+        )
+    text = " ".join(f"{w:+.3g} {name}" for w, name in zip(weights, names, strict=True) if w)
+    return np.array([weights]) @ wanted, (text,)
+
+
+def fewer_rows(question: Question) -> Question:
+    """The same with as few rows of each wanted quantity as have the same sum of squares."""
+    rows, part = [], []
+    for k in range(len(question.names)):
+        _, values, vectors = np.linalg.svd(question.wanted[question.part == k], full_matrices=False)
+        square = values**2
+        kept = np.cumsum(square[::-1])[::-1] > _NEGLIGIBLE * square.sum()
+        rows.append(vectors[kept] * values[kept, None])
+        part.append(np.full(kept.sum(), k))
+    changed = np.concatenate(rows), np.concatenate(part)
+    return eqx.tree_at(lambda q: (q.wanted, q.part), question, changed)
 
 
 def _root(

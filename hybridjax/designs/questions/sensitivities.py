@@ -6,6 +6,7 @@ depends on p, and is what they leave of the derivatives.
 """
 
 import abc
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -63,7 +64,8 @@ class Channel(NamedTuple):
     basis: Float[np.ndarray, "E r"]
     """Of what numerators can explain, at power 1."""
     slopes: Float[np.ndarray, "E n"]
-    """By c, of n entries: those of c_1 for all, then those of c_2, ..."""
+    """By c, of n entries: those of c_1 for all, then those of c_2, ... (Equations come in pairs of
+    blocks, real and imaginary parts of the same.)"""
 
 
 class DenominatorSensitivities(Sensitivities):
@@ -81,13 +83,7 @@ class DenominatorSensitivities(Sensitivities):
         return cls(np.concatenate(each), tuple(channels), order)
 
     def only(self, some: Int[np.ndarray, " k"]) -> "DenominatorSensitivities":
-        channels = []
-        for one in self.channels:
-            kept, number = _renumbered(one.cosine, some)
-            if len(kept):
-                basis, _ = powers_basis(one.basis[kept])
-                channels.append(Channel(number, basis, one.slopes[kept]))
-        return self.of(channels, self.order)
+        return self.of(only_channels(self.channels, some), self.order)
 
     def at(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, "d rows"]:
         left = []
@@ -110,20 +106,29 @@ def denominator_sensitivities(
     for htf, cosine, _ in seen:
         size = len(c) * htf.n_sections + (htf.n_sections if overhang is None else overhang) + 1
         require_frequencies(htf, len(c), size)
-        channels += _channels(htf, cosine, c, size)
+        channels += channels_of(htf, cosine, c, size, range(1, len(c) + 1))
     return DenominatorSensitivities.of(channels, len(c))
 
 
-def _channels(
-    htf: HTF, cosine: Int[np.ndarray, " F"], c: Float[np.ndarray, " d"], size: int
+def channels_of(
+    htf: HTF,
+    cosine: Int[np.ndarray, " F"],
+    c: Float[np.ndarray, " d"],
+    size: int,
+    delays: Sequence[int],
 ) -> list[Channel]:
-    r"""From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
+    r"""H delayed by some periods and divided by the denominator's modulus, and what numerators of
+    so many coefficients can explain of that.
+
+    From $dH = dB/\chi - H\, d\chi/\chi$ at z and at 1/z, with a channel for all entries whose
     errors depend on the frequency in the same way.
 
     Where H_m and H_{-m} are different, sum and difference of H_m(w) and H_m(-w) = conj H_{-m}(w)
     are explained by cosines and sines times the coefficients of B_m, whose real and imaginary parts
     are thereby apart: with the same real equations as those of the real B_0. This needs errors of
     the same size in both; otherwise all four equations are taken together.
+
+    **Raises:** `DefinitionError` for harmonics that are not symmetric about 0.
     """
     N, f = htf.n_sections, np.asarray(htf.f)
     if not all((-m) % N in {k % N for k in htf.harmonics} for m in htf.harmonics):
@@ -131,11 +136,13 @@ def _channels(
             f"the harmonics of `goal` must be symmetric about 0, not {htf.harmonics}."
         )
     weight = dict(zip(htf.harmonics, error_weights(htf, check_values(htf))[..., 0], strict=True))
-    delay = np.exp(-2j * np.pi * f) ** np.arange(1, len(c) + 1)[:, None]
+    delay = np.exp(-2j * np.pi * f)
+    size_of_chi = np.abs(chi(delay, c))
+    delayed = delay ** np.array(delays)[:, None] / size_of_chi
     slope = {
-        m: weight[m] * H[:, :, 0] * (delay / np.abs(chi(delay[0], c)))[..., None]
+        m: weight[m] * H[:, :, 0] * delayed[..., None]
         for m, H in zip(htf.harmonics, np.asarray(htf.H), strict=True)
-    }  # (d, F, ny)
+    }  # (delays, F, ny)
     angle = 2 * np.pi / N * f[:, None] * np.arange(size)
     powers = np.concatenate([np.cos(angle), -np.sin(angle)])
     groups: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
@@ -145,8 +152,8 @@ def _channels(
         shape = factor / factor.max()
         key = np.round(shape, _EQUAL_WEIGHTS).tobytes()
         if key not in groups:
-            size_of_chi = np.tile(np.abs(chi(delay[0], c)), len(shape) // len(f))
-            groups[key] = powers_basis(basis)[0] * (shape / size_of_chi)[:, None], []
+            shape = shape / np.tile(size_of_chi, len(shape) // len(f))
+            groups[key] = powers_basis(basis)[0] * shape[:, None], []
         groups[key][1].extend(entries)
 
     for m in htf.harmonics:
@@ -184,6 +191,17 @@ def _both_parts(powers: Float[np.ndarray, "E R"]) -> Float[np.ndarray, "2*E 2*R"
     """What real and imaginary parts of the coefficients of B_m make of H_m and of H_{-m}."""
     cosine, sine = np.split(powers, 2)
     return np.block([[cosine, -sine], [sine, cosine], [cosine, sine], [sine, -cosine]])
+
+
+def only_channels(channels: Sequence[Channel], some: Int[np.ndarray, " k"]) -> list[Channel]:
+    """Where only these cosines are applied; they are counted anew."""
+    left = []
+    for one in channels:
+        kept, number = _renumbered(one.cosine, some)
+        if len(kept):
+            basis, _ = powers_basis(one.basis[kept])
+            left.append(Channel(number, basis, one.slopes[kept]))
+    return left
 
 
 def _renumbered(
