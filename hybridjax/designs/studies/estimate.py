@@ -6,17 +6,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..errors import DefinitionError
-from ..experiments.data import ExperimentData
-from ..identify.htf.spectral_sums import SumOptions, spectral_sums
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.maximum_likelihood import maximum_likelihood
-from ..identify.multipliers.order import estimated_noise, noise_ratios, refuse_invented
-from ..identify.multipliers.structured import StructuredFit, fit_multipliers
-from ..identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
-from ..linear.frequency_response import check_harmonics
-from ..linear.htf import HTF
-from .goals import Multipliers
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...identify.htf.spectral_sums import SumOptions, spectral_sums
+from ...identify.multipliers.error_weights import check_values, error_weights, require_frequencies
+from ...identify.multipliers.maximum_likelihood import maximum_likelihood
+from ...identify.multipliers.order import estimated_noise, noise_ratios, refuse_invented
+from ...identify.multipliers.structured import StructuredFit, fit_multipliers
+from ...identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
+from ...linear.frequency_response import check_harmonics
+from ...linear.htf import HTF
+from ..goals import Multipliers
 
 
 # Estimates of the noise, each from the misfit of a fit weighted by the last one. Doubled: noise
@@ -79,8 +79,8 @@ class Estimate(NamedTuple):
 
 
 def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estimate:
-    r"""The fit of `fit_multipliers` to all responses of all blocks, each weighted by the power of its
-    cosine and by the noise of its block.
+    """The fit of `fit_multipliers` to all responses of all blocks, each weighted by the power of
+    its cosine and by the noise of its block.
 
     A line that was measured in several experiments counts several times: the least-squares problem
     is that of the weighted mean, and the scatter between experiments, of noise and of distortion,

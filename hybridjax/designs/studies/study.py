@@ -7,21 +7,21 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Order, Positive, Seed
-from .._core.html.multipliers import multiplier_table
-from .._core.html.parts import card, table, text
-from .._core.progress import working
-from ..errors import DefinitionError
-from ..experiments.data import ExperimentData
-from ..experiments.design.design import Design
-from ..identify.multipliers.structured import StructuredFit
-from .candidates import Candidates
-from .goals import Multipliers
-from .limits import Limit
-from .optimal_design import OptimalDesign
-from .optimize import optimal_design
-from .study_estimate import Block, Estimate, block_of, estimate
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Order, Positive, Seed
+from ..._core.html.multipliers import multiplier_table
+from ..._core.html.parts import card, table, text
+from ..._core.progress import working
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...experiments.design.design import Design
+from ...identify.multipliers.structured import StructuredFit
+from ..candidates import Candidates
+from ..goals import Multipliers
+from ..limits import Limit, Limits
+from ..optimal_design import OptimalDesign
+from ..optimize import optimal_design
+from .estimate import Block, Estimate, block_of, estimate
 
 
 # A block has at most so many times the strides of all before it. Doubled: fewer blocks, and more
@@ -110,7 +110,16 @@ class Study(eqx.Module):
     ):
         if len(first.input_names) > 1:
             raise DefinitionError(
-                f"Study: `first` has the inputs {', '.join(first.input_names)}: study one at a time."
+                f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
+            )
+        if goal is not None and (goal.weights is not None or goal.estimator == "fit_ldtp"):
+            raise DefinitionError(
+                "a study finds multipliers by fit_multipliers: `goal` may have no weights and no "
+                "other estimator."
+            )
+        if isinstance(limit, Limits) and limit.strides is not None:
+            raise DefinitionError(
+                "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
         Candidates.of(first)
         self.first, self.order, self.standard_error = first, order, standard_error

@@ -1,0 +1,43 @@
+"""Experiments whose signals stay below a peak."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Int
+
+from ..experiments.design.crest import optimize_phases
+from ..experiments.design.design import Design
+
+
+def below_peaks(design: Design, peak: dict[str, float], seed: int) -> Design:
+    """The design with phases for low peaks, and with experiments that still exceed one made
+    smaller."""
+    phase = np.array(design.phase)
+    for e in range(design.experiments):
+        here = np.flatnonzero(design.experiment == e)
+        # (Alone, so that a line that stands in several experiments may have any phase.)
+        phase[here] = optimize_phases(_one(design, here), seed).phase
+    design = dataclasses.replace(design, phase=phase)
+    return scaled_below(design, peak, each=True)
+
+
+def scaled_below(design: Design, peak: dict[str, float], each: bool) -> Design:
+    """The design with amplitudes made smaller where a signal exceeds its peak.
+
+    **Arguments:** `each`: each signal of each experiment by itself, else all by the same factor.
+    """
+    factor, highest = np.ones((design.experiments, len(design.input_names))), None
+    for name, most in peak.items():
+        i = design.input_names.index(name)
+        highest = np.abs(design.inputs()).max(axis=1) if highest is None else highest
+        factor[:, i] = most / np.maximum(highest[:, i], most)
+    if not each:
+        factor[:] = factor.min()
+    amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
+    return dataclasses.replace(design, amplitude=amplitude)
+
+
+def _one(design: Design, here: Int[np.ndarray, " k"]) -> Design:
+    """One experiment."""
+    parts = {n: getattr(design, n)[here] for n in ("line", "channel", "amplitude", "phase")}
+    return dataclasses.replace(design, experiment=0 * here, experiments=1, **parts)
