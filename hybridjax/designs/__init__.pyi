@@ -1,2 +1,9 @@
-from .goals import Multipliers as Multipliers, Parameters as Parameters
+from .goals import (
+    FrequencyResponse as FrequencyResponse,
+    ImpulseResponse as ImpulseResponse,
+    Multipliers as Multipliers,
+    Order as Order,
+    Parameters as Parameters,
+)
+from .limits import Limits as Limits
 from .optimal_design import OptimalDesign as OptimalDesign

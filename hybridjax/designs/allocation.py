@@ -16,12 +16,11 @@ limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.optimize import linprog
 
-from ..errors import DefinitionError
-from .limits import Limits
-from .sensitivities import Sensitivities
+from .limits import PowerLimits
+from .questions.question import AbstractQuestion, Answer
 
 
 # Powers never fall below this part of the largest one while they are looked for, so that numerators
@@ -35,36 +34,6 @@ _LOOK, _PRICES = 5, 8
 # Steps are tried at a multiple of their logarithm that grows by this factor, and halved where they
 # raise the criterion. Larger: more steps are in vain.
 _LONGER = 1.15
-# An unknown is lost where an eigenvalue of the scaled information is below this. Ten times more:
-# goals known that much less well count as unseen.
-_SINGULAR = 1e-12
-
-
-class Question(NamedTuple):
-    """What is asked of the data."""
-
-    sensitivities: Sensitivities
-    wanted: Float[np.ndarray, "g d"]
-    """Derivatives of the wanted quantities by the unknowns."""
-    names: tuple[str, ...]
-    """Of the wanted quantities."""
-    unknowns: tuple[str, ...]
-    criterion: str
-    """"A", the sum of variances, or "D", the volume of the ellipsoid."""
-
-    def only(self, some: Int[np.ndarray, " k"]) -> "Question":
-        """Where only these cosines are applied."""
-        return self._replace(sensitivities=self.sensitivities.only(some))
-
-
-class Answer(NamedTuple):
-    """What some powers tell."""
-
-    covariance: Float[np.ndarray, "g g"]
-    sensitivity: Float[np.ndarray, " K"]
-    """By which an increase of the power of a cosine lowers the criterion."""
-    criterion: float
-    """In units of a variance."""
 
 
 class Certificate(NamedTuple):
@@ -77,7 +46,7 @@ class Certificate(NamedTuple):
     e at most where no limit of single cosines holds."""
 
 
-def certify(found: Answer, power: Float[np.ndarray, " K"], limits: Limits) -> Certificate:
+def certify(found: Answer, power: Float[np.ndarray, " K"], limits: PowerLimits) -> Certificate:
     """**Arguments:** `found`, the answer with these powers."""
     bounds = np.stack([np.zeros_like(power), limits.largest], axis=1)
     total = power @ found.sensitivity
@@ -89,43 +58,6 @@ def certify(found: Answer, power: Float[np.ndarray, " K"], limits: Limits) -> Ce
     return Certificate(float(-best.fun), -best.fun * relative)
 
 
-def answer(question: Question, power: Float[np.ndarray, " K"]) -> Answer:
-    """**Arguments:** `power`, all positive.
-
-    **Raises:** `DefinitionError` that names what the data cannot see.
-    """
-    sensitivities = question.sensitivities
-    rows = sensitivities.at(power)
-    half = _root(rows @ rows.T, question)
-    influence = question.wanted @ half @ (half.T @ rows)
-    spread = question.wanted @ half
-    covariance = spread @ spread.T
-    if question.criterion == "D":
-        influence = np.linalg.solve(np.linalg.cholesky(covariance), influence)
-        criterion = float(np.exp(np.linalg.slogdet(covariance)[1] / len(covariance)))
-    else:
-        criterion = float(np.trace(covariance))
-    squares = np.bincount(sensitivities.candidate, (influence**2).sum(axis=0), len(power))
-    return Answer(covariance, squares / power, criterion)
-
-
-def _root(information: Float[np.ndarray, "d d"], question: Question) -> Float[np.ndarray, "d d"]:
-    """R with R R^T the inverse of the information."""
-    size = np.sqrt(np.diag(information))
-    unseen = np.flatnonzero(~(size > 0))
-    if len(unseen):
-        raise DefinitionError(f"the data cannot see {question.unknowns[unseen[0]]} at all.")
-    values, vectors = np.linalg.eigh(information / size / size[:, None])
-    if not values[0] > _SINGULAR:
-        parts = [
-            f"{x:+.2g} {name}"
-            for x, name in zip(vectors[:, 0] / size, question.unknowns, strict=True)
-            if abs(x) > 1e-3 * np.abs(vectors[:, 0] / size).max()
-        ]
-        raise DefinitionError(f"the data cannot see this combination: {' '.join(parts)}.")
-    return vectors / np.sqrt(values) / size[:, None]
-
-
 class Allocation(NamedTuple):
     """Powers, and how good they are."""
 
@@ -135,20 +67,20 @@ class Allocation(NamedTuple):
 
 
 def allocate(
-    question: Question, limits: Limits, start: Float[np.ndarray, " K"], max_steps: int
+    question: AbstractQuestion, limits: PowerLimits, start: Float[np.ndarray, " K"], max_steps: int
 ) -> Allocation:
     """The best powers within limits, from others.
 
-    **Raises:** `DefinitionError` as `answer`.
+    **Raises:** `DefinitionError` as `question.answer`.
     """
     prices = np.full(len(limits.cost), 1 / len(limits.cost))
     power = short = limits.within(np.maximum(start, _FLOOR * start.max()))
     last, longer = np.inf, _LONGER
     for step in range(max_steps + 1):
-        now = answer(question, power)
+        now = question.answer(power)
         if now.criterion > last:
             power, longer = short, max(longer / 2, 1.0)
-            now = answer(question, power)
+            now = question.answer(power)
         if step % _LOOK == 0 or step == max_steps:
             certificate = certify(now, power, limits)
             if certificate.excess <= 1 + _ENOUGH:
@@ -162,7 +94,7 @@ def allocate(
 
 
 def _cheapest(
-    a: Float[np.ndarray, " K"], limits: Limits, prices: Float[np.ndarray, " L"]
+    a: Float[np.ndarray, " K"], limits: PowerLimits, prices: Float[np.ndarray, " L"]
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " L"]]:
     r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
     prices $\mu$ of the limits, which rise where a limit is exceeded."""

@@ -1,19 +1,44 @@
 r"""What an experiment may cost: powers p of the cosines with $W p \le 1$ and $p \le$ `largest`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.boundary.kinds import Positive
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive
 from ..errors import DefinitionError
+from .candidates import Candidates
+from .signals import Squares, rate_of
 
 
-Limit = Literal["input", "output"] | Mapping[str, Positive]
+@checked
+class Limits(eqx.Module):
+    """What limits experiments, by the names of signals.
+
+    **Arguments:**
+
+    - `rms`: of inputs, of outputs (their deviation from the cycle), or of states by the names that
+      `LDTP.coordinates` has, over all experiments.
+    - `rate`: rms of the change of an input from one section to the next.
+    - `peak`: of an input, in every experiment. Phases are then chosen for a low peak, and what
+      still exceeds it is made smaller. (Such phases are not random: realizations of them do not
+      show the distortion.)
+    - `strides`: cycles of all experiments together, without those that are discarded.
+    """
+
+    rms: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    rate: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    peak: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    strides: Count | None = eqx.field(static=True, default=None)
 
 
-class Limits(NamedTuple):
+Limit = Literal["input", "output"] | Mapping[str, Positive] | Limits
+
+
+class PowerLimits(NamedTuple):
     """L limits of quantities that are sums over all cosines, and one of each cosine."""
 
     names: tuple[str, ...]
@@ -31,41 +56,44 @@ class Limits(NamedTuple):
         """The same proportions, as large as the limits allow."""
         return np.minimum(power / self.use(power).max(), self.largest)
 
-    def only(self, some: Int[np.ndarray, " k"]) -> "Limits":
+    def only(self, some: Int[np.ndarray, " k"]) -> "PowerLimits":
         """Where only these cosines are applied."""
         return self._replace(cost=self.cost[:, some], largest=self.largest[some])
 
 
-def make_limits(
+def power_limits(
     limit: Limit,
-    squares: dict[str, Float[np.ndarray, " K"]],
-    inputs: tuple[str, ...],
+    squares: list[Squares],
+    ports: dict[Literal["input", "output"], tuple[str, ...]],
     usual: Float[np.ndarray, " K"],
     largest: Float[np.ndarray, " K"],
-) -> Limits:
-    """**Arguments:**
+) -> PowerLimits:
+    """They hold for each of the models. A peak is no smaller than an rms value.
 
-    - `limit`: rms values by name, or what is to be no larger than with the `usual` powers.
-    - `squares`: mean square of each signal per unit of each cosine's power.
+    **Arguments:**
+
+    - `squares`: of each model. `ports`: names of inputs and of outputs.
+    - `usual`: powers with which nothing is to be larger, where `limit` is a word.
 
     **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies, or
     that leave the power of some cosine unlimited.
     """
     if isinstance(limit, str):
-        names = [n for n in squares if (n in inputs) == (limit == "input")]
-        level = {n: float(np.sqrt(squares[n] @ usual)) for n in names}
+        levels = [{n: float(np.sqrt(one[n] @ usual)) for n in ports[limit]} for one in squares]
     else:
-        level = {str(n): float(rms) for n, rms in limit.items()}
-    unknown = [n for n in level if n not in squares]
-    if unknown or not level:
-        what = f"limits '{unknown[0]}'" if unknown else "limits nothing"
-        raise DefinitionError(
-            f"`limit` {what}; what can be limited is the rms value of {', '.join(squares)}."
-        )
-    silent = [n for n, rms in level.items() if rms == 0]
+        given = limit if isinstance(limit, Limits) else Limits(limit)
+        level = _levels(given, ports["input"], squares[0])
+        levels = [level for _ in squares]
+    silent = [n for n, rms in levels[0].items() if rms == 0]
     if silent:
         raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
-    cost = np.stack([squares[n] / rms**2 for n, rms in level.items()])
+    cost = np.stack(
+        [
+            one[n] / rms**2
+            for one, level in zip(squares, levels, strict=True)
+            for n, rms in level.items()
+        ]
+    )
     if not (largest > 0).any():
         raise DefinitionError("`largest` is zero at all frequencies: no cosine may be applied.")
     free = (cost.max(axis=0) == 0) & np.isinf(largest)
@@ -73,4 +101,64 @@ def make_limits(
         raise DefinitionError(
             f"no limit reaches cosine {int(np.argmax(free))} of the design: limit the input, too."
         )
-    return Limits(tuple(level), cost, largest)
+    return PowerLimits(tuple(levels[0]), np.unique(cost, axis=0), largest)
+
+
+def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[str, float]:
+    """The rms values that are allowed, by the names of `squares`."""
+    rates = {rate_of(n) for n in inputs}
+    unknown = [n for n in limit.rms if n not in squares or n in rates]
+    if unknown or not (limit.rms or limit.rate or limit.peak):
+        what = f"limits '{unknown[0]}'" if unknown else "limits nothing"
+        known = ", ".join(n for n in squares if n not in rates)
+        raise DefinitionError(f"`limit` {what}; what can be limited is the rms value of {known}.")
+    for word, given in (("rate", limit.rate), ("peak", limit.peak)):
+        unknown = [n for n in given if n not in inputs]
+        if unknown:
+            raise DefinitionError(
+                f"`limit` limits the {word} of '{unknown[0]}'; the inputs are {', '.join(inputs)}."
+            )
+    level = {str(n): float(x) for n, x in limit.rms.items()}
+    level |= {rate_of(n): float(x) for n, x in limit.rate.items()}
+    for name, peak in limit.peak.items():
+        level[name] = min(level.get(name, np.inf), float(peak))
+    return level
+
+
+def largest_power(
+    largest: float | Callable[[np.ndarray], np.ndarray] | None, cosines: Candidates, count: int
+) -> Float[np.ndarray, " K"]:
+    """The largest mean square of each cosine, if it stands in one of `count` experiments only."""
+    if largest is None:
+        return np.full(len(cosines.f), np.inf)
+    given = np.asarray(largest(cosines.f) if callable(largest) else largest)
+    if given.dtype.kind not in "fiu" or given.shape not in ((), cosines.f.shape):
+        raise DefinitionError("`largest` must give a real number for each frequency.")
+    amplitude = np.broadcast_to(given, cosines.f.shape)
+    if not (amplitude >= 0).all():
+        raise DefinitionError("`largest` must give amplitudes that are not negative.")
+    return amplitude**2 / (2 * count)
+
+
+def experiments_within(
+    limit: Limit, experiments: int | None, usual: int, periods: int, cosines: int
+) -> int:
+    """How many experiments there are to be: `experiments`, or as many as `strides` allow.
+
+    **Raises:** `DefinitionError` if the strides do not suffice, or there are fewer cosines.
+    """
+    strides = limit.strides if isinstance(limit, Limits) else None
+    if strides is None:
+        count = usual if experiments is None else experiments
+    else:
+        count = strides // periods if experiments is None else experiments
+        if count * periods > strides or count == 0:
+            raise DefinitionError(
+                f"`limit` allows {strides} strides, but {max(count, 1)} experiments of {periods} "
+                f"periods are {max(count, 1) * periods}: allow more, or take fewer or shorter ones."
+            )
+    if count > cosines:
+        raise DefinitionError(
+            f"{count} experiments are more than the {cosines} cosines that there are."
+        )
+    return count

@@ -26,12 +26,15 @@ class OptimalDesign(eqx.Module):
 
     - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
     - `usual`: the design with which it is compared, scaled to the same limits.
-    - `names` (g,) of the wanted quantities; `covariance` (g, g) with `design`, `usual_covariance`
-      with `usual`.
+    - `names` (g,) of the wanted quantities; `variances` (g,) with `design`, `usual_variances` with
+      `usual`.
     - `criterion` and `usual_criterion`: what was made small, in units of a variance.
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
       to that of this one; with one limit the largest sensitivity of a line per unit of what is
-      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum.
+      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum, but for
+      peaks, which are taken as no larger than rms values.
+    - `for_peaks`: how many times the strides limits of peaks cost, beside the same limits of the
+      rms; 1 where no peak is limited.
     - `frequencies` (K,) and `channels` (K,) of all cosines that were allowed; `power` and
       `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
       which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
@@ -43,11 +46,12 @@ class OptimalDesign(eqx.Module):
     design: Design
     usual: Design
     names: tuple[str, ...] = eqx.field(static=True)
-    covariance: Float[np.ndarray, "g g"]
-    usual_covariance: Float[np.ndarray, "g g"]
+    variances: Float[np.ndarray, " g"]
+    usual_variances: Float[np.ndarray, " g"]
     criterion: float
     usual_criterion: float
     certificate: float
+    for_peaks: float
     frequencies: Float[np.ndarray, " K"]
     channels: np.ndarray
     power: Float[np.ndarray, " K"]
@@ -60,12 +64,12 @@ class OptimalDesign(eqx.Module):
     @property
     def standard_errors(self) -> Float[np.ndarray, " g"]:
         """Of the wanted quantities, with one run of `design`."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.sqrt(self.variances)
 
     @property
     def usual_standard_errors(self) -> Float[np.ndarray, " g"]:
         """The same with one run of `usual`."""
-        return np.sqrt(np.diag(self.usual_covariance))
+        return np.sqrt(self.usual_variances)
 
     @property
     def strides(self) -> int:
@@ -108,6 +112,8 @@ class OptimalDesign(eqx.Module):
             f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
+        if self.for_peaks > 1:
+            rows.append(f"  peaks cost {self.for_peaks:.3g} times the strides of such rms values")
         rows += [
             f"  rms of {name}: {self.rms[name]:.3g} ({self.rms[name] / old:.3g} times the usual)"
             for name, old in self.usual_rms.items()

@@ -1,11 +1,10 @@
 """The design that answers a question in the fewest strides."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
@@ -13,13 +12,16 @@ from .._core.progress import working
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import allocate, answer
+from .allocation import allocate
 from .candidates import Candidates
 from .goals import Goal, Multipliers
 from .grouping import to_design, worthwhile
-from .limits import Limit, make_limits
+from .limits import Limit, Limits, experiments_within, largest_power, power_limits
+from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
-from .questions import Model, question_of
+from .peaks import below_peaks, scaled_below
+from .questions.question_of import question_of
+from .signals import Model, mean_squares, rms_of
 
 
 # Cosines that together tell less than such a part of all are left out, the largest part of these
@@ -27,20 +29,17 @@ from .questions import Model, question_of
 # distortion hides.
 _NEGLIGIBLE = (2e-3, 1e-4, 0.0)
 _AS_GOOD = 1.01
-# Noise that nobody gave, relative to the rms of the output in the usual design: 20 dB. Doubled: all
-# standard errors are.
-_NOISE = 0.1
 
 
 @checked
 @working("optimal_design")
 def optimal_design(
-    model: Model,
+    model: Model | Sequence[Model],
     design: Design | None = None,
     *,
     goal: Literal["multipliers"] | Goal = "multipliers",
     limit: Limit = "input",
-    noise: Mapping[str, Positive] | None = None,
+    noise: NoiseLike | None = None,
     largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
     experiments: ExperimentCount | None = None,
     seed: Seed = 0,
@@ -54,23 +53,29 @@ def optimal_design(
     data = hj.run_experiments(cycle, sections, plan.design, outputs)
     ```
 
-    The variance of the goal is the Cramer-Rao bound with white noise. It is a convex function of
-    the cosines' powers, and the result's `certificate` says how far from the optimum they are.
-    Strong cosines stand in several experiments, weak ones in one: for variances that are estimated
-    run `plan.design.realizations(4)`, or two windows.
+    The variance of the goal is the Cramer-Rao bound. It is a convex function of the cosines'
+    powers, and the result's `certificate` says how far from the optimum they are. Strong cosines
+    stand in several experiments, weak ones in one: for variances that are estimated run
+    `plan.design.realizations(4)`, or two windows.
 
     **Arguments:**
 
     - `model`: what is known of the system, exact or estimated: a `StructuredFit` also does. Its
-      deviations are then those of the harmonics that were fitted.
+      deviations are then those of the harmonics that were fitted. Several models, any of which may
+      be true (`hj.designs.draws` of an estimate): the mean of the criterion is made small, and the
+      limits hold for each.
     - `design`: what one would do otherwise. Its lines, inputs, periods and experiments are those of
       the result; by default `multisine` with all lines. Lines that are not in it are forbidden.
-    - `goal`: `"multipliers"`, or a `hj.designs.Multipliers` or `hj.designs.Parameters`.
-    - `limit`: rms values by name, of inputs or of outputs (their deviation from the cycle), over
-      all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
-      `"output"`, of each.
-    - `noise`: standard deviation of the white noise of each output that is measured, by name. By
-      default all are, 20 dB below their rms deviation in `design` within the limits.
+    - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
+      `FrequencyResponse`, `ImpulseResponse`, `Order`.
+    - `limit`: rms values by name, of inputs, outputs (their deviation from the cycle) or states,
+      over all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
+      `"output"`, of each. Or `hj.designs.Limits`, also of peaks, rates and strides.
+    - `noise`: of each output that is measured, by name: the standard deviation of white noise, or
+      a function that gives it by the frequency of the output (0 to N/2 cycles per period), the root
+      of a spectrum. Or noise that was estimated: an `LDTPFit` with noise, or a model of noise as
+      for `hj.identify.noise_spectrum`. By default all outputs are measured, with white noise 20 dB
+      below their rms deviation in `design` within the limits.
     - `largest`: amplitude that no cosine may exceed; a number, or a function of an array of f. Zero
       forbids a frequency.
     - `experiments`: their number, by default that of `design`. `seed` of phases and division.
@@ -79,32 +84,31 @@ def optimal_design(
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data cannot see,
     multipliers that are not simple, and arguments that do not fit together.
     """
-    usual = _usual(model) if design is None else design
-    if usual.n_sections != model.n_sections or len(usual.input_names) != len(model.inputs):
-        raise DefinitionError(
-            f"the design has {usual.n_sections} sections and {len(usual.input_names)} inputs, the "
-            f"model {model.n_sections} and {len(model.inputs)}."
-        )
+    models = [model] if isinstance(model, Model) else list(model)
+    usual = _usual(models) if design is None else design
+    _check_alike(models, usual)
     cosines = Candidates.of(usual)
     usual_power = cosines.power_of(usual)
-    squares = _squares(model, cosines)
-    count = usual.experiments if experiments is None else experiments
-    most = _largest(largest, cosines, count)
-    limits = make_limits(limit, squares, model.inputs, usual_power, most)
-    if count > len(cosines.f):
-        raise DefinitionError(
-            f"{count} experiments are more than the {len(cosines.f)} cosines that there are."
-        )
+    squares = [mean_squares(one, cosines) for one in models]
+    count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
+    most = largest_power(largest, cosines, count)
+    ports = {"input": models[0].inputs, "output": models[0].outputs}
+    limits = power_limits(limit, squares, ports, usual_power, most)
+    peak = dict(limit.peak) if isinstance(limit, Limits) else {}
 
     # The usual proportions, as large as the limits allow.
-    factor = 1 / limits.use(usual_power).max()
-    usual_power = usual_power * factor
-    usual = dataclasses.replace(usual, amplitude=usual.amplitude * np.sqrt(factor))
-    usual_rms = _rms(squares, usual_power)
+    root = np.sqrt(1 / limits.use(usual_power).max())
+    usual = dataclasses.replace(usual, amplitude=usual.amplitude * root)
+    usual = scaled_below(usual, peak, each=False)
+    usual_power = cosines.power_of(usual)
+    shown = [*models[0].inputs, *models[0].outputs]
+    shown += [name for name in limits.names if name not in shown]
+    usual_rms = rms_of(squares, shown, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
-    question = question_of(goal, model, cosines, _noise(model, noise, usual_rms))
+    errors = make_noise(models[0], noise, usual_rms)
+    question = question_of(goal, models, cosines, errors, usual_power)
 
-    before = answer(question, usual_power)
+    before = question.answer(usual_power)
     allowed = np.flatnonzero(most > 0)
     ideal = allocate(question.only(allowed), limits.only(allowed), usual_power[allowed], max_steps)
     for negligible in _NEGLIGIBLE:
@@ -112,74 +116,53 @@ def optimal_design(
         kept = allowed[worthwhile(cosines.only(allowed), gain, count, negligible)]
         start = ideal.power[np.searchsorted(allowed, kept)]
         best = allocate(question.only(kept), limits.only(kept), start, max_steps)
-        worse = best.answer.criterion / ideal.answer.criterion
-        if worse < _AS_GOOD:
+        if best.answer.criterion < _AS_GOOD * ideal.answer.criterion:
             break
-    shorter = usual.experiments / count
     power, relative = np.zeros_like(usual_power), np.zeros_like(usual_power)
     power[kept], relative[allowed] = best.power, ideal.certificate.relative
+    made = to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed)
+    after, for_peaks = best.answer, 1.0
+    if peak:
+        made = below_peaks(made, peak, seed)
+        power = cosines.power_of(made)
+        after = question.only(kept).answer(power[kept])
+        for_peaks = after.criterion / best.answer.criterion
+    shorter = usual.experiments / count
     return OptimalDesign(
-        design=to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed),
+        design=made,
         usual=usual,
         names=question.names,
-        covariance=best.answer.covariance * shorter,
-        usual_covariance=before.covariance,
-        criterion=best.answer.criterion * shorter,
+        variances=after.variances * shorter,
+        usual_variances=before.variances,
+        criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
-        certificate=ideal.certificate.excess * worse,
+        certificate=ideal.certificate.excess * after.criterion / ideal.answer.criterion,
+        for_peaks=for_peaks,
         frequencies=cosines.f,
         channels=cosines.channel,
         power=power,
         usual_power=usual_power,
         sensitivity=relative,
         limited=limits.names,
-        rms=_rms(squares, power),
+        rms=rms_of(squares, shown, power),
         usual_rms=usual_rms,
     )
 
 
-def _usual(model: Model) -> Design:
+def _usual(models: list[Model]) -> Design:
     """All lines of the usual band, with the same amplitude."""
-    return multisine(model.n_sections, inputs=model.inputs)
+    return multisine(models[0].n_sections, inputs=models[0].inputs)
 
 
-def _squares(model: Model, cosines: Candidates) -> dict[str, Float[np.ndarray, " K"]]:
-    """Mean square of each signal per unit of each cosine's power, by name."""
-    H = np.asarray(model.htf(cosines.f).H)
-    answers = (np.abs(H) ** 2).sum(axis=0)[np.arange(len(cosines.f)), :, cosines.channel].T
-    inputs = [(cosines.channel == i).astype(float) for i in range(len(model.inputs))]
-    return dict(zip((*model.inputs, *model.outputs), (*inputs, *answers), strict=True))
-
-
-def _rms(
-    squares: dict[str, Float[np.ndarray, " K"]], power: Float[np.ndarray, " K"]
-) -> dict[str, float]:
-    return {name: float(np.sqrt(square @ power)) for name, square in squares.items()}
-
-
-def _noise(
-    model: Model, noise: Mapping[str, float] | None, rms: dict[str, float]
-) -> Float[np.ndarray, " ny"]:
-    """Standard deviation of each output's noise, infinite for those that are not measured."""
-    if noise is None:
-        noise = {name: _NOISE * rms[name] for name in model.outputs if rms[name] > 0}
-    unknown = [name for name in noise if name not in model.outputs]
-    if unknown or not noise:
-        what = f"names '{unknown[0]}'" if unknown else "names no output"
-        raise DefinitionError(f"`noise` {what}; the outputs are {', '.join(model.outputs)}.")
-    return np.array([noise.get(name, np.inf) for name in model.outputs])
-
-
-def _largest(
-    largest: float | Callable[[np.ndarray], np.ndarray] | None, cosines: Candidates, count: int
-) -> Float[np.ndarray, " K"]:
-    """The largest mean square of each cosine, if it stands in one experiment only."""
-    if largest is None:
-        return np.full(len(cosines.f), np.inf)
-    given = np.asarray(largest(cosines.f) if callable(largest) else largest)
-    if given.dtype.kind not in "fiu" or given.shape not in ((), cosines.f.shape):
-        raise DefinitionError("`largest` must give a real number for each frequency.")
-    amplitude = np.broadcast_to(given, cosines.f.shape)
-    if not (amplitude >= 0).all():
-        raise DefinitionError("`largest` must give amplitudes that are not negative.")
-    return amplitude**2 / (2 * count)
+def _check_alike(models: list[Model], design: Design) -> None:
+    """**Raises:** `DefinitionError` for models and a design that do not fit together."""
+    first = models[0]
+    for k, one in enumerate(models):
+        for name in ("n_sections", "inputs", "outputs"):
+            if getattr(one, name) != getattr(first, name):
+                raise DefinitionError(f"model {k} has other {name} than model 0.")
+    if design.n_sections != first.n_sections or len(design.input_names) != len(first.inputs):
+        raise DefinitionError(
+            f"the design has {design.n_sections} sections and {len(design.input_names)} inputs, "
+            f"the model {first.n_sections} and {len(first.inputs)}."
+        )

@@ -5,6 +5,7 @@ from .htf.nonparametric import missing_frequencies as missing_frequencies
 from .htf.transient import TransientFit as TransientFit, remove_transient as remove_transient
 from .joint.bound import ldtp_bound as ldtp_bound
 from .joint.ldtp_fit import LDTPFit as LDTPFit
+from .joint.noise import noise_spectrum as noise_spectrum
 from .multipliers.bound import (
     MultiplierBound as MultiplierBound,
     multiplier_bound as multiplier_bound,

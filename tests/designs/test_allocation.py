@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import minimize
 
 import hybridjax as hj
-from hybridjax.designs.allocation import Question, allocate, answer, certify
-from hybridjax.designs.limits import Limits
-from hybridjax.designs.sensitivities import DirectSensitivities
+from hybridjax.designs.allocation import allocate, certify
+from hybridjax.designs.limits import PowerLimits
+from hybridjax.designs.questions.question import Question
+from hybridjax.designs.questions.sensitivities import DirectSensitivities
 
 
 def question(slopes, criterion="A"):
@@ -20,7 +21,7 @@ def question(slopes, criterion="A"):
 def limits(cost, largest=np.inf):
     cost = np.atleast_2d(cost)
     names = tuple("abc"[: len(cost)])
-    return Limits(names, cost, np.broadcast_to(largest, cost.shape[1]).astype(float))
+    return PowerLimits(names, cost, np.broadcast_to(largest, cost.shape[1]).astype(float))
 
 
 @pytest.mark.parametrize("criterion", ["A", "D"])
@@ -67,9 +68,9 @@ def test_the_certificate_bounds_every_other_choice():
     slopes, some = rng.normal(size=(2, 9)), limits(rng.uniform(0.2, 2, 9))
     asked = question(slopes)
     poor = some.within(np.ones(9))
-    now = answer(asked, poor)
+    now = asked.answer(poor)
     e = certify(now, poor, some).excess
-    others = [answer(asked, some.within(rng.exponential(size=9) ** 4)) for _ in range(200)]
+    others = [asked.answer(some.within(rng.exponential(size=9) ** 4)) for _ in range(200)]
     best = allocate(asked, some, poor, 300).answer.criterion
     assert now.criterion / e < best < min(other.criterion for other in others)
 

@@ -236,18 +236,20 @@ def designs(t):
         {"u0": "1"},
         Other(),
     ]
+    noise = [3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]
+    noise += [{"y0": lambda f: "x"}, {"y0": lambda f: f * NAN}, {"y0": lambda f: f - 1}]
     yield "optimal_design", hj.optimal_design, dict(
         model=t.model, design=t.design, goal=ask, max_steps=1
     ), {
         "model": instance(t.design), "design": [3, t.model, t.one_input, np.zeros((1, 9, 2))],
         "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
-        "limit": limits, "noise": optional([3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]),
+        "limit": limits, "noise": optional(noise),
         "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
         "max_steps": COUNT,
     }  # fmt: skip
     yield "Multipliers", hj.designs.Multipliers, {}, {
-        "which": optional(WHOLE), "part": WORD, "criterion": WORD, "harmonics": HARMONICS,
-        "overhang": optional(WHOLE),
+        "which": optional(WHOLE), "part": WORD, "criterion": WORD, "estimator": WORD,
+        "harmonics": optional(HARMONICS), "overhang": optional(WHOLE),
     }  # fmt: skip
     yield "Parameters", hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",)), {
         "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],

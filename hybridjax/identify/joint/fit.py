@@ -93,6 +93,7 @@ def fit_ldtp(htf: HTF, start: LDTP, *, direct: bool = True, max_steps: StepCount
         freedom=freedom,
         result=Result.OK if found.converged else Result.NOT_CONVERGED,
         harmonics=htf.harmonics,
+        noise=None,
         _coordinates=found.coordinates,
         _root=root,
         _scale=scale,

@@ -107,11 +107,11 @@ def _slopes(coordinates, f, m):
     N, (ny, nu) = model.n_sections, model.D[0].shape
     z = np.exp(2j * np.pi / N * f)
     z_m = np.exp(2j * np.pi / N * (m[:, None] + f)).ravel()
-    states, adjoints = _states(model, z), _adjoints(model, z_m)
+    states, mu = _states(model, z), adjoints(model, z_m)
     J = np.zeros((coordinates.size, len(m), len(f), ny, nu), complex)
     for n, at in enumerate(places):
         x = states[n]  # (F, nu, d)
-        after = adjoints[(n + 1) % N] / z_m[:, None, None]
+        after = mu[(n + 1) % N] / z_m[:, None, None]
         wave = np.exp(-2j * np.pi / N * m * n)[:, None, None, None] / N
         nu_m = after.reshape(len(m), len(f), ny, -1) * wave
         shapes = dict(coordinates.blocks(n))
@@ -144,8 +144,10 @@ def _states(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
     return around(forced @ _resolvent(phi.T, z, model.n_sections))[0]
 
 
-def _adjoints(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
-    """mu at each section, (F, ny, d)."""
+def adjoints(
+    model: PeriodicModel, z: Complex[np.ndarray, " F"]
+) -> list[Complex[np.ndarray, "F ny d"]]:
+    r"""$\mu$ at each section."""
 
     def around(mu):
         found = []

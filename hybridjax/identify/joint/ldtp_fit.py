@@ -9,12 +9,14 @@ from jaxtyping import Complex, Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Scalar, Vector
 from ..._core.results import Result
+from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..multipliers.multiplier_estimate import MultiplierEstimate
 from .coordinates import LocalCoordinates
 from .frequency import transfer, transfer_slopes
+from .noise import noise_spectrum
 
 
 class LDTPFit(MultiplierEstimate):
@@ -35,6 +37,8 @@ class LDTPFit(MultiplierEstimate):
       what the misfit itself says, and the two are equal.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,): those that were fitted.
+    - `noise`: what makes the noise of the outputs of independent white inputs with variance one, as
+      an `LDTP`; None where it was not fitted, that is for HTFs.
     """
 
     model: LDTP
@@ -46,6 +50,7 @@ class LDTPFit(MultiplierEstimate):
     freedom: int = eqx.field(static=True)
     result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
+    noise: LDTP | None
     _coordinates: LocalCoordinates
     _root: Float[np.ndarray, "P r"]
     _scale: Float[np.ndarray, " ny"]
@@ -86,6 +91,22 @@ class LDTPFit(MultiplierEstimate):
             f, H * size, harmonics, self.n_sections, self.inputs, self.outputs, "fit",
             variance=variance * size**2,
         )  # fmt: skip
+
+    @checked
+    def noise_spectrum(
+        self, f: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> Float[np.ndarray, "M F ny"]:
+        """The spectrum of the fitted noise where the harmonics of lines f (F,) lie, as
+        `hj.identify.noise_spectrum` gives it.
+
+        **Raises:** `DefinitionError` if no noise was fitted.
+        """
+        if self.noise is None:
+            raise DefinitionError(
+                "no noise was fitted: HTFs tell its variance at their own lines only "
+                "(`HTF.variance`); fit to series."
+            )
+        return noise_spectrum(self.noise, f, harmonics)
 
     def __repr__(self) -> str:
         return f"LDTPFit(multipliers {self.show_multipliers()}; {self._about()})"

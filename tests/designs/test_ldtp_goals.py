@@ -1,0 +1,83 @@
+"""Goals of whoever fits the matrices of the model itself."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+NOISE = {"y0": 0.01, "y1": 0.02}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hj.testing.synthetic_ldtp()
+
+
+@pytest.fixture(scope="module")
+def usual(model):
+    return hj.multisine(6, 32, band=(0, 3), inputs=model.inputs)
+
+
+def expected(model, design, harmonics=None):
+    """The exact HTFs at the lines of a design, with the variance that they are measured with."""
+    htf = model.htf(design.frequencies, harmonics)
+    std = np.array(list(NOISE.values()))
+    variance = design.expected_variance()[:, None, :] * std[:, None] ** 2
+    return hj.HTF(
+        htf.f, htf.H, htf.harmonics, 6, model.inputs, model.outputs,
+        variance=np.broadcast_to(variance, htf.H.shape),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
+def test_standard_errors_are_the_bound_of_the_ldtp(model, usual, harmonics):
+    """That of `ldtp_bound`, which sums information up without leaving parts of lines out."""
+    assert model.outputs == tuple(NOISE)
+    goal = hj.designs.Multipliers(estimator="fit_ldtp", harmonics=harmonics)
+    plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
+    assert plan.certificate < 1.03
+    bound = hj.identify.ldtp_bound(model, expected(model, plan.usual, harmonics))
+    np.testing.assert_allclose(np.sum(plan.usual_variances), _total(bound), rtol=1e-5)
+    free = hj.optimal_design(
+        model, usual, goal=hj.designs.Multipliers(harmonics=(-1, 0, 1)), noise=NOISE
+    )
+    assert free.usual_criterion > plan.usual_criterion
+
+
+def _total(bound):
+    """The sum of the variances of real multipliers, or of real and imaginary parts, pairs once."""
+    return sum(
+        np.trace(c) for z, c in zip(bound.multipliers, bound.multiplier_covariances, strict=True)
+        if z.imag >= 0
+    )  # fmt: skip
+
+
+def test_no_other_design_is_better_than_the_certificate_allows(model, usual):
+    goal = hj.designs.Multipliers(estimator="fit_ldtp")
+    limit = {"u0": 0.1, "u1": 0.1}
+    plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE, limit=limit)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        other = hj.multisine(
+            6,
+            32,
+            band=(0, 3),
+            inputs=model.inputs,
+            amplitude=lambda f: rng.exponential(size=f.shape),
+        ).scaled(0.1)
+        bound = hj.identify.ldtp_bound(model, expected(model, other))
+        assert _total(bound) > plan.criterion / plan.certificate
+
+
+def test_only_outputs_that_are_measured_count(model, usual):
+    goal = hj.designs.Multipliers(estimator="fit_ldtp")
+    both = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
+    one = hj.optimal_design(model, usual, goal=goal, noise={"y1": 0.02})
+    assert one.usual_criterion > both.usual_criterion
+
+
+def test_a_model_without_matrices_is_refused(model, usual):
+    fit = hj.fit_multipliers(expected(model, usual, (-1, 0, 1)), 2, check=False)
+    with pytest.raises(hj.DefinitionError, match="needs a model with matrices"):
+        hj.optimal_design(fit, usual, goal=hj.designs.Multipliers(estimator="fit_ldtp"))
