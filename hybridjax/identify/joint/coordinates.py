@@ -29,7 +29,7 @@ _UNSEEN = 1e-13
 
 
 class LocalCoordinates(NamedTuple):
-    """Directions in which a model can change: Y in A and C, and the entries of B and D."""
+    """Directions in which a model can change: Y in A and C, and the entries of B, K and D."""
 
     model: PeriodicModel
     """In output-normal form."""
@@ -44,6 +44,7 @@ class LocalCoordinates(NamedTuple):
         """What is free at section n, with its shape, in order."""
         (after, d), (ny, nu) = self.model.A[n].shape, self.model.D[n].shape
         found = [("Y", (self.to_A[n].shape[1], d)), ("B", (after, nu))]
+        found.append(("K", self.model.K[n].shape))
         return found + ([("D", (ny, nu))] if self.direct else [])
 
     @property
@@ -66,15 +67,16 @@ class LocalCoordinates(NamedTuple):
 
     def moved(self, step: Float[np.ndarray, " P"]) -> PeriodicModel:
         """The model with these coordinates; it itself has zero everywhere."""
-        A, B, C, D = map(list, self.model)
+        A, B, C, D, K = map(list, self.model)
         places = self.places
         for n in range(self.model.n_sections):
             change = {name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)}
             A[n] = A[n] + self.to_A[n] @ change["Y"]
             C[n] = C[n] + self.to_C[n] @ change["Y"]
             B[n] = B[n] + change["B"]
+            K[n] = K[n] + change["K"]
             D[n] = D[n] + change.get("D", 0.0)
-        return PeriodicModel(A, B, C, D)
+        return PeriodicModel(A, B, C, D, K)
 
 
 def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
@@ -90,6 +92,7 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         [after[n].T @ model.B[n] for n in range(N)],
         [model.C[n] @ back[n] for n in range(N)],
         model.D,
+        [after[n].T @ model.K[n] for n in range(N)],
     )
     to_A, to_C = [], []
     for A, C in zip(model.A, model.C, strict=True):

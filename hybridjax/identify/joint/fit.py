@@ -1,100 +1,78 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
-import numpy as np
+from typing import Annotated, Literal
 
+from ..._core.arguments import Numbers
+from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import StepCount
+from ..._core.boundary.kinds import Order, StepCount
 from ..._core.precision import require_x64
-from ..._core.results import Result
 from ...errors import DefinitionError
+from ...experiments.record import RecordedData
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.error_weights import ROUNDING, check_values, error_weights
-from .characteristic import characteristic_slopes
-from .coordinates import local_coordinates
-from .frequency import FrequencyProblem
 from .ldtp_fit import LDTPFit
-from .minimize import minimize
-from .periodic_model import PeriodicModel
+from .to_htf import fit_to_htf
+from .to_series import fit_to_series
 
 
 @checked
-def fit_ldtp(htf: HTF, start: LDTP, *, direct: bool = True, max_steps: StepCount = 50) -> LDTPFit:
-    r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model to all HTFs together.
+def fit_ldtp(
+    data: HTF | RecordedData,
+    guess: LDTP | Order | Annotated[Numbers, Integers("N", sign="positive")],
+    *,
+    noise: Literal["output", "innovations"] = "output",
+    start: Literal["free", "cycle"] = "free",
+    direct: bool = True,
+    max_steps: StepCount = 50,
+) -> LDTPFit:
+    r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
-    Maximum likelihood for independent, circular, normal errors of the HTFs with the variances
-    given:
+    *To HTFs*, with independent, circular, normal errors of the variances given:
 
     $$V(A, B, C, D) = \sum \frac{2}{v}\, | H_m(\omega) - \hat H_m(\omega; A, B, C, D) |^2$$
 
     over all frequencies, harmonics, outputs and inputs. `fit_multipliers` gives each of the
     transfer functions a numerator of its own; here they follow from fewer numbers, and
-    multipliers are more exact (`hj.identify.ldtp_bound` says by how much). By Levenberg and
-    Marquardt's iteration, with exact derivatives, in local coordinates in which the choice of
-    states does not count (McKelvey, Helmersson and Ribarits 2004).
+    multipliers are more exact (`hj.identify.ldtp_bound` says by how much).
+
+    *To series*, with normal errors e of predictions one step ahead:
+
+    $$x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n], \qquad y[n] = C[n] x[n] + D[n] u[n] + e[n]$$
+
+    $V = \sum_n T_n \log \det S[n]$ with S[n] the covariance of the $T_n$ errors at section n
+    (Ljung, *System Identification*, 1999, for each section). With `noise="output"` K is zero and S
+    the same at all sections: white noise of sensors. With "innovations" the noise is whatever
+    periodic process the states can make: noise that drives the system (every such system has this
+    form, by Kalman's filter), and, with more states, colored noise.
+
+    By Levenberg and Marquardt's iteration, with exact derivatives, in local coordinates in which
+    the choice of states does not count (McKelvey, Helmersson and Ribarits 2004).
 
     ```python
-    start = hj.identify.realize(estimate, dims)
-    fit = hj.fit_ldtp(estimate, start)
+    fit = hj.fit_ldtp(estimate, dims)
     ```
 
     **Arguments:**
 
-    - `htf`: estimated, with harmonics as many as can be had: few of them determine few of the
-      matrices' entries. Without variances each output counts relative to its misfit.
-    - `start`: where the iteration begins, and the dimension of the state at each section. It must
-      be observable, as what `hj.identify.realize` gives is. Too few dimensions bias the
-      multipliers; the misfit shows it where variances are known.
+    - `data`: HTFs, estimated, with harmonics as many as can be had: few of them determine few of
+      the matrices' entries; without variances each output counts relative to its misfit. Or series,
+      as for `fit_series`.
+    - `guess`: the dimension of the state at each section or at all: the fit begins with what
+      `hj.identify.realize` makes of HTFs, and with a subspace method for series. Or the model to
+      begin with, observable, which has these dimensions. Too few bias the multipliers.
+    - `noise`: of series, see above.
+    - `start`: of series. "free": the state at the start of each record is unknown; "cycle": zero.
     - `direct`: whether outputs may depend on the input at their own section; if not, D = 0.
     - `max_steps`: of the iteration.
 
     **Raises:** `DefinitionError` if the two do not fit together, for NaN in the HTFs, variances
-    that are not positive, a start with a state that outputs never show, or fewer numbers in the
-    HTFs than unknowns.
+    that are not positive, a guess with a state that outputs never show, or fewer numbers in the
+    data than unknowns; for records with `lead`.
     """
     require_x64()
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(start, name) != getattr(htf, name):
-            raise DefinitionError(
-                f"`start` and HTFs have different {name}: {getattr(start, name)} and "
-                f"{getattr(htf, name)}."
-            )
-    scale = check_values(htf)
-    problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
-    model = PeriodicModel.of(start, scale)
-    if not direct:
-        model = model._replace(D=[0.0 * D for D in model.D])
-    unknowns = local_coordinates(model, direct).size
-    freedom = problem.residuals - unknowns
-    if freedom < 1:
-        raise DefinitionError(
-            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns."
-        )
-    if not np.isfinite(problem.cost(model)):
-        raise DefinitionError("`start` is resonant at a frequency of the HTFs.")
-    found = minimize(problem, model, direct, max_steps)
-    if htf.variance is None:
-        # Once more with the outputs weighted by what their misfit says.
-        square = (np.abs(problem.errors(found.coordinates.model)) ** 2).mean(axis=(0, 1, 3))
-        noise = np.maximum(np.sqrt(square / 2), ROUNDING)
-        problem = problem._replace(weight=problem.weight / noise[:, None])
-        found = minimize(problem, found.coordinates.model, direct, max_steps)
-    c, slopes = characteristic_slopes(found.coordinates)
-    unit = 1.0 if htf.variance is not None else found.cost / freedom
-    root = np.sqrt(unit) * found.equations.covariance_root()
-    return LDTPFit(
-        model=found.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs),
-        multipliers=multipliers_of(c),
-        coefficients=c,
-        covariance=slopes @ root @ (slopes @ root).T,
-        covariance_freedom=np.inf if htf.variance is not None else float(freedom),
-        cost=found.cost / unit,
-        freedom=freedom,
-        result=Result.OK if found.converged else Result.NOT_CONVERGED,
-        harmonics=htf.harmonics,
-        noise=None,
-        _coordinates=found.coordinates,
-        _root=root,
-        _scale=scale,
-    )
+    if isinstance(data, HTF):
+        if noise == "innovations":
+            raise DefinitionError("HTFs tell nothing of innovations: give the series.")
+        return fit_to_htf(data, guess, direct, max_steps)
+    return fit_to_series(data, guess, noise == "innovations", start == "free", direct, max_steps)

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ...linear.htf import HTF
 from .coordinates import LocalCoordinates
@@ -66,6 +66,10 @@ class FrequencyProblem(NamedTuple):
             return np.inf
         return cost if np.isfinite(cost) else np.inf
 
+    def reweighted(self, model: PeriodicModel) -> "FrequencyProblem":
+        """Itself: its weights are known."""
+        return self
+
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
         gram, gradient = np.zeros((P, P)), np.zeros(P)
@@ -82,13 +86,14 @@ def transfer(
 ) -> Complex[np.ndarray, "M F ny nu"]:
     """The harmonic transfer functions of a model."""
     N = model.n_sections
-    states = _states(model, np.exp(2j * np.pi / N * f))
     G = np.stack(
-        [x @ C.T + D.T for x, C, D in zip(states, model.C, model.D, strict=True)]
-    )  # (N, F, nu, ny)
-    n = np.arange(N)
-    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, n)) / N
-    return np.tensordot(waves, G, 1).swapaxes(2, 3)
+        [
+            _real_times(C, x) + D[:, None, :]
+            for x, C, D in zip(states_at(model, f), model.C, model.D, strict=True)
+        ]
+    )  # (N, ny, F, nu)
+    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
+    return np.tensordot(waves, G, 1).swapaxes(1, 2)
 
 
 def transfer_slopes(
@@ -105,61 +110,85 @@ def transfer_slopes(
 def _slopes(coordinates, f, m):
     model, places = coordinates.model, coordinates.places
     N, (ny, nu) = model.n_sections, model.D[0].shape
-    z = np.exp(2j * np.pi / N * f)
-    z_m = np.exp(2j * np.pi / N * (m[:, None] + f)).ravel()
-    states, mu = _states(model, z), adjoints(model, z_m)
+    states, after = states_at(model, f), _after(model, f, m)
     J = np.zeros((coordinates.size, len(m), len(f), ny, nu), complex)
     for n, at in enumerate(places):
-        x = states[n]  # (F, nu, d)
-        after = mu[(n + 1) % N] / z_m[:, None, None]
-        wave = np.exp(-2j * np.pi / N * m * n)[:, None, None, None] / N
-        nu_m = after.reshape(len(m), len(f), ny, -1) * wave
+        x = states[n]  # (d, F, nu)
+        wave = _waves(m, n, N)[:, None, None]
         shapes = dict(coordinates.blocks(n))
-        left = nu_m @ coordinates.to_A[n] + wave * coordinates.to_C[n]  # (M, F, ny, q)
+        left = _real_times(coordinates.to_A[n].T, after[n])  # (q, M, F, ny)
+        left += coordinates.to_C[n].T[:, None, None, :] * wave
         Y = J[at["Y"]].reshape(*shapes["Y"], *J.shape[1:])
-        right = x.transpose(2, 0, 1)[None, :, None, :, None]  # (1, d, 1, F, 1, nu)
-        np.multiply(left.transpose(3, 0, 1, 2)[:, None, ..., None], right, out=Y)
+        np.multiply(left[:, None, ..., None], x[None, :, None, :, None, :], out=Y)
         B = J[at["B"]].reshape(*shapes["B"], *J.shape[1:])
         for j in range(nu):
-            B[:, j, ..., j] = nu_m.transpose(3, 0, 1, 2)
+            B[:, j, ..., j] = after[n]
         if coordinates.direct:
             D = J[at["D"]].reshape(*shapes["D"], *J.shape[1:])
             for i, j in np.ndindex(ny, nu):
-                D[i, j, ..., i, j] = wave[..., 0, 0]
+                D[i, j, ..., i, j] = wave[..., 0]
     return J
 
 
-def _states(model: PeriodicModel, z: Complex[np.ndarray, " F"]):
-    """x~ at each section, (F, nu, d)."""
+def _after(model: PeriodicModel, f: Float[np.ndarray, " F"], m: Int[np.ndarray, " M"]):
+    """What a change of the state after each section adds to the HTFs, (d, M, F, ny) each."""
+    N, ny = model.n_sections, len(model.C[0])
+    z = np.exp(2j * np.pi / N * (m[:, None] + f))
+    mu = adjoints(model, z.ravel())
+    factors = [(_waves(m, n, N)[:, None] / z)[..., None] for n in range(N)]
+    return [
+        mu[(n + 1) % N].reshape(-1, len(m), len(f), ny) * factor for n, factor in enumerate(factors)
+    ]
+
+
+def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
+    return np.exp(-2j * np.pi / N * n * m) / N
+
+
+def states_at(
+    model: PeriodicModel, f: Float[np.ndarray, " F"]
+) -> list[Complex[np.ndarray, "d F nu"]]:
+    r"""$\tilde x$ at each section."""
+    N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
+    back = np.exp(-2j * np.pi / N * f)[:, None]
 
     def around(x):
         found = []
         for A, B in zip(model.A, model.B, strict=True):
             found.append(x)
-            x = (x @ A.T + B.T) / z[:, None, None]
+            x = (_real_times(A, x) + B[:, None, :]) * back
         return found, x
 
-    nu, phi = model.B[0].shape[1], model.monodromy()
-    _, forced = around(np.zeros((len(z), nu, len(phi)), complex))
-    return around(forced @ _resolvent(phi.T, z, model.n_sections))[0]
+    _, forced = around(np.zeros((len(phi), len(f), nu), complex))
+    return around(np.einsum("fab,bfj->afj", _resolvent(phi, np.exp(-2j * np.pi * f)), forced))[0]
 
 
 def adjoints(
     model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "F ny d"]]:
-    r"""$\mu$ at each section."""
+) -> list[Complex[np.ndarray, "d F ny"]]:
+    r"""$\mu$ at each section, transposed."""
+    ny, phi = len(model.C[0]), model.monodromy()
+    back = 1 / z[:, None]
 
     def around(mu):
         found = []
         for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
-            mu = C + mu @ A / z[:, None, None]
+            mu = _real_times(A.T, mu)
+            mu *= back
+            mu += C.T[:, None, :]
             found.append(mu)
         return found[::-1]
 
-    ny, phi = len(model.C[0]), model.monodromy()
-    forced = around(np.zeros((len(z), ny, len(phi)), complex))[0]
-    return around(forced @ _resolvent(phi, z, model.n_sections))
+    forced = around(np.zeros((len(phi), len(z), ny), complex))[0]
+    return around(np.einsum("fba,bfi->afi", _resolvent(phi, z**-model.n_sections), forced))
 
 
-def _resolvent(phi: Float[np.ndarray, "d d"], z: Complex[np.ndarray, " F"], N: int):
-    return np.linalg.inv(np.eye(len(phi)) - phi * z[:, None, None] ** -N)
+def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
+    """(a, *rest): a product with a real matrix."""
+    parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
+    return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
+
+
+def _resolvent(phi: Float[np.ndarray, "d d"], z_N: Complex[np.ndarray, " F"]):
+    r"""$(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
+    return np.linalg.inv(np.eye(len(phi)) - phi * z_N[:, None, None])

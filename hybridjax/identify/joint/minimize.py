@@ -8,6 +8,7 @@ from .coordinates import LocalCoordinates, local_coordinates
 from .frequency import FrequencyProblem
 from .normal_equations import NormalEquations
 from .periodic_model import PeriodicModel
+from .series import SeriesProblem
 
 
 # Damping of the first step, relative to the squared length of each column. Doubled: first steps are
@@ -32,12 +33,18 @@ class Minimum(NamedTuple):
     equations: NormalEquations
     cost: float
     converged: bool
+    problem: FrequencyProblem | SeriesProblem
+    """With the last weights."""
 
 
 def minimize(
-    problem: FrequencyProblem, model: PeriodicModel, direct: bool, max_steps: int
+    problem: FrequencyProblem | SeriesProblem, model: PeriodicModel, direct: bool, max_steps: int
 ) -> Minimum:
     """The model that makes the cost smallest, from this one on.
+
+    After each step the problem takes the weights that its errors suggest, where these are unknown.
+    The cost is concave in the covariance of the errors up to terms without the model, so that a
+    step that lowers it with the weights of before raises the likelihood.
 
     **Arguments:** `direct`: whether D is free.
     """
@@ -47,18 +54,20 @@ def minimize(
     for _ in range(max_steps):
         step, gain = equations.step(damping)
         if gain <= _SETTLED_GAIN * min(1.0, cost):
-            return Minimum(coordinates, equations, cost, True)
+            return Minimum(coordinates, equations, cost, True, problem)
         model = coordinates.moved(step)
         while (lower := problem.cost(model)) >= cost:
             if damping > _MOST_DAMPING:
                 small = gain <= _STALLED_GAIN * cost or np.abs(step).max() < _STALLED_STEP
-                return Minimum(coordinates, equations, cost, bool(small))
+                return Minimum(coordinates, equations, cost, bool(small), problem)
             damping *= _MORE
             model = coordinates.moved(equations.step(damping)[0])
         settled = cost - lower <= _SETTLED_GAIN * min(1.0, cost)
-        cost, damping = lower, damping * _LESS
+        again = problem.reweighted(model)
+        cost = lower if again is problem else again.cost(model)
+        problem, damping = again, damping * _LESS
         coordinates = local_coordinates(model, direct)
         equations = problem.linearize(coordinates)
         if settled:
-            return Minimum(coordinates, equations, cost, True)
-    return Minimum(coordinates, equations, cost, False)
+            return Minimum(coordinates, equations, cost, True, problem)
+    return Minimum(coordinates, equations, cost, False, problem)

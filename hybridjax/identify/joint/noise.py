@@ -59,6 +59,28 @@ def noise_spectrum(
     mu = adjoints(model, z)
     total = np.zeros((len(z), len(noise.outputs)))
     for n in range(N):
-        after = mu[(n + 1) % N] / z[:, None, None]
-        total += (np.abs(model.D[n] + after @ model.B[n]) ** 2).sum(axis=2)
+        after = np.tensordot(model.B[n].T, mu[(n + 1) % N], 1) / z[:, None]  # (inputs, F, ny)
+        total += (np.abs(model.D[n].T[:, None] + after) ** 2).sum(axis=0)
     return total.reshape(len(harmonics), len(f), -1) / N
+
+
+def noise_model(
+    model: PeriodicModel,
+    S: Float[np.ndarray, "N ny ny"],
+    scale: Float[np.ndarray, " ny"],
+    outputs: tuple[str, ...],
+) -> LDTP:
+    """The noise of a model in innovation form, of inputs with variance one.
+
+    **Arguments:** `S`: covariances of the innovations, in units of `scale`, as the model's outputs.
+    """
+    ny = len(outputs)
+    L = np.linalg.cholesky(S)
+    names = tuple(f"noise of {name}" for name in outputs)
+    D = [scale[:, None] * root for root in L]
+    if not model.K[0].shape[1]:
+        zero = np.zeros((len(S), 1, 1))
+        return LDTP(zero, zero * np.ones(ny), np.zeros((len(S), ny, 1)), D, None, names, outputs)
+    B = [K @ root for K, root in zip(model.K, L, strict=True)]
+    C = [scale[:, None] * C for C in model.C]
+    return LDTP.from_blocks(model.A, B, C, D, names, outputs)

@@ -13,7 +13,7 @@ Blocks = list[Float[np.ndarray, "rows columns"]]
 
 
 class PeriodicModel(NamedTuple):
-    """$x[n+1] = A[n] x[n] + B[n] u[n]$, $y[n] = C[n] x[n] + D[n] u[n]$."""
+    """$x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n]$, $y[n] = C[n] x[n] + D[n] u[n] + e[n]$."""
 
     A: Blocks
     """(d[n+1], d[n]) at section n,"""
@@ -22,11 +22,13 @@ class PeriodicModel(NamedTuple):
     C: Blocks
     """(ny, d[n]),"""
     D: Blocks
-    """(ny, nu)."""
+    """(ny, nu),"""
+    K: Blocks
+    """(d[n+1], ny), or without columns: then noise does not reach the state."""
 
     @classmethod
     def of(cls, model: LDTP, scale: Float[np.ndarray, " ny"]) -> "PeriodicModel":
-        """With outputs in units of `scale`."""
+        """With outputs in units of `scale`, and noise that does not reach the state."""
         dims = [int(d) for d in np.asarray(model.dims)]
         after = [*dims[1:], dims[0]]
         A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
@@ -35,6 +37,7 @@ class PeriodicModel(NamedTuple):
             [b[:j] for b, j in zip(B, after, strict=True)],
             [c[:, :i] / scale[:, None] for c, i in zip(C, dims, strict=True)],
             [d / scale[:, None] for d in D],
+            [np.zeros((j, 0)) for j in after],
         )
 
     @property

@@ -1,0 +1,71 @@
+"""The fit of a linear periodic model to harmonic transfer functions."""
+
+import numpy as np
+
+from ..._core.results import Result
+from ...errors import DefinitionError
+from ...linear.htf import HTF
+from ...linear.ldtp import LDTP
+from ..multipliers.denominator import multipliers_of
+from ..multipliers.error_weights import ROUNDING, check_values, error_weights
+from ..series.realization import realize
+from .characteristic import characteristic_slopes
+from .coordinates import local_coordinates
+from .frequency import FrequencyProblem
+from .ldtp_fit import LDTPFit
+from .minimize import minimize
+from .periodic_model import PeriodicModel
+
+
+def fit_to_htf(htf: HTF, guess, direct: bool, max_steps: int) -> LDTPFit:
+    """As `fit_ldtp`."""
+    scale = check_values(htf)
+    start = guess if isinstance(guess, LDTP) else realize(htf, guess)
+    require_same_kind(start, htf)
+    problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
+    model = PeriodicModel.of(start, scale)
+    if not direct:
+        model = model._replace(D=[0.0 * D for D in model.D])
+    unknowns = local_coordinates(model, direct).size
+    freedom = problem.residuals - unknowns
+    if freedom < 1:
+        raise DefinitionError(
+            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns."
+        )
+    if not np.isfinite(problem.cost(model)):
+        raise DefinitionError("the guess is resonant at a frequency of the HTFs.")
+    found = minimize(problem, model, direct, max_steps)
+    if htf.variance is None:
+        # Once more with the outputs weighted by what their misfit says.
+        square = (np.abs(problem.errors(found.coordinates.model)) ** 2).mean(axis=(0, 1, 3))
+        noise = np.maximum(np.sqrt(square / 2), ROUNDING)
+        problem = problem._replace(weight=problem.weight / noise[:, None])
+        found = minimize(problem, found.coordinates.model, direct, max_steps)
+    c, slopes = characteristic_slopes(found.coordinates)
+    unit = 1.0 if htf.variance is not None else found.cost / freedom
+    root = np.sqrt(unit) * found.equations.covariance_root()
+    return LDTPFit(
+        model=found.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs),
+        multipliers=multipliers_of(c),
+        coefficients=c,
+        covariance=slopes @ root @ (slopes @ root).T,
+        covariance_freedom=np.inf if htf.variance is not None else float(freedom),
+        cost=found.cost / unit,
+        freedom=freedom,
+        result=Result.OK if found.converged else Result.NOT_CONVERGED,
+        harmonics=htf.harmonics,
+        noise=None,
+        _coordinates=found.coordinates,
+        _root=root,
+        _scale=scale,
+    )
+
+
+def require_same_kind(model: LDTP, data) -> None:
+    """**Raises:** `DefinitionError` if a guess and data have different N, inputs or outputs."""
+    for name in ("n_sections", "inputs", "outputs"):
+        if getattr(model, name) != getattr(data, name):
+            raise DefinitionError(
+                f"guess and data have different {name}: {getattr(model, name)} and "
+                f"{getattr(data, name)}."
+            )
