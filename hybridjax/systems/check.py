@@ -1,6 +1,6 @@
 """Whether a system is well formed: names, shapes of every function, finite parameters."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import equinox as eqx
 import jax
@@ -31,6 +31,35 @@ def check_system(system: HybridSystem) -> None:
                 f"parameter `{jax.tree_util.keystr(path)[1:]}` of {type(system).__name__} is "
                 f"{np.asarray(leaf)}; every parameter must be finite."
             )
+    form = _form(system)
+    if form is None or form not in _checked:
+        _check_functions(system)
+        if form is not None:
+            if len(_checked) >= _KEPT:
+                _checked.clear()
+            _checked.add(form)
+    if isinstance(system, Quotient):
+        system.check()
+
+
+# Systems that were found to be well formed, but for their numbers.
+_checked: set[Hashable] = set()
+# So many of them. Doubled: twice as many kinds of systems can be taken turns with.
+_KEPT = 256
+
+
+def _form(system: HybridSystem) -> Hashable:
+    """All but the numbers of a system; `None` where that cannot be compared."""
+    leaves, structure = jax.tree_util.tree_flatten(system)
+    form = structure, *((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
+    try:
+        hash(form)
+    except TypeError:
+        return None
+    return form
+
+
+def _check_functions(system: HybridSystem) -> None:
     if not system.charts():
         raise DefinitionError(f"{type(system).__name__} has no charts.")
     _check_units(type(system).__name__, "inputs", system.inputs, system.input_units)
@@ -86,8 +115,12 @@ def check_system(system: HybridSystem) -> None:
                 f"the reset of {label} returns shape {shape}, but chart '{tr.target}' has the "
                 f"{s.dims[b]} states {quoted(s.charts[b].states)}."
             )
-    if isinstance(system, Quotient):
-        system.check()
+    for output in system.outputs():
+        values = s.resolve_outputs(output)
+        for a, name in enumerate(s.names):
+            if values.defined(a):
+                what = f"output '{output.name}' in chart '{name}'"
+                _shape(what, lambda t, q, u, a=a, z=values: z(a, t, q, u), s, a)
 
 
 def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:

@@ -37,3 +37,24 @@ def test_host_and_program_try_the_same_ways(name, monkeypatch):
     np.testing.assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
     for one in ("first", "slack", "lead"):
         np.testing.assert_allclose(getattr(host, one), getattr(xla, one), rtol=1e-12)
+
+
+# Derivatives of the ways from section 0 to 1 and back, and sizes at both.
+BACK_AND_FORTH = np.array([[[2.0]], [[0.1]]])
+
+
+def test_errors_are_followed_from_their_section_on():
+    """An error made on the way from section 0 shrinks first, one from section 1 grows first; after
+    each turn a fifth is left."""
+    errors = np.ones((1, 2, 1))
+    worst = plan._impact(BACK_AND_FORTH, errors, np.ones((2, 1)))
+    np.testing.assert_allclose(worst, [[1 / (1 - 0.2), 2 / (1 - 0.2)]], rtol=1e-12)
+    worst = plan._impact(BACK_AND_FORTH, errors, np.array([[1.0], [100.0]]))
+    np.testing.assert_allclose(worst, [[0.1 / (1 - 0.2), 1 / (1 - 0.2)]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale, largest", [([1.0, 100.0], 1.375), ([100.0, 1.0], 3.75)])
+def test_errors_of_all_sections_add_up(scale, largest):
+    """x1 = 2 x0 + 1 and x0 = x1 / 10 + 1, once they have."""
+    found = plan._accumulated(BACK_AND_FORTH, np.ones((2, 1)), np.array(scale)[:, None])
+    assert found == pytest.approx(largest, rel=1e-5)

@@ -50,6 +50,13 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
     np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-12)
 
 
+def test_process_noise_does_not_depend_on_the_chunks(arguments):
+    noise = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
+    whole = hj.run_experiments(*arguments, **BATCH, **noise)
+    parts = hj.experiments.stream_experiments(*arguments, chunk=40, **BATCH, **noise)
+    np.testing.assert_array_equal(records(parts), whole.y)
+
+
 def test_inputs_may_lie_on_disk(arguments, whole, tmp_path):
     np.save(tmp_path / "u.npy", whole.u)
     u = np.load(tmp_path / "u.npy", mmap_mode="r")

@@ -123,6 +123,19 @@ def test_regions_cover(small):
     np.testing.assert_allclose(np.mean([fit.noise for fit in fits], axis=0), 0.3, rtol=0.02)
 
 
+def test_unknown_starts_leave_the_first_cycles_without_a_say():
+    """Of an input at the first sample only, section 0 sees lag 2 a cycle later; what it sees at
+    once may as well come from before."""
+    u, y = np.zeros((10, 1)), np.ones((10, 1))
+    u[0] = 1.0
+    parts = Parts(hj.Record(u, y, n_sections=2))
+    seen = {}
+    for free_start in (True, False):
+        problem = OutputErrorProblem.from_data(parts, 1, 0, free_start=free_start)
+        seen[free_start] = [x.shape[1] for x in problem.to_lags]
+    assert seen == {True: [1, 0], False: [2, 1]}
+
+
 def test_process_noise_is_seen_in_the_residuals(small):
     """A random input nobody recorded: regions from white errors would be too small."""
     true, runs = small.multipliers, 40

@@ -108,6 +108,10 @@ def replaced(**changes):
         ),
         (replaced(guard=lambda t, q, u: q[0] - u[1]), "guard of .* cannot be evaluated: index 1"),
         (replaced(reset=lambda t, q, u: (q[3],)), "reset of .* cannot be evaluated: index 3"),
+        (
+            Anything(ROOM, named=(hj.Output("z", {"b": lambda t, q, u: q[1]}),)),
+            "output 'z' in chart 'b' cannot be evaluated: index 1 is out of bounds",
+        ),
         (Anything(ROOM, (TO_B, TO_B)), "two transitions are called 'go'"),
         (
             eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)),
