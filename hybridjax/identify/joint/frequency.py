@@ -85,7 +85,7 @@ class FrequencyProblem(NamedTuple):
         """
         N, (ny, nu) = model.n_sections, model.D[0].shape
         m = np.array(self.harmonics)
-        ends = np.cumsum([0, *[len(B) for B in model.B]])
+        ends = np.cumsum([0, *[len(B) for B in model.B]]).tolist()
         waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
         size = ends[-1] + (N * ny if direct else 0)
         gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
@@ -107,7 +107,7 @@ class FrequencyProblem(NamedTuple):
         except np.linalg.LinAlgError:
             return model
         found = np.stack(each, axis=1)
-        B = [found[a:b] for a, b in pairwise(ends.tolist())]
+        B = [found[a:b] for a, b in pairwise(ends)]
         D = list(found[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
         return model._replace(B=B, D=D)
 
