@@ -198,8 +198,8 @@ def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
 
 def states_at(
     model: PeriodicModel, f: Float[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "d F nu"]]:
-    r"""$\tilde x$ at each section."""
+) -> list[Complex[np.ndarray, "_ F nu"]]:
+    r"""$\tilde x$ at each section, (d, F, nu)."""
     N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
     back = np.exp(-2j * np.pi / N * f)[:, None]
 
@@ -216,8 +216,8 @@ def states_at(
 
 def adjoints(
     model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "d F ny"]]:
-    r"""$\mu$ at each section, transposed."""
+) -> list[Complex[np.ndarray, "_ F ny"]]:
+    r"""$\mu$ at each section, transposed: (d, F, ny)."""
     ny, phi = len(model.C[0]), model.monodromy()
     back = 1 / z[:, None]
 

@@ -16,6 +16,7 @@ class NormalEquations:
     """
 
     def __init__(self, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"]):
+        self.gradient = gradient
         size = np.sqrt(np.diag(gram))
         self._size = np.where(size > 0, size, 1.0)
         self._values, self._vectors = np.linalg.eigh(gram / self._size / self._size[:, None])
