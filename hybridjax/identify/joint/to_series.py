@@ -40,7 +40,7 @@ def fit_to_series(
     same = np.tile(np.eye(len(parts.outputs)), (N, 1, 1))
     problem = SeriesProblem(series, same, innovations, free_start, series.numbers)
     if not isinstance(guess, LDTP):
-        model = subspace_model(series, given_dims(guess, N), innovations)
+        model = subspace_model(series, given_dims(guess, N, "guess"), innovations)
     else:
         require_same_kind(guess, parts)
         model = PeriodicModel.of(guess, series.scale)

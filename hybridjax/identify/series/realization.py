@@ -116,7 +116,7 @@ def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
     return np.where(scale > 0, scale, 1.0)
 
 
-def given_dims(dims, N: int) -> list[int] | None:
+def given_dims(dims, N: int, name: str = "dims") -> list[int] | None:
     """One for each section; None where none are given.
 
     **Raises:** `DefinitionError` for another number of them.
@@ -125,7 +125,7 @@ def given_dims(dims, N: int) -> list[int] | None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
     if chosen.shape != (N,):
-        raise DefinitionError(f"`dims` must be one for each of {N} sections, not {len(chosen)}.")
+        raise DefinitionError(f"`{name}` must be one for each of {N} sections, not {len(chosen)}.")
     return [int(d) for d in chosen]
 
 
