@@ -8,9 +8,9 @@ from scipy import stats
 import hybridjax as hj
 from hybridjax.identify.joint.coordinates import local_coordinates
 from hybridjax.identify.joint.periodic_model import PeriodicModel
-from hybridjax.identify.joint.prediction import Predictor
-from hybridjax.identify.joint.series import SeriesProblem
-from hybridjax.identify.joint.series_part import SeriesPart
+from hybridjax.identify.joint.prediction.predictor import Predictor
+from hybridjax.identify.joint.prediction.problem import SeriesProblem
+from hybridjax.identify.joint.prediction.series_part import SeriesPart
 from hybridjax.identify.series.cycle_grid import CycleGrid
 
 from .test_series import record, scaled

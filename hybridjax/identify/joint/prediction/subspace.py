@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ...errors import DefinitionError
-from .periodic_model import PeriodicModel
+from ....errors import DefinitionError
+from ..periodic_model import PeriodicModel
 from .series_part import SeriesPart
 
 

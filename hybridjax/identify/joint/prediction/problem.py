@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .coordinates import LocalCoordinates
-from .normal_equations import NormalEquations
-from .periodic_model import PeriodicModel
+from ..coordinates import LocalCoordinates
+from ..normal_equations import NormalEquations
+from ..periodic_model import PeriodicModel
 from .recursion import recursion
 from .series_part import SeriesPart, solve_starts
 

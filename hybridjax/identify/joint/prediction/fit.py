@@ -5,24 +5,24 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.results import Result
-from ...errors import DefinitionError
-from ...experiments.record import RecordedData
-from ...linear.frequency_response import all_harmonics
-from ...linear.ldtp import LDTP
-from ..multipliers.denominator import multipliers_of
-from ..series.parts import Parts
-from ..series.realization import given_dims
-from .characteristic import characteristic_slopes
-from .coordinates import local_coordinates
-from .ldtp_fit import LDTPFit
-from .minimize import minimize
-from .noise import noise_model
-from .periodic_model import PeriodicModel
-from .series import SeriesProblem
+from ...._core.results import Result
+from ....errors import DefinitionError
+from ....experiments.record import RecordedData
+from ....linear.frequency_response import all_harmonics
+from ....linear.ldtp import LDTP
+from ...multipliers.denominator import multipliers_of
+from ...series.parts import Parts
+from ...series.realization import given_dims
+from ..characteristic import characteristic_slopes
+from ..coordinates import local_coordinates
+from ..ldtp_fit import LDTPFit
+from ..minimize import minimize
+from ..noise import noise_model
+from ..periodic_model import PeriodicModel
+from ..to_htf import require_same_kind
+from .problem import SeriesProblem
 from .series_part import SeriesPart
 from .subspace import subspace_model
-from .to_htf import require_same_kind
 
 
 def fit_to_series(
