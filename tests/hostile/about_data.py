@@ -128,16 +128,24 @@ def estimates(t):
     yield "multiplier_bound", hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain), {
         "model": instance(t.design), "htf": htf, "overhang": optional([*WHOLE, 10**6]),
     }  # fmt: skip
-    yield "fit_ldtp", hj.fit_ldtp, dict(htf=t.uncertain, start=t.model), {
-        "htf": htf, "start": instance(t.design), "direct": FLAG, "max_steps": COUNT,
+    dims = ["x", 2.5, NAN, 0, -1, [3], [2.5] * 6, ["2"] * 6, 10**6, Other()]
+    yield "fit_ldtp", hj.fit_ldtp, dict(data=t.uncertain, guess=t.model), {
+        "data": [*(x for x in htf if not isinstance(x, hj.ExperimentData)), []], "noise": WORD,
+        "guess": [*(x for x in instance(t.design) if not isinstance(x, int)), *dims],
+        "start": WORD, "direct": FLAG, "max_steps": COUNT,
     }  # fmt: skip
     yield "LDTPFit.htf", t.joint.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
     }  # fmt: skip
+    yield "LDTPFit.noise_spectrum", t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2])), {
+        "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
+    }  # fmt: skip
+    yield "noise_spectrum", hj.identify.noise_spectrum, dict(noise=t.model, f=np.array([0.1])), {
+        "noise": instance(t.design), "f": array([0.1, 0.2], empty=True), "harmonics": HARMONICS,
+    }  # fmt: skip
     yield "ldtp_bound", hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain), {
         "model": instance(t.design), "htf": htf,
     }  # fmt: skip
-    dims = ["x", 2.5, NAN, 0, -1, [3], [2.5] * 6, ["2"] * 6, 10**6, Other()]
     yield "realize", hj.identify.realize, dict(source=t.exact), {
         "source": [None, "x", 3, NAN, np.zeros(3), t.design, Other()], "dims": dims,
         "order": FEW, "horizon": optional(FEW), "outputs": NEW_NAMES, "inputs": NEW_NAMES,
@@ -161,7 +169,8 @@ def series(t):
     }  # fmt: skip
     yield "validate", hj.validate, dict(model=t.fit, data=t.record), {
         "model": [*instance(t.design), t.exact], "data": [*data, other], "start": WORD,
-        "lags": optional([*COUNT, 10**6]), "level": SHARE,
+        "noise": optional(instance(t.design, t.model)), "lags": optional([*COUNT, 10**6]),
+        "level": SHARE,
     }  # fmt: skip
     u = t.data.u
     yield "amplitude_sweep", hj.identify.amplitude_sweep, dict(

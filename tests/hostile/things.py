@@ -117,6 +117,10 @@ class Things:
         return hj.Record(u, y + 1e-3 * np.random.default_rng(1).normal(size=y.shape), n_sections=6)
 
     @ft.cached_property
+    def driven(self):
+        return hj.fit_ldtp(self.record, self.model, noise="innovations")
+
+    @ft.cached_property
     def fit(self):
         return hj.fit_series(self.record, 2)
 

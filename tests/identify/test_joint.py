@@ -164,7 +164,7 @@ def test_structure_is_worth_something(model, exact):
 
 
 def test_bad_input_is_refused_in_a_sentence(model, exact):
-    with pytest.raises(hj.DefinitionError, match="`start` and HTFs have different inputs"):
+    with pytest.raises(hj.DefinitionError, match="guess and data have different inputs"):
         hj.fit_ldtp(exact, hj.LDTP(model.A, model.B, model.C, inputs=("a", "b")))
     with pytest.raises(hj.DefinitionError, match="too few for"):
         few = model.htf(F[:2], (0,))

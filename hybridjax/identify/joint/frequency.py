@@ -85,7 +85,7 @@ class FrequencyProblem(NamedTuple):
         """
         N, (ny, nu) = model.n_sections, model.D[0].shape
         m = np.array(self.harmonics)
-        ends = np.cumsum([0, *[len(B) for B in model.B]])
+        ends = np.cumsum([0, *[len(B) for B in model.B]]).tolist()
         waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
         size = ends[-1] + (N * ny if direct else 0)
         gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
@@ -107,7 +107,7 @@ class FrequencyProblem(NamedTuple):
         except np.linalg.LinAlgError:
             return model
         found = np.stack(each, axis=1)
-        B = [found[a:b] for a, b in pairwise(ends.tolist())]
+        B = [found[a:b] for a, b in pairwise(ends)]
         D = list(found[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
         return model._replace(B=B, D=D)
 
@@ -198,8 +198,8 @@ def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
 
 def states_at(
     model: PeriodicModel, f: Float[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "d F nu"]]:
-    r"""$\tilde x$ at each section."""
+) -> list[Complex[np.ndarray, "_ F nu"]]:
+    r"""$\tilde x$ at each section, (d, F, nu)."""
     N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
     back = np.exp(-2j * np.pi / N * f)[:, None]
 
@@ -216,8 +216,8 @@ def states_at(
 
 def adjoints(
     model: PeriodicModel, z: Complex[np.ndarray, " F"]
-) -> list[Complex[np.ndarray, "d F ny"]]:
-    r"""$\mu$ at each section, transposed."""
+) -> list[Complex[np.ndarray, "_ F ny"]]:
+    r"""$\mu$ at each section, transposed: (d, F, ny)."""
     ny, phi = len(model.C[0]), model.monodromy()
     back = 1 / z[:, None]
 

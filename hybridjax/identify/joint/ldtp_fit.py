@@ -17,7 +17,7 @@ from ..multipliers.multiplier_estimate import MultiplierEstimate
 from .coordinates import LocalCoordinates
 from .frequency import transfer, transfer_slopes
 from .noise import noise_spectrum
-from .prediction import Predictor
+from .prediction.predictor import Predictor
 
 
 class LDTPFit(MultiplierEstimate):

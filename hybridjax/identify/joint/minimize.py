@@ -10,7 +10,7 @@ from .coordinates import LocalCoordinates, local_coordinates
 from .frequency import FrequencyProblem
 from .normal_equations import NormalEquations
 from .periodic_model import PeriodicModel
-from .series import SeriesProblem
+from .prediction.problem import SeriesProblem
 
 
 # Damping of the first step, relative to the squared length of each column. Doubled: first steps are

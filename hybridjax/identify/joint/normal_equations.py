@@ -16,7 +16,8 @@ class NormalEquations:
     """
 
     def __init__(self, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"]):
-        size = np.sqrt(np.diag(gram))
+        self.gradient = gradient
+        size = np.sqrt(np.maximum(np.diag(gram), 0))
         self._size = np.where(size > 0, size, 1.0)
         self._values, self._vectors = np.linalg.eigh(gram / self._size / self._size[:, None])
         self._slope = self._vectors.T @ (gradient / self._size)

@@ -8,7 +8,7 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..multipliers.denominator import multipliers_of
 from ..multipliers.error_weights import ROUNDING, check_values, error_weights
-from ..series.realization import realize
+from ..series.realization import given_dims, realize
 from .characteristic import characteristic_slopes
 from .coordinates import local_coordinates
 from .frequency import FrequencyProblem
@@ -29,7 +29,9 @@ _COARSE_GAIN = 0.05
 def fit_to_htf(htf: HTF, guess, direct: bool, max_steps: int) -> LDTPFit:
     """As `fit_ldtp`."""
     scale = check_values(htf)
-    start = guess if isinstance(guess, LDTP) else realize(htf, guess)
+    start = guess
+    if not isinstance(guess, LDTP):
+        start = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
     require_same_kind(start, htf)
     problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
     model = PeriodicModel.of(start, scale)

@@ -100,7 +100,7 @@ def realize(
         np.block([[markov[(n + i) % N, i + j + 1] for j in range(p)] for i in range(p + 1)])
         for n in range(N)
     ]
-    bases = _bases(hankels, _chosen(dims, N), order, edge, ny)
+    bases = _bases(hankels, given_dims(dims, N), order, edge, ny)
     A, C = _shifted(bases, ny)
     after = [(n + 1) % N for n in range(N)]
     B = [bases[n].T @ hankels[n][:, :nu] for n in after]
@@ -116,12 +116,16 @@ def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
     return np.where(scale > 0, scale, 1.0)
 
 
-def _chosen(dims, N: int) -> list[int] | None:
+def given_dims(dims, N: int, name: str = "dims") -> list[int] | None:
+    """One for each section; None where none are given.
+
+    **Raises:** `DefinitionError` for another number of them.
+    """
     if dims is None:
         return None
     chosen = np.broadcast_to(np.asarray(dims), N) if np.ndim(dims) == 0 else np.asarray(dims)
     if chosen.shape != (N,):
-        raise DefinitionError(f"`dims` must be one for each of {N} sections, not {len(chosen)}.")
+        raise DefinitionError(f"`{name}` must be one for each of {N} sections, not {len(chosen)}.")
     return [int(d) for d in chosen]
 
 
@@ -187,7 +191,7 @@ def _from_htf(htf: HTF, dims, order: int, horizon: int | None) -> LDTP:
         for _ in range(2):  # the second time for accuracy
             Y = Y - (Y @ Q.T) @ Q
         matrices.append(Y)
-    bases = _bases(matrices, _chosen(dims, N), order, edge, ny)
+    bases = _bases(matrices, given_dims(dims, N), order, edge, ny)
     A, C = _shifted(bases, ny)
     C = [scale[:, None] * c for c in C]
     B, D = _inputs(A, C, G, z, weight)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ...experiments.record import Record
 from ...linear.ldtp import LDTP
-from ..joint.prediction import Predictor
+from ..joint.prediction.predictor import Predictor
 from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
 from .cycle_grid import count_cycles, drift_waves
 from .series_fit import SeriesFit

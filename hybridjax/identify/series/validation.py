@@ -16,7 +16,7 @@ from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
 from ..joint.ldtp_fit import LDTPFit
-from ..joint.prediction import Predictor
+from ..joint.prediction.predictor import Predictor
 from .checks.comparable import Comparable
 from .checks.power import smallest_visible
 from .checks.residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of

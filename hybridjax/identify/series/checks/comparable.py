@@ -9,7 +9,7 @@ from ....errors import DefinitionError
 from ....experiments.data import ExperimentData
 from ....experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ....linear.ldtp import LDTP
-from ...joint.prediction import Predictor
+from ...joint.prediction.predictor import Predictor
 from ..parts import in_groups
 from ..series_fit import SeriesFit
 from ..simulation import can_be_compared

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...errors import DefinitionError
-from ...experiments.record import Record
-from ...linear.ldtp import LDTP
-from ..series.cycle_grid import CycleGrid
-from .periodic_model import PeriodicModel
-from .series import SeriesProblem
+from ....errors import DefinitionError
+from ....experiments.record import Record
+from ....linear.ldtp import LDTP
+from ...series.cycle_grid import CycleGrid
+from ..periodic_model import PeriodicModel
+from .problem import SeriesProblem
 from .series_part import SeriesPart
 
 

@@ -1,12 +1,12 @@
 """A periodic model of series to begin a fit with: regression on the past, then a common state."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from ...errors import DefinitionError
-from .periodic_model import PeriodicModel
+from ....errors import DefinitionError
+from ..periodic_model import PeriodicModel
 from .series_part import SeriesPart
 
 
@@ -25,7 +25,7 @@ _SAMPLES = 200_000
 
 
 def subspace_model(
-    parts: Iterable[SeriesPart], dims: Int[np.ndarray, " N"], innovations: bool
+    parts: Iterable[SeriesPart], dims: Sequence[int], innovations: bool
 ) -> PeriodicModel:
     """A model with these dimensions, with or without K.
 

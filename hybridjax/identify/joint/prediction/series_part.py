@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..series.cycle_grid import CycleGrid
+from ...series.cycle_grid import CycleGrid
 
 
 # Singular values below this part of the largest one are rounding errors. Doubled: combinations of

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .coordinates import LocalCoordinates
-from .normal_equations import NormalEquations
-from .periodic_model import PeriodicModel
+from ..coordinates import LocalCoordinates
+from ..normal_equations import NormalEquations
+from ..periodic_model import PeriodicModel
 from .recursion import recursion
 from .series_part import SeriesPart, solve_starts
 
@@ -33,13 +33,13 @@ class Path(NamedTuple):
     F: list[Float[np.ndarray, "R1 T1 after d"]]
     gain: list[Float[np.ndarray, "R1 T1 after ny"]]
     """K, as it acts on the errors of outputs that are seen,"""
-    mean: list[Float[np.ndarray, "R1 T1 ny ny"]]
-    """the mean of all errors, given these,"""
     whiten: list[Float[np.ndarray, "R1 T1 ny ny"]]
     """and what makes these independent with variance one."""
     x: list[Float[np.ndarray, "R T d"]]
+    entering: list[Float[np.ndarray, "R T ny"]]
+    """What K acts on: errors, with their means where outputs are not seen."""
     error: list[Float[np.ndarray, "R T ny"]]
-    """Zero where an output is not seen."""
+    """Zero where an output is not seen, and without drift."""
     starts: list[Float[np.ndarray, "R rows s"]]
     """What the states at the starts add to predictions, whitened."""
     start_gram: Float[np.ndarray, "R s s"]
@@ -145,12 +145,17 @@ class SeriesProblem(NamedTuple):
             left.append(seen)
             starts.append(rows)
         x0 = solve_starts(gram, along)[:, None]
+        x = [at[..., 0] + (at[..., 1:] @ x0)[..., 0] for at in x]
+        entering = []
+        for n, at in enumerate(x):
+            e = (part.y[n] - direct[n] - at @ model.C[n].T) * part.seen[n]
+            entering.append(_times(given[n], e))
         return Path(
             F=F,
             gain=gain,
-            mean=list(given),
             whiten=list(whiten),
-            x=[at[..., 0] + (at[..., 1:] @ x0)[..., 0] for at in x],
+            x=x,
+            entering=entering,
             error=[e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in left],
             starts=starts,
             start_gram=gram,
@@ -170,7 +175,7 @@ class SeriesProblem(NamedTuple):
 
 def _slopes(
     coordinates: LocalCoordinates, part: SeriesPart, path: Path
-) -> Iterator[Float[np.ndarray, "R T ny P"]]:
+) -> Iterator[Float[np.ndarray, "_ _ ny P"]]:
     """Derivatives of the predictions at each section."""
     model, places = coordinates.model, coordinates.places
 
@@ -183,7 +188,7 @@ def _slopes(
         same = np.broadcast_to(np.eye(after), (1, 1, after, after))
         later[..., at["B"]] += _outer(same, u)
         if model.K[n].shape[1]:
-            later[..., at["K"]] += _outer(same, _times(path.mean[n], path.error[n]))
+            later[..., at["K"]] += _outer(same, path.entering[n])
         if coordinates.direct:
             later[..., at["D"]] -= _outer(gain, u)
 

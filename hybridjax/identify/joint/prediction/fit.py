@@ -5,23 +5,24 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.results import Result
-from ...errors import DefinitionError
-from ...experiments.record import RecordedData
-from ...linear.frequency_response import all_harmonics
-from ...linear.ldtp import LDTP
-from ..multipliers.denominator import multipliers_of
-from ..series.parts import Parts
-from .characteristic import characteristic_slopes
-from .coordinates import local_coordinates
-from .ldtp_fit import LDTPFit
-from .minimize import minimize
-from .noise import noise_model
-from .periodic_model import PeriodicModel
-from .series import SeriesProblem
+from ...._core.results import Result
+from ....errors import DefinitionError
+from ....experiments.record import RecordedData
+from ....linear.frequency_response import all_harmonics
+from ....linear.ldtp import LDTP
+from ...multipliers.denominator import multipliers_of
+from ...series.parts import Parts
+from ...series.realization import given_dims
+from ..characteristic import characteristic_slopes
+from ..coordinates import local_coordinates
+from ..ldtp_fit import LDTPFit
+from ..minimize import minimize
+from ..noise import noise_model
+from ..periodic_model import PeriodicModel
+from ..to_htf import require_same_kind
+from .problem import SeriesProblem
 from .series_part import SeriesPart
 from .subspace import subspace_model
-from .to_htf import require_same_kind
 
 
 def fit_to_series(
@@ -36,14 +37,15 @@ def fit_to_series(
         )
     N = parts.n_sections
     series = ScaledSeries(parts)
-    if isinstance(guess, LDTP):
+    same = np.tile(np.eye(len(parts.outputs)), (N, 1, 1))
+    problem = SeriesProblem(series, same, innovations, free_start, series.numbers)
+    if not isinstance(guess, LDTP):
+        model = subspace_model(series, given_dims(guess, N, "guess"), innovations)
+    else:
         require_same_kind(guess, parts)
         model = PeriodicModel.of(guess, series.scale)
         if innovations:
-            ny = len(parts.outputs)
-            model = model._replace(K=[np.zeros((len(A), ny)) for A in model.A])
-    else:
-        model = subspace_model(series, np.broadcast_to(np.asarray(guess), N), innovations)
+            model = _with_gain(model, problem, series)
     if not direct:
         model = model._replace(D=[0.0 * D for D in model.D])
     unknowns = local_coordinates(model, direct).size
@@ -56,9 +58,6 @@ def fit_to_series(
             f"the series hold {series.numbers} numbers, {fewest} samples of an output at one of "
             f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
         )
-    ny = len(parts.outputs)
-    same = np.tile(np.eye(ny), (N, 1, 1))
-    problem = SeriesProblem(series, same, innovations, free_start, series.numbers)
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     found = minimize(problem.reweighted(model), model, direct, max_steps)
@@ -80,6 +79,25 @@ def fit_to_series(
         _root=root,
         _scale=series.scale,
     )
+
+
+def _with_gain(
+    model: PeriodicModel, problem: SeriesProblem, series: "ScaledSeries"
+) -> PeriodicModel:
+    """A guess without gain as it is, or what the subspace method finds with its dimensions, where
+    the data suffice for that and it is more likely."""
+    plain = model._replace(
+        K=[np.zeros((len(A), len(C))) for A, C in zip(model.A, model.C, strict=True)]
+    )
+    try:
+        found = subspace_model(series, model.dims, True)
+    except DefinitionError:
+        return plain
+
+    def unlikely(one):
+        return np.linalg.slogdet(problem.reweighted(one).S)[1].sum()
+
+    return min(plain, found, key=unlikely)
 
 
 class ScaledSeries:

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 
-Columns = Float[np.ndarray, "R T d columns"]
-"""States of R records in T cycles, one for each column."""
+Columns = Float[np.ndarray, "_ _ _ _"]
+"""(R, T, d, columns): states of R records in T cycles, one for each column."""
 
 
 def recursion(
-    F: Sequence[Float[np.ndarray, "R1 T1 after d"]],
+    F: Sequence[Float[np.ndarray, "_ _ _ _"]],
     shape: tuple[int, int, int],
     enter: Callable[[int, Columns], None],
     drive: Callable[[int, Columns], None],
@@ -25,7 +25,7 @@ def recursion(
 
     **Arguments:**
 
-    - `F`: one for each section; its first axes may have the length 1.
+    - `F`: (R, T, after, d), one for each section; the first axes may have the length 1.
     - `shape`: R, T and the columns.
     - `enter`: adds what enters at a section to x there, before it is given; `drive`: what enters
       after it to the next x.

@@ -1,0 +1,231 @@
+"""`fit_ldtp` of series: output error and innovations, gaps, starts, and the noise it finds."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scipy import stats
+
+import hybridjax as hj
+from hybridjax.identify.joint.coordinates import local_coordinates
+from hybridjax.identify.joint.periodic_model import PeriodicModel
+from hybridjax.identify.joint.prediction.predictor import Predictor
+from hybridjax.identify.joint.prediction.problem import SeriesProblem
+from hybridjax.identify.joint.prediction.series_part import SeriesPart
+from hybridjax.identify.series.cycle_grid import CycleGrid
+
+from .test_series import record, scaled
+from .test_uncertainty import covered
+
+
+ONE = np.ones(2)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return scaled(3, (2, 3, 4, 2), 2, 1)
+
+
+def driven(model, size, sensor=0.1):
+    """Noise that enters where the inputs do, and noise of the sensors."""
+    still = np.broadcast_to(sensor * np.eye(2), (model.n_sections, 2, 2))
+    B = np.concatenate([size * model.B, np.zeros((*model.B.shape[:2], 2))], axis=2)
+    D = np.concatenate([size * model.D, still], axis=2)
+    return hj.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
+
+
+def noisy(model, noise, cycles, seed):
+    rng, n = np.random.default_rng(seed), model.n_sections * cycles
+    before = 20 * model.n_sections
+    u = rng.normal(size=(n + before, len(model.inputs)))
+    w = rng.normal(size=(n + before, len(noise.inputs)))
+    y = np.asarray(model.simulate(u) + noise.simulate(w))
+    about = dict(n_sections=model.n_sections, outputs=model.outputs)
+    return hj.Record(u[before:], y[before:], **about)
+
+
+def with_gaps(one, share, seed):
+    y = np.array(one.y)
+    y[np.random.default_rng(seed).random(y.shape) < share] = np.nan
+    return hj.Record(one.u, y, n_sections=one.n_sections, first_section=one.first_section,
+                     outputs=one.outputs, drift=one.drift)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def gappy(small):
+    """Three short records that start at different sections, a twentieth of the samples missing."""
+    return [
+        with_gaps(record(small, 4 * 12 + k, k, 0.1, first_section=k), 0.05, k) for k in range(3)
+    ]
+
+
+def in_innovation_form(model, seed=0):
+    rng = np.random.default_rng(seed)
+    model = PeriodicModel.of(model, ONE)
+    return model._replace(K=[0.1 * rng.normal(size=(len(A), 2)) for A in model.A])
+
+
+COVARIANCES = np.array([[1, 0.3], [0.3, 0.5]]) * np.arange(1, 5)[:, None, None]
+
+
+def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
+    """A missing output's error is the mean given the other's."""
+    part = SeriesPart.of(CycleGrid.from_records(gappy), ONE)
+    model = in_innovation_form(small)
+    path = SeriesProblem([part], COVARIANCES, True, False, 0).path(model, part)
+    for r, one in enumerate(gappy):
+        x = np.zeros(model.dims[r])
+        for t, (u, y) in enumerate(zip(one.u, one.y, strict=True)):
+            cycle, n = divmod(r + t, 4)
+            e = y - model.C[n] @ x - model.D[n] @ u
+            seen, S = np.isfinite(e), COVARIANCES[n]
+            mean = S[:, seen] @ np.linalg.solve(S[np.ix_(seen, seen)], e[seen])
+            np.testing.assert_allclose(path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11)
+            x = model.A[n] @ x + model.B[n] @ u + model.K[n] @ mean
+
+
+@pytest.mark.parametrize("free", (True, False))
+@pytest.mark.parametrize("drift", (None, np.inf))
+def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
+    records = [
+        hj.Record(r.u, r.y + 3.0, n_sections=4, first_section=r.first_section, drift=drift)
+        for r in gappy
+    ]
+    part = SeriesPart.of(CycleGrid.from_records(records), ONE)
+    same = np.tile(np.eye(2) * 2.0, (4, 1, 1))  # (a drift is taken out of each output alone)
+    problem = SeriesProblem([part], same, True, free, 0)
+    coordinates = local_coordinates(in_innovation_form(small), True)
+    step = np.random.default_rng(1).normal(size=coordinates.size)
+    ahead, back = (problem.cost(coordinates.moved(h * step)) for h in (1e-6, -1e-6))
+    equations = problem.linearize(coordinates)
+    gradient = equations.gradient
+    assert (ahead - back) / 2e-6 == pytest.approx(-2 * gradient @ step, rel=1e-5)
+
+
+def test_a_change_of_states_changes_no_prediction(small, gappy):
+    part = SeriesPart.of(CycleGrid.from_records(gappy), ONE)
+    model = in_innovation_form(small)
+    problem = SeriesProblem([part], COVARIANCES, True, True, 0)
+    normal = local_coordinates(model, True)
+    assert problem.cost(normal.model) == pytest.approx(problem.cost(model), rel=1e-9)
+    dims = np.asarray(small.dims)
+    after = np.roll(dims, -1)
+    entries = (after * dims + after * (1 + 2) + 2 * dims + 2).sum()
+    assert normal.size == entries - (dims**2).sum()
+
+
+@pytest.mark.parametrize("start", ("free", "cycle"))
+def test_series_without_noise_are_met_exactly(small, start):
+    x0 = np.ones(3) if start == "free" else None
+    whole = record(small, 4 * 60 + 3, 0, first_section=1, x0=x0)
+    data = with_gaps(whole, 0.02, 0)
+    shaken = eqx.tree_at(lambda m: m.B, small, 1.05 * small.B)
+    fit = hj.fit_ldtp(data, shaken, start=start)
+    assert fit.compare(small.multipliers).max_error < 1e-9
+    f = np.array([0.1, 0.4])
+    assert fit.htf(f).error(small.htf(f)).max() < 1e-9
+    assert fit.unknowns == local_coordinates(PeriodicModel.of(small, ONE), True).size
+
+
+def test_periodic_series_and_their_htfs_agree(small):
+    """One steady window of a multisine, in the time and in the frequency domain."""
+    design = hj.multisine(periods=32, n_sections=4, band=(0, 2), lines="odd", seed=0)
+    data = hj.experiments.simulate_experiments(small, design, start="periodic")
+    rng = np.random.default_rng(0)
+    data = eqx.tree_at(lambda d: d.y, data, data.y + 0.05 * rng.normal(size=data.y.shape))
+    in_time = hj.fit_ldtp(data, small)
+    htf = hj.estimate_htf(data)
+    sigma = np.sqrt(in_time.noise_spectrum(htf.f[:1], (0,))[0, 0])
+    each = design.expected_variance(1.0)[:, None, :] * sigma[:, None] ** 2
+    each = np.broadcast_to(each, htf.H.shape)
+    htf = hj.HTF(htf.f, htf.H, htf.harmonics, 4, htf.inputs, htf.outputs, variance=each)
+    in_frequency = hj.fit_ldtp(htf, small)
+    apart = np.abs(in_time.multipliers - in_frequency.multipliers).max()
+    assert apart < 0.5 * in_time.standard_errors[0]
+    np.testing.assert_allclose(in_time.standard_errors, in_frequency.standard_errors, rtol=0.2)
+
+
+def test_noise_that_drives_the_system_is_found(small):
+    """The spectrum of the fit is that of the truth; predictions are white, simulations are not."""
+    noise = driven(small, 0.3)
+    data, other = noisy(small, noise, 600, 0), noisy(small, noise, 300, 1)
+    fit = hj.fit_ldtp(data, small.dims, noise="innovations")
+    f = np.linspace(0.05, 0.45, 9)
+    ratio = fit.noise_spectrum(f) / hj.identify.noise_spectrum(noise, f)
+    assert np.abs(np.log(ratio)).max() < 0.6 and abs(np.log(ratio).mean()) < 0.1
+    assert fit.contains(small.multipliers, 0.999).all()
+    assert hj.validate(fit, other, level=1e-3).white
+    assert not hj.validate(fit.model, other, level=1e-3).white
+
+
+def test_errors_are_as_large_as_said(small):
+    """The distances of 40 fits, in units of their covariance, and the coverage, at 0.1 %."""
+    noise, runs = driven(small, 0.3), 40
+    fits = [
+        hj.fit_ldtp(noisy(small, noise, 150, seed), small, noise="innovations")
+        for seed in range(runs)
+    ]
+    square = [fit.distance(small.multipliers)[0] for fit in fits]
+    assert 1e-3 < stats.chi2(2 * runs).cdf(sum(square)) < 1 - 1e-3
+    hits = sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits)
+    assert covered(hits, runs)
+
+
+def test_the_true_model_and_its_noise_leave_white_errors(small):
+    """Both p-values are uniform, where simulations are refused every time."""
+    noise, p = driven(small, 0.3), []
+    for seed in range(30):
+        data = noisy(small, noise, 100, seed)
+        found = hj.validate(small, data, noise=noise)
+        p.append([found.whiteness, found.independence])
+        assert not hj.validate(small, data).white
+    for test in np.reshape(p, (30, 2, 2)).transpose(1, 2, 0).reshape(4, 30):
+        assert stats.kstest(test, "uniform").pvalue > 1e-3
+
+
+def test_the_filter_is_that_of_riccati(small):
+    """One section: scipy's solution of the algebraic equation."""
+    from scipy.linalg import solve_discrete_are
+
+    A, C = np.array([[0.8, 0.3], [-0.2, 0.6]]), np.array([[1.0, 0.5], [0.0, 1.0]])
+    G, R = np.array([[1.0], [0.4]]), 0.3
+    noise = hj.LDTP([A], [np.hstack([G, np.zeros((2, 2))])], [C], [np.hstack([np.zeros((2, 1)),
+                    R * np.eye(2)])])  # fmt: skip
+    plant = hj.LDTP([A], [G], [C])
+    found = Predictor.of(plant, noise)
+    P = solve_discrete_are(A.T, C.T, G @ G.T, R**2 * np.eye(2))
+    S = C @ P @ C.T + R**2 * np.eye(2)
+    np.testing.assert_allclose(found.S[0], S, rtol=1e-9)
+    np.testing.assert_allclose(found.model.K[0][2:], A @ P @ C.T @ np.linalg.inv(S), rtol=1e-8)
+
+
+def test_the_spectrum_of_noise(small):
+    """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
+    f, N = np.array([0.1, 0.3]), 4
+    white = hj.LDTP(np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 2, 1)),
+                    np.broadcast_to(0.3 * np.eye(2), (N, 2, 2)))  # fmt: skip
+    np.testing.assert_allclose(hj.identify.noise_spectrum(white, f), 0.09)
+    noise = driven(small, 0.3)
+    found = hj.identify.noise_spectrum(noise, f, (-1, 1))
+    for row, m in zip(found, (-1, 1), strict=True):
+        H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
+        np.testing.assert_allclose(row, (np.abs(H) ** 2).sum(axis=(0, 3)), rtol=1e-9)
+
+
+def test_bad_input_is_refused_in_a_sentence(small):
+    data = record(small, 4 * 40, 0, 0.1)
+    with pytest.raises(hj.DefinitionError, match="guess and data have different outputs"):
+        hj.fit_ldtp(hj.Record(data.u, data.y, n_sections=4, outputs=("a", "b")), small)
+    with pytest.raises(hj.DefinitionError, match="depend on inputs up to 2 samples later"):
+        hj.fit_ldtp(hj.Record(data.u, data.y, n_sections=4, lead=2), small)
+    with pytest.raises(hj.DefinitionError, match="too few for 60 unknowns"):
+        hj.fit_ldtp(record(small, 4 * 8, 0, 0.1), small, noise="innovations")
+    with pytest.raises(hj.DefinitionError, match="are too few to begin with 4 dimensions"):
+        hj.fit_ldtp(record(small, 4 * 8, 0, 0.1), 4)
+    with pytest.raises(hj.DefinitionError, match="HTFs tell nothing of innovations"):
+        hj.fit_ldtp(small.htf(np.array([0.1, 0.2])), small, noise="innovations")
+    with pytest.raises(hj.DefinitionError, match="no noise was fitted"):
+        hj.fit_ldtp(small.htf(np.linspace(0.01, 1.9, 30)), small).noise_spectrum(0.1)
+    with pytest.raises(hj.DefinitionError, match="have no noise of their own"):
+        hj.validate(small, data, noise=driven(small, 0.3, sensor=0.0))
+    with pytest.raises(hj.DefinitionError, match="a multiplier of modulus"):
+        hj.identify.noise_spectrum(eqx.tree_at(lambda m: m.A, small, 2 * small.A), 0.1)
