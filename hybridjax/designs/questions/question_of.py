@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
+from ...errors import DefinitionError
 from ..candidates import Candidates
-from ..goals import FrequencyResponse, Goal, ImpulseResponse, Multipliers, Order
+from ..goals import FrequencyResponse, Goal, ImpulseResponse, Multipliers, Order, Parameters
 from ..noise import Noise
 from ..signals import Model
 from .average import Average
@@ -30,6 +31,10 @@ def question_of(
     **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
     that do not exist, and combinations that the data cannot see, which are named.
     """
+    if isinstance(goal, Parameters) and len(models) > 1:
+        raise DefinitionError(
+            "a goal of parameters is about the one cycle that it holds: give one `model`."
+        )
     each = [_about(goal, one, cosines, noise, power) for one in models]
     return each[0] if len(each) == 1 else Average(tuple(each), each[0].names)
 
