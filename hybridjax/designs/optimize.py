@@ -53,6 +53,7 @@ def optimal_design(
     experiments: ExperimentCount | None = None,
     seed: Seed = 0,
     max_steps: StepCount = 300,
+    robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
     r"""The amplitudes that answer a question in the fewest strides, and proof that they do.
 
@@ -71,8 +72,7 @@ def optimal_design(
 
     - `model`: what is known of the system, exact or estimated: a `StructuredFit` also does. Its
       deviations are then those of the harmonics that were fitted. Several models, any of which may
-      be true (`hj.designs.draws` of an estimate): the mean of the criterion is made small, and the
-      limits hold for each.
+      be true (`hj.designs.draws` of an estimate): see `robust`. The limits hold for each.
     - `design`: what one would do otherwise. Its lines, inputs, periods and experiments are those of
       the result; by default `multisine` with all lines. Lines that are not in it are forbidden.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
@@ -89,6 +89,8 @@ def optimal_design(
       forbids a frequency.
     - `experiments`: their number, by default that of `design`. `seed` of phases and division.
     - `max_steps` of the iteration.
+    - `robust`: of several models, whether the mean of the criterion is made small, or that of the
+      worst one (in fact a mean of 16th powers, which is a little smaller).
 
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data cannot see,
     multipliers that are not simple, and arguments that do not fit together.
@@ -116,7 +118,7 @@ def optimal_design(
     usual_rms = rms_of(squares, shown, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
-    question = question_of(goal, models, cosines, errors, usual_power)
+    question = question_of(goal, models, cosines, errors, usual_power, robust)
 
     before = question.answer(usual_power)
     allowed = np.flatnonzero(most > 0)
