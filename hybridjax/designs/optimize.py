@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
@@ -12,14 +13,22 @@ from .._core.progress import working
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import allocate
+from .allocation import Allocation, allocate
 from .candidates import Candidates
 from .goals import Goal, Multipliers
 from .grouping import to_design, worthwhile
-from .limits import Limit, Limits, experiments_within, largest_power, power_limits
+from .limits import (
+    Limit,
+    Limits,
+    PowerLimits,
+    experiments_within,
+    largest_power,
+    power_limits,
+)
 from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
 from .peaks import below_peaks, scaled_below
+from .questions.question import AbstractQuestion
 from .questions.question_of import question_of
 from .signals import Model, mean_squares, rms_of
 
@@ -44,6 +53,7 @@ def optimal_design(
     experiments: ExperimentCount | None = None,
     seed: Seed = 0,
     max_steps: StepCount = 300,
+    robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
     r"""The amplitudes that answer a question in the fewest strides, and proof that they do.
 
@@ -62,8 +72,7 @@ def optimal_design(
 
     - `model`: what is known of the system, exact or estimated: a `StructuredFit` also does. Its
       deviations are then those of the harmonics that were fitted. Several models, any of which may
-      be true (`hj.designs.draws` of an estimate): the mean of the criterion is made small, and the
-      limits hold for each.
+      be true (`hj.designs.draws` of an estimate): see `robust`. The limits hold for each.
     - `design`: what one would do otherwise. Its lines, inputs, periods and experiments are those of
       the result; by default `multisine` with all lines. Lines that are not in it are forbidden.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
@@ -80,6 +89,8 @@ def optimal_design(
       forbids a frequency.
     - `experiments`: their number, by default that of `design`. `seed` of phases and division.
     - `max_steps` of the iteration.
+    - `robust`: of several models, whether the mean of the criterion is made small, or that of the
+      worst one (in fact a mean of 16th powers, which is a little smaller).
 
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data cannot see,
     multipliers that are not simple, and arguments that do not fit together.
@@ -87,19 +98,18 @@ def optimal_design(
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
         raise DefinitionError("`model` holds no model.")
-    usual = _usual(models) if design is None else design
+    usual = multisine(models[0].n_sections, inputs=models[0].inputs) if design is None else design
     _check_alike(models, usual)
     cosines = Candidates.of(usual)
-    usual_power = cosines.power_of(usual)
     squares = [mean_squares(one, cosines) for one in models]
     count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
     most = largest_power(largest, cosines, count)
     ports = {"input": models[0].inputs, "output": models[0].outputs}
-    limits = power_limits(limit, squares, ports, usual_power, most)
+    limits = power_limits(limit, squares, ports, cosines.power_of(usual), most)
     peak = dict(limit.peak) if isinstance(limit, Limits) else {}
 
     # The usual proportions, as large as the limits allow.
-    root = np.sqrt(1 / limits.use(usual_power).max())
+    root = np.sqrt(1 / limits.use(cosines.power_of(usual)).max())
     usual = dataclasses.replace(usual, amplitude=usual.amplitude * root)
     usual = scaled_below(usual, peak, each=False)
     usual_power = cosines.power_of(usual)
@@ -108,27 +118,20 @@ def optimal_design(
     usual_rms = rms_of(squares, shown, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
-    question = question_of(goal, models, cosines, errors, usual_power)
+    question = question_of(goal, models, cosines, errors, usual_power, robust)
 
     before = question.answer(usual_power)
     allowed = np.flatnonzero(most > 0)
     ideal = allocate(question.only(allowed), limits.only(allowed), usual_power[allowed], max_steps)
-    for negligible in _NEGLIGIBLE:
-        gain = ideal.power * ideal.answer.sensitivity
-        kept = allowed[worthwhile(cosines.only(allowed), gain, count, negligible)]
-        start = ideal.power[np.searchsorted(allowed, kept)]
-        best = allocate(question.only(kept), limits.only(kept), start, max_steps)
-        if best.answer.criterion < _AS_GOOD * ideal.answer.criterion:
-            break
+    kept, best = _with_fewer(question, limits, cosines, (allowed, ideal), count, max_steps)
     power, relative = np.zeros_like(usual_power), np.zeros_like(usual_power)
     power[kept], relative[allowed] = best.power, ideal.certificate.relative
     made = to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed)
-    after, for_peaks = best.answer, 1.0
+    after = best.answer
     if peak:
         made = below_peaks(made, peak, seed)
         power = cosines.power_of(made)
         after = question.only(kept).answer(power[kept])
-        for_peaks = after.criterion / best.answer.criterion
     shorter = usual.experiments / count
     return OptimalDesign(
         design=made,
@@ -139,7 +142,7 @@ def optimal_design(
         criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
         certificate=ideal.certificate.excess * after.criterion / ideal.answer.criterion,
-        for_peaks=for_peaks,
+        for_peaks=after.criterion / best.answer.criterion,
         frequencies=cosines.f,
         channels=cosines.channel,
         power=power,
@@ -151,9 +154,27 @@ def optimal_design(
     )
 
 
-def _usual(models: list[Model]) -> Design:
-    """All lines of the usual band, with the same amplitude."""
-    return multisine(models[0].n_sections, inputs=models[0].inputs)
+def _with_fewer(
+    question: AbstractQuestion,
+    limits: PowerLimits,
+    cosines: Candidates,
+    ideal: tuple[Int[np.ndarray, " allowed"], Allocation],
+    count: int,
+    max_steps: int,
+) -> tuple[Int[np.ndarray, " kept"], Allocation]:
+    """The cosines that matter, as so many experiments can hold, and their powers.
+
+    **Arguments:** `ideal`, the cosines that are allowed, with their best powers.
+    """
+    allowed, found = ideal
+    for negligible in _NEGLIGIBLE:
+        gain = found.power * found.answer.sensitivity
+        some = np.flatnonzero(worthwhile(cosines.only(allowed), gain, count, negligible))
+        kept = allowed[some]
+        best = allocate(question.only(kept), limits.only(kept), found.power[some], max_steps)
+        if best.answer.criterion < _AS_GOOD * found.answer.criterion:
+            break
+    return kept, best
 
 
 def _check_alike(models: list[Model], design: Design) -> None:

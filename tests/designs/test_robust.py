@@ -51,6 +51,24 @@ def test_the_mean_over_models(usual):
         assert both.power[np.abs(there) < 0.05].sum() > 0.1 * both.power.sum()
 
 
+def test_the_worst_of_several_models(usual):
+    """Better for the worst one than the mean is, but not than the certificate allows."""
+    models = [of(0.8), of(1.6), of(2.4)]
+    worst = hj.optimal_design(
+        models, usual, goal=GOAL, noise=NOISE, limit={"u": 0.1}, robust="worst"
+    )
+    mean = plan(models, usual)
+    assert worst.certificate < 1.05
+    each = [variance(one, worst.design) for one in models]
+    assert np.mean(np.power(each, 16)) ** (1 / 16) == pytest.approx(worst.criterion, rel=2e-3)
+    assert max(each) < 0.97 * max(variance(one, mean.design) for one in models)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        other = hj.multisine(N, 32, band=(0, 2), amplitude=lambda f: rng.exponential(size=f.shape))
+        other = other.scaled(0.1)
+        assert max(variance(one, other) for one in models) > worst.criterion / worst.certificate
+
+
 def test_limits_hold_for_each(usual):
     models = [of(0.8), of(2.4)]
     found = hj.optimal_design(models, usual, goal=GOAL, noise=NOISE, limit={"u": 9.0, "y": 0.1})

@@ -257,7 +257,7 @@ def designs(t):
         "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
         "limit": limits, "noise": optional(noise),
         "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
-        "max_steps": COUNT,
+        "max_steps": COUNT, "robust": WORD,
     }  # fmt: skip
     yield "Multipliers", hj.designs.Multipliers, {}, {
         "which": optional(WHOLE), "part": WORD, "criterion": WORD, "estimator": WORD,

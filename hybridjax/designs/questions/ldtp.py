@@ -1,8 +1,7 @@
 r"""The matrices of a linear periodic model as unknowns, as `fit_ldtp` has them.
 
-They are taken in the local coordinates of `fit_ldtp`, scaled so that the information of the usual
-design is the identity. A line then tells little of most combinations; those of which it tells
-nothing are left out.
+They are taken in the local coordinates of `fit_ldtp`, in combinations for which the information of
+the usual design is the identity; those that it does not show are left out.
 """
 
 from collections.abc import Iterator
@@ -37,9 +36,6 @@ _SINGULAR = 1e-13
 # The part of a wanted variance that combinations which are not shown may have, at the least.
 # Doubled: standard errors may be 5 % too small instead of 2.5 %.
 _MISSED = 0.05
-# Information of a line about a combination that is left out, relative to that of the usual design.
-# Doubled: at most so much of it is lost for each line and combination.
-_NOTHING = 1e-9
 
 
 class LDTPUnknowns(NamedTuple):
@@ -110,8 +106,7 @@ def ldtp_unknowns(
     gram = np.zeros((P, P))
     for lines, rows in _rows(coordinates, seen, scale):
         rows *= np.sqrt(power[lines])[:, None, None]
-        flat = rows.transpose(1, 0, 2).reshape(P, -1)
-        gram += flat @ flat.T
+        gram += _flat(rows) @ _flat(rows).T
     size = np.sqrt(np.diag(gram))
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(gram / size / size[:, None])
@@ -119,12 +114,8 @@ def ldtp_unknowns(
     turn = (vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]).T
     candidate, slopes = [], []
     for lines, rows in _rows(coordinates, seen, scale):
-        rows = turn @ rows
-        strength, directions = np.linalg.eigh(rows.swapaxes(1, 2) @ rows)
-        telling = strength * power[lines, None] > _NOTHING
-        rows = (rows @ directions).swapaxes(1, 2)
-        candidate.append(np.repeat(lines, telling.sum(axis=1)))
-        slopes.append(rows[telling].T)
+        candidate.append(np.repeat(lines, rows.shape[2]))
+        slopes.append(turn @ _flat(rows))
     sensitivities = DirectSensitivities(np.concatenate(candidate), np.concatenate(slopes, axis=1))
     return LDTPUnknowns(coordinates, scale, sensitivities, size, values, vectors)
 
@@ -146,3 +137,7 @@ def _rows(
             rows = slopes[..., channel] * weight[:, some]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
             yield here[some], rows.reshape(*rows.shape[:2], -1).view(float)
+
+
+def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines*rows"]:
+    return rows.swapaxes(0, 1).reshape(rows.shape[1], -1)
