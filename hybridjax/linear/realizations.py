@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 
 # Rotations that errors are compared with: multiples of roots of primes, which fill all turns evenly
@@ -22,8 +22,8 @@ class Realizations(eqx.Module):
     - `shares` (R, F, nu): the weights of the experiments, whose sum is one.
     """
 
-    parts: Complex[Array, "R M F ny nu"]
-    shares: Float[Array, "R F nu"]
+    parts: Complex[np.ndarray, "R M F ny nu"]
+    shares: Float[np.ndarray, "R F nu"]
 
     def at(self, rows: np.ndarray) -> "Realizations":
         """The same at some of the frequencies."""

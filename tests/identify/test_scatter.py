@@ -6,6 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.linear.realizations import Realizations
 
 
 N, P = 4, 16
@@ -56,6 +57,53 @@ def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, varian
     assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
 
 
+def one_line(errors):
+    """Realizations of one frequency with H = 0, whose estimates are off by errors (R, runs)."""
+    R, runs = errors.shape
+    parts = errors.reshape(R, 1, runs, 1, 1) / R
+    variance = np.var(errors, axis=0, ddof=1).reshape(1, runs, 1, 1) / R
+    both = dict(variance=variance, variance_freedom=np.full(runs, R - 1.0))
+    realizations = Realizations(parts, np.full((R, runs, 1), 1 / R))
+    return hj.HTF(np.arange(runs), parts.sum(axis=0), 0, N, **both, realizations=realizations)
+
+
+@pytest.mark.parametrize("R", [2, 4, 8])
+@pytest.mark.parametrize("kind", ["normal", "constant"])
+def test_regions_hold_the_truth_whatever_the_errors_are(kind, R):
+    """Discs of few realizations do not, where all errors are of one size."""
+    rng, runs = np.random.default_rng(R), 4000
+    turns = np.exp(2j * np.pi * rng.random((R, runs)))
+    estimate = one_line(turns * (rng.rayleigh(size=(R, runs)) if kind == "normal" else 1))
+    truth = hj.HTF(estimate.f, 0 * estimate.H, 0, N)
+    for level in (0.8, 0.95):
+        hits = int(estimate.contains(truth, level).sum())
+        assert stats.binomtest(hits, runs, level).pvalue > 1e-3
+    discs = np.sum(np.abs(estimate.H) <= estimate.confidence_radius())
+    assert (stats.binomtest(int(discs), runs, 0.95).pvalue > 1e-3) == (kind == "normal" or R == 8)
+    far = hj.HTF(estimate.f, 0 * estimate.H + 1e6, 0, N)
+    assert not estimate.contains(far).any()
+
+
+def test_realizations_add_up_and_go_along(model):
+    data = realized(model, 4, noise=0.1)
+    htf = hj.estimate_htf(data)
+    np.testing.assert_allclose(htf.realizations.parts.sum(axis=0), htf.H, atol=1e-14)
+    np.testing.assert_allclose(htf.realizations.shares, 0.25)
+    some = htf.at(np.asarray(htf.f)[[3, 1]]).select((0, 1))
+    np.testing.assert_allclose(some.realizations.parts.sum(axis=0), some.H, atol=1e-14)
+    truth = model.htf(htf.f)
+    np.testing.assert_array_equal(
+        some.contains(truth.at(some.f).select((0, 1))),
+        htf.contains(truth)[np.searchsorted(htf.harmonics, (0, 1))][:, [3, 1]],
+    )
+    assert htf.interpolate([0.3]).realizations is None
+    assert hj.estimate_htf(realized(model, 17, noise=0.1)).realizations is None
+    with pytest.raises(hj.DefinitionError, match="different frequencies"):
+        htf.contains(truth.at(truth.f[1:]))
+    with pytest.raises(hj.DefinitionError, match="have no variance"):
+        truth.contains(truth)
+
+
 def test_the_parts_of_the_variance(model):
     """White noise: both parts are the same; their mean is the formula of the design."""
     data = realized(model, 40, 8, noise=0.2)
@@ -90,6 +138,8 @@ def test_sums_of_parts_are_those_of_the_whole(model):
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance", "variance_freedom"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
+    np.testing.assert_allclose(many.realizations.parts, one.realizations.parts, atol=1e-14)
+    np.testing.assert_allclose(many.realizations.shares, one.realizations.shares)
 
 
 def test_without_repeats_or_realizations_nothing_is_known(model):
