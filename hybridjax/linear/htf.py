@@ -148,10 +148,11 @@ class HTF(eqx.Module):
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
         variance, noise = (None if v is None else v[rows] for v in self._variances)
-        single = self.realizations and self.realizations.select(rows)
-        return self._with(
-            self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom, single
+        single, freedom = (
+            self.realizations and self.realizations.select(rows),
+            self.variance_freedom,
         )
+        return self._with(self.f, self.H[rows], harmonics, variance, noise, freedom, single)
 
     def at(self, f: Frequencies) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
@@ -172,10 +173,8 @@ class HTF(eqx.Module):
         variance, noise = (None if v is None else v[:, nearest] for v in self._variances)
         known_by = self.variance_freedom
         freedom = None if known_by is None else known_by[nearest]
-        single = self.realizations and self.realizations.at(nearest)
-        return self._with(
-            self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom, single
-        )
+        single, H = self.realizations and self.realizations.at(nearest), self.H[:, nearest]
+        return self._with(self.f[nearest], H, self.harmonics, variance, noise, freedom, single)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
@@ -201,10 +200,8 @@ class HTF(eqx.Module):
     def contains(self, true: "HTF", level: Probability = 0.95) -> Bool[np.ndarray, "M F ny nu"]:
         """Whether confidence regions of this level hold supposed values (host side).
 
-        The region of an estimate from 2 to 16 realizations is the set of the values that their
-        errors do not speak against, whatever the distribution of these (`Realizations.p_values`);
-        of two it is wide. Elsewhere it is the disc of `confidence_radius`, which counts on normal
-        errors: a little too small for distortion of a few products of cosines.
+        The region of 2 to 16 realizations holds for errors of any distribution, is of the size of
+        the disc from four on, and wide for two (`Realizations.p_values`). Elsewhere it is the disc.
 
         **Raises:** `DefinitionError` if the two do not fit together, or without `variance`.
         """
