@@ -248,7 +248,6 @@ def linear(t):
         "source": [None, 3], "variance": ["abc", size[:1], -size, size + 1j],
         "noise_variance": ["abc", size[:1], -size, size + 1j],
         "variance_freedom": optional([*array(f), -f - 1]),
-        "realizations": optional(instance(t.estimate)),
     }  # fmt: skip
     htf = t.estimate
     yield "HTF.harmonic", htf.harmonic, dict(m=0), {"m": INTEGER}
@@ -257,9 +256,6 @@ def linear(t):
     yield "HTF.at", htf.at, dict(f=f[:2]), {"f": [*array(f[:2], empty=True), f[:2] + 0.01]}
     yield "HTF.interpolate", htf.interpolate, dict(f=f[:2]), {"f": array(f[:2], empty=True)}
     yield "HTF.confidence_radius", htf.confidence_radius, {}, {"level": SHARE}
-    yield "HTF.contains", t.uncertain.contains, dict(true=t.uncertain), {
-        "true": instance(t.model), "level": SHARE,
-    }  # fmt: skip
     yield "HTF.predict", htf.predict, dict(u=u), {"u": array(u)}
     for name in ("error", "harmonic_errors"):
         yield f"HTF.{name}", getattr(htf, name), dict(other=t.exact), {"other": instance(t.model)}

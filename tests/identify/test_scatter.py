@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.linear.realizations import Realizations
+from hybridjax.identify.htf.realizations import Realizations
 
 
 N, P = 4, 16
@@ -57,51 +57,51 @@ def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, varian
     assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
 
 
-def one_line(errors):
-    """Realizations of one frequency with H = 0, whose estimates are off by errors (R, runs)."""
-    R, runs = errors.shape
-    parts = errors.reshape(R, 1, runs, 1, 1) / R
-    variance = np.var(errors, axis=0, ddof=1).reshape(1, runs, 1, 1) / R
-    both = dict(variance=variance, variance_freedom=np.full(runs, R - 1.0))
-    realizations = Realizations(parts, np.full((R, runs, 1), 1 / R))
-    return hj.HTF(np.arange(runs), parts.sum(axis=0), 0, N, **both, realizations=realizations)
-
-
 @pytest.mark.parametrize("R", [2, 4, 8])
 @pytest.mark.parametrize("kind", ["normal", "constant"])
-def test_regions_hold_the_truth_whatever_the_errors_are(kind, R):
-    """Discs of few realizations do not, where all errors are of one size."""
+def test_p_values_are_right_whatever_the_errors_are(kind, R):
+    """Discs of few realizations are not, where all errors are of one size."""
     rng, runs = np.random.default_rng(R), 4000
-    turns = np.exp(2j * np.pi * rng.random((R, runs)))
-    estimate = one_line(turns * (rng.rayleigh(size=(R, runs)) if kind == "normal" else 1))
-    truth = hj.HTF(estimate.f, 0 * estimate.H, 0, N)
-    for level in (0.8, 0.95):
-        hits = int(estimate.contains(truth, level).sum())
-        assert stats.binomtest(hits, runs, level).pvalue > 1e-3
-    discs = np.sum(np.abs(estimate.H) <= estimate.confidence_radius())
-    assert (stats.binomtest(int(discs), runs, 0.95).pvalue > 1e-3) == (kind == "normal" or R == 8)
-    far = hj.HTF(estimate.f, 0 * estimate.H + 1e6, 0, N)
-    assert not estimate.contains(far).any()
+    errors = np.exp(2j * np.pi * rng.random((R, runs)))
+    errors *= rng.rayleigh(size=(R, runs)) if kind == "normal" else 1
+    realizations = Realizations(errors.reshape(R, 1, runs, 1, 1) / R, np.full((R, runs, 1), 1 / R))
+    p = realizations.p_values(np.zeros((1, runs, 1, 1), complex))
+    for level in (0.05, 0.2):
+        assert stats.binomtest(int(np.sum(p < level)), runs, level).pvalue > 1e-3
+    assert realizations.p_values(np.full((1, runs, 1, 1), 1e6 + 0j)).max() < 0.05
+    square = np.var(errors, axis=0, ddof=1) / R * (R - 1) * (0.05 ** (-1 / (R - 1)) - 1)
+    discs = int(np.sum(np.abs(errors.mean(axis=0)) ** 2 <= square))
+    assert (stats.binomtest(discs, runs, 0.95).pvalue > 1e-3) == (kind == "normal" or R == 8)
 
 
-def test_realizations_add_up_and_go_along(model):
-    data = realized(model, 4, noise=0.1)
-    htf = hj.estimate_htf(data)
-    np.testing.assert_allclose(htf.realizations.parts.sum(axis=0), htf.H, atol=1e-14)
-    np.testing.assert_allclose(htf.realizations.shares, 0.25)
-    some = htf.at(np.asarray(htf.f)[[3, 1]]).select((0, 1))
-    np.testing.assert_allclose(some.realizations.parts.sum(axis=0), some.H, atol=1e-14)
-    truth = model.htf(htf.f)
-    np.testing.assert_array_equal(
-        some.contains(truth.at(some.f).select((0, 1))),
-        htf.contains(truth)[np.searchsorted(htf.harmonics, (0, 1))][:, [3, 1]],
-    )
-    assert htf.interpolate([0.3]).realizations is None
-    assert hj.estimate_htf(realized(model, 17, noise=0.1)).realizations is None
-    with pytest.raises(hj.DefinitionError, match="different frequencies"):
-        htf.contains(truth.at(truth.f[1:]))
-    with pytest.raises(hj.DefinitionError, match="have no variance"):
-        truth.contains(truth)
+def test_p_values_of_a_model(model):
+    """The truth is rejected as often as it should be, another model always."""
+    data = [realized(model, 4, noise=0.1, seed=seed) for seed in range(40)]
+    truth = model.htf(LINES.frequencies[::3], (-1, 0, 1))
+    p = np.stack([hj.identify.htf_p_values(one, truth) for one in data])
+    assert stats.kstest(p[:, 0, 0, 0, 0], "uniform").pvalue > 1e-3
+    assert 0.03 < np.mean(p < 0.05) < 0.07
+    parts = [
+        hj.ExperimentData(data[0].u[k : k + 4], data[0].y[k : k + 4], n_sections=N, periods=P)
+        for k in range(0, 16, 4)
+    ]
+    np.testing.assert_allclose(hj.identify.htf_p_values(parts, truth), p[0], atol=1e-12)
+    other = hj.HTF(truth.f, 2 * truth.H, (-1, 0, 1), N, truth.inputs, truth.outputs)
+    assert np.mean(hj.identify.htf_p_values(data[0], other) < 0.05) > 0.8
+
+
+@pytest.mark.parametrize(
+    "message, count, f",
+    [
+        ("measured in one realization only", 1, None),
+        ("at most 16 realizations", 17, None),
+        ("f = 0.123 was not excited", 4, [0.123]),
+    ],
+)
+def test_p_values_that_cannot_be_had(model, message, count, f):
+    supposed = model.htf(LINES.frequencies if f is None else f, 0)
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.identify.htf_p_values(realized(model, count, noise=0.1), supposed)
 
 
 def test_the_parts_of_the_variance(model):
@@ -138,8 +138,6 @@ def test_sums_of_parts_are_those_of_the_whole(model):
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance", "variance_freedom"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
-    np.testing.assert_allclose(many.realizations.parts, one.realizations.parts, atol=1e-14)
-    np.testing.assert_allclose(many.realizations.shares, one.realizations.shares)
 
 
 def test_without_repeats_or_realizations_nothing_is_known(model):
