@@ -86,8 +86,8 @@ def test_p_values_of_a_model(model):
         for k in range(0, 16, 4)
     ]
     np.testing.assert_allclose(hj.identify.htf_p_values(parts, truth), p[0], atol=1e-12)
-    other = hj.HTF(truth.f, 2 * truth.H, (-1, 0, 1), N, truth.inputs, truth.outputs)
-    assert np.mean(hj.identify.htf_p_values(data[0], other) < 0.05) > 0.8
+    other = hj.HTF(truth.f, truth.H + 2, (-1, 0, 1), N, truth.inputs, truth.outputs)
+    assert hj.identify.htf_p_values(data[0], other).max() < 0.05
 
 
 @pytest.mark.parametrize(
