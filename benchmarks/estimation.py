@@ -15,11 +15,11 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
 - `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
 - `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % regions of H_0, H_1 and H_-1 at ten fixed frequencies
-  hold the best linear approximation, the mean over 2000 realizations without noise; `disc`: how
-  often discs do. `p`: the smallest binomial p-value times the number of tests (60, for each family
-  and amplitude), which is above 0.01 where the regions are right. `distortion`: the part of the
-  variance that is not noise. `bias`: the best linear approximation less the exact H_0, at these
-  frequencies.
+  (`region`: by `htf_p_values`, `disc`: discs) hold the best linear approximation, the mean over
+  2000 realizations without noise. `p`: the smallest binomial p-value times the number of tests
+  (60, for each family and amplitude), which is above 0.01 where the regions are right.
+  `distortion`: the part of the variance that is not noise. `bias`: the best linear approximation
+  less the exact H_0, at these frequencies.
 
     python benchmarks/estimation.py [--skip coverage ...] [--runs 1000]
 """
@@ -139,7 +139,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
         error = np.abs(np.asarray(estimate.H) - np.asarray(truth.H))
         return {
-            "region": estimate.contains(truth),
+            "region": hj.identify.htf_p_values(noisy, truth, repeats=2) > 0.05,
             "disc": error <= np.asarray(estimate.confidence_radius()),
             "variance": np.stack([estimate.variance, estimate.noise_variance]),
         }

@@ -2,6 +2,7 @@ from .htf.coherence import Coherence as Coherence, estimate_coherence as estimat
 from .htf.distortion import OutputLevels as OutputLevels, output_levels as output_levels
 from .htf.leakage import predict_leakage as predict_leakage
 from .htf.nonparametric import missing_frequencies as missing_frequencies
+from .htf.p_values import htf_p_values as htf_p_values
 from .htf.transient import TransientFit as TransientFit, remove_transient as remove_transient
 from .joint.bound import ldtp_bound as ldtp_bound
 from .joint.ldtp_fit import LDTPFit as LDTPFit

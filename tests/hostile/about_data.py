@@ -76,6 +76,9 @@ def estimates(t):
     yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
+    yield "htf_p_values", hj.identify.htf_p_values, dict(
+        data=t.four_times, true=t.model.htf(t.design.frequencies[:2], 0)
+    ), {"data": alone, "true": instance(t.model)} | shared  # fmt: skip
     yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
         "data": instance(t.design), "repeats": FEW,
     }  # fmt: skip

@@ -77,6 +77,11 @@ class Things:
         return hj.ExperimentData(u, y, n_sections=6, periods=16, result=self.data.result)
 
     @ft.cached_property
+    def four_times(self):
+        design = self.design.realizations(4)
+        return hj.experiments.simulate_experiments(self.model, design, start="periodic")
+
+    @ft.cached_property
     def estimate(self):
         return hj.estimate_htf(self.data, (-1, 0, 1))
 

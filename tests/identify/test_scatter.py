@@ -6,6 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.identify.htf.realizations import Realizations
 
 
 N, P = 4, 16
@@ -54,6 +55,53 @@ def inside(model, count, repeats, variance, runs=100, **more):
 def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, variance, noise):
     hits, of = inside(model, count, repeats, variance, **noise)
     assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("R", [2, 4, 8])
+@pytest.mark.parametrize("kind", ["normal", "constant"])
+def test_p_values_are_right_whatever_the_errors_are(kind, R):
+    """Discs of few realizations are not, where all errors are of one size."""
+    rng, runs = np.random.default_rng(R), 4000
+    errors = np.exp(2j * np.pi * rng.random((R, runs)))
+    errors *= rng.rayleigh(size=(R, runs)) if kind == "normal" else 1
+    realizations = Realizations(errors.reshape(R, 1, runs, 1, 1) / R, np.full((R, runs, 1), 1 / R))
+    p = realizations.p_values(np.zeros((1, runs, 1, 1), complex))
+    for level in (0.05, 0.2):
+        assert stats.binomtest(int(np.sum(p < level)), runs, level).pvalue > 1e-3
+    assert realizations.p_values(np.full((1, runs, 1, 1), 1e6 + 0j)).max() < 0.05
+    square = np.var(errors, axis=0, ddof=1) / R * (R - 1) * (0.05 ** (-1 / (R - 1)) - 1)
+    discs = int(np.sum(np.abs(errors.mean(axis=0)) ** 2 <= square))
+    assert (stats.binomtest(discs, runs, 0.95).pvalue > 1e-3) == (kind == "normal" or R == 8)
+
+
+def test_p_values_of_a_model(model):
+    """The truth is rejected as often as it should be, another model always."""
+    data = [realized(model, 4, noise=0.1, seed=seed) for seed in range(40)]
+    truth = model.htf(LINES.frequencies[::3], (-1, 0, 1))
+    p = np.stack([hj.identify.htf_p_values(one, truth) for one in data])
+    assert stats.kstest(p[:, 0, 0, 0, 0], "uniform").pvalue > 1e-3
+    assert 0.03 < np.mean(p < 0.05) < 0.07
+    parts = [
+        hj.ExperimentData(data[0].u[k : k + 4], data[0].y[k : k + 4], n_sections=N, periods=P)
+        for k in range(0, 16, 4)
+    ]
+    np.testing.assert_allclose(hj.identify.htf_p_values(parts, truth), p[0], atol=1e-12)
+    other = hj.HTF(truth.f, truth.H + 2, (-1, 0, 1), N, truth.inputs, truth.outputs)
+    assert hj.identify.htf_p_values(data[0], other).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    "message, count, f",
+    [
+        ("measured in one realization only", 1, None),
+        ("at most 16 realizations", 17, None),
+        ("f = 0.123 was not excited", 4, [0.123]),
+    ],
+)
+def test_p_values_that_cannot_be_had(model, message, count, f):
+    supposed = model.htf(LINES.frequencies if f is None else f, 0)
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.identify.htf_p_values(realized(model, count, noise=0.1), supposed)
 
 
 def test_the_parts_of_the_variance(model):

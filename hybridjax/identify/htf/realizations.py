@@ -1,8 +1,9 @@
 """What single experiments tell of harmonic transfer functions, and tests that need no more."""
 
-import equinox as eqx
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 
 # Rotations that errors are compared with: multiples of roots of primes, which fill all turns evenly
@@ -13,25 +14,16 @@ _PRIMES = np.array([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47])
 _AT_ONCE = 2_000_000
 
 
-class Realizations(eqx.Module):
+class Realizations(NamedTuple):
     """What each of R experiments, 16 at most, adds to the estimates at F frequencies.
 
-    **Fields:** zero where an experiment does not measure a frequency.
-
-    - `parts` (R, M, F, ny, nu): their sum over experiments is H.
-    - `shares` (R, F, nu): the weights of the experiments, whose sum is one.
+    Zero where an experiment does not measure a frequency.
     """
 
-    parts: Complex[Array, "R M F ny nu"]
-    shares: Float[Array, "R F nu"]
-
-    def at(self, rows: np.ndarray) -> "Realizations":
-        """The same at some of the frequencies."""
-        return Realizations(self.parts[:, :, rows], self.shares[:, rows])
-
-    def select(self, rows: np.ndarray) -> "Realizations":
-        """The same for some of the harmonics."""
-        return Realizations(self.parts[:, rows], self.shares)
+    parts: Complex[np.ndarray, "R M F ny nu"]
+    """Their sum over experiments is H."""
+    shares: Float[np.ndarray, "R F nu"]
+    """The weights of the experiments, whose sum is one."""
 
     def p_values(self, true: Complex[np.ndarray, "M F ny nu"]) -> Float[np.ndarray, "M F ny nu"]:
         r"""How likely errors are that add up to as much, if these are the true values.
