@@ -76,7 +76,7 @@ def information(
     """Where an experiment learns: one row per output.
 
     Left: how dense the information is over input frequency and the phase at which the output is
-    measured, relative to the mean over the band (of all outputs together). Right: over the phase alone,
+    measured, relative to the mean (of all outputs together). Right: over the phase alone,
     whose mean over all phases is the output's share of the whole (gray). The band shown holds nine
     tenths of the information.
     """

@@ -85,12 +85,14 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     its cosine and by the noise of its block.
 
     A line that was measured in several experiments counts several times: the least-squares problem
-    is that of the weighted mean, and the scatter between experiments, of noise and of distortion,
-    tells how sure the multipliers are, whatever the spectrum of the noise is. The variance that
-    weighs is one number for each block and output, from the misfit of all of its lines and
-    harmonics (less the part that numerators take of it). With hundreds of degrees of freedom it
-    does not depend on the errors of single lines, as variances of their own would, and does not
-    bias.
+    is that of the weighted mean. The variance that weighs is one number for each block and output,
+    from the misfit of all of its lines and harmonics (less the part that numerators take of it).
+    With hundreds of degrees of freedom it does not depend on the errors of single lines, as
+    variances of their own would, and does not bias.
+
+    How sure the multipliers are is said twice, and the larger is believed: by the scatter of noise
+    and distortion at the lines that matter, whatever the spectrum of the noise is, which tells too
+    little where these are few; and by the levels of the noise, as if it were white.
     """
     N, d = blocks[0].n_sections, order
     size = d * N + (N if goal.overhang is None else goal.overhang) + 1
@@ -109,7 +111,9 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         if np.abs(np.log(change)).max() < _SETTLED:
             break
     htf = _joined(blocks, noise, H)
-    fit = fit_multipliers(htf, d, overhang=goal.overhang, check=False)
+    by_scatter = fit_multipliers(htf, d, overhang=goal.overhang, check=False)
+    by_level = fit_multipliers(htf, d, overhang=goal.overhang, check=False, errors="variance")
+    fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     groups = group_htf(htf, error_weights(htf, check_values(htf)), size)
     return Estimate(fit, noise, _doubt(groups, htf, fit))
 
