@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
@@ -17,8 +18,10 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, panels
 
 
 _FREQUENCY = "input frequency $f$ (cycles/period)"
-# Part of the information or power that a figure shows. Closer to 1: a wider band, mostly empty.
-_SHOWN = 0.99
+# Part of the information that a figure shows. Closer to 1: a wider band, mostly empty.
+_SHOWN = 0.9
+# Amplitudes that a figure shows, relative to the largest. Smaller: lines that do not matter, too.
+_WEAKEST = 1e-3
 
 
 @checked
@@ -32,8 +35,8 @@ def spectrum(
     """The spectrum of an optimal design, and of the usual one, below |H_0| of all outputs.
 
     Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
-    twice its power over all experiments), of all inputs together. Lines that no experiment holds
-    are not drawn.
+    twice its power over all experiments), of all inputs together; three decades of it. Lines that
+    no experiment holds are not drawn.
     """
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
@@ -56,6 +59,8 @@ def spectrum(
         unit = unit_of(model.inputs[0])
         below.set(yscale="log", xlabel=_FREQUENCY, ylabel=with_unit("amplitude", unit))
         below.set_xlim(0, f.max())
+        top = np.sqrt(2 * max(plan.power.max(), plan.usual_power.max()))
+        below.set_ylim(_WEAKEST * top, 2 * top)
         below.legend()
         axes[0, 0].get_figure(root=True).align_ylabels(axes)
     return Plot(axes)
@@ -71,8 +76,9 @@ def information(
     """Where an experiment learns: one row per output.
 
     Left: how dense the information is over input frequency and the phase at which the output is
-    measured, relative to its mean over the band shown (white: none). Right: over the phase alone,
-    where 1 is the mean of all outputs and phases. The band shown holds 99 % of it.
+    measured, relative to the mean (of all outputs together). Right: over the phase alone,
+    whose mean over all phases is the output's share of the whole (gray). The band shown holds nine
+    tenths of the information.
     """
     ny, _, N = found.share.shape
     lines = np.rint(found.f * found.periods).astype(int)
@@ -101,7 +107,7 @@ def information(
             bar.set_label("information / mean")
             bar.ax.tick_params(labelsize=7)
             side.barh(np.arange(N) / N, profile[k], height=1 / N, color=CYCLE[0])
-            side.axvline(1 / ny, color="0.5", lw=0.6)
+            side.axvline(profile[k].mean(), color="0.5", lw=0.6)
         axes[-1, 0].set_xlabel(_FREQUENCY)
         axes[-1, 1].set_xlabel("over all $f$")
     return Plot(axes)
@@ -141,6 +147,10 @@ def strides(
             panel.plot(n, size, color=color, lw=1.2, label=label, zorder=1)
         panel.set(xscale="log", yscale="log", xlabel="strides", ylabel="standard error")
         panel.set_xlim(low, high)
+        for axis, text in ((panel.xaxis, "{x:.0f}"), (panel.yaxis, "{x:.0e}")):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter(StrMethodFormatter(text))
+            axis.set_minor_formatter(NullFormatter())
         panel.legend()
     return Plot(axes)
 

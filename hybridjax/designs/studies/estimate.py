@@ -19,9 +19,11 @@ from ...linear.htf import HTF
 from ..goals import Multipliers
 
 
-# Estimates of the noise, each from the misfit of a fit weighted by the last one. Doubled: noise
-# changes by less than 0.1 %.
-_SWEEPS = 2
+# Estimates of the noise, at most, each from the misfit of a fit weighted by the last one; and the
+# relative change that ends them. Doubled: no more estimates, as a rule; one less at times.
+_SWEEPS = 10
+_SETTLED = 0.02
+# Steps of each of these fits. Doubled: nothing, since the next one goes on.
 _MAX_STEPS = 50
 
 
@@ -83,27 +85,35 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     its cosine and by the noise of its block.
 
     A line that was measured in several experiments counts several times: the least-squares problem
-    is that of the weighted mean, and the scatter between experiments, of noise and of distortion,
-    tells how sure the multipliers are, whatever the spectrum of the noise is. The variance that
-    weighs is one number for each block and output, from the misfit of all of its lines and
-    harmonics (less the part that numerators take of it). With hundreds of degrees of freedom it
-    does not depend on the errors of single lines, as variances of their own would, and does not
-    bias.
+    is that of the weighted mean. The variance that weighs is one number for each block and output,
+    from the misfit of all of its lines and harmonics (less the part that numerators take of it).
+    With hundreds of degrees of freedom it does not depend on the errors of single lines, as
+    variances of their own would, and does not bias.
+
+    How sure the multipliers are is said twice, and the larger is believed: by the scatter of noise
+    and distortion at the lines that matter, whatever the spectrum of the noise is, which tells too
+    little where these are few; and by the levels of the noise, as if it were white.
     """
     N, d = blocks[0].n_sections, order
     size = d * N + (N if goal.overhang is None else goal.overhang) + 1
     member = np.repeat(np.arange(len(blocks)), [len(block.f) for block in blocks])
     H = np.concatenate([block.H for block in blocks], axis=1)
-    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1)))
-    noise, c = np.broadcast_to(rms, (len(blocks), len(rms))).copy(), None
+    # All of it may be noise, to begin with.
+    square = [np.mean(np.abs(b.H) ** 2 / b.variance[:, None], axis=(0, 1)) for b in blocks]
+    noise, c = np.sqrt(square), None
     for _ in range(_SWEEPS):
         htf = _joined(blocks, noise, H)
         require_frequencies(htf, d, size)
         groups = group_htf(htf, error_weights(htf, check_values(htf)), size)
         c, _ = maximum_likelihood(groups, d, _MAX_STEPS, c)
-        noise *= _misfit(groups, c, member, noise.shape)
+        change = _misfit(groups, c, member, noise.shape)
+        noise = noise * change
+        if np.abs(np.log(change)).max() < _SETTLED:
+            break
     htf = _joined(blocks, noise, H)
-    fit = fit_multipliers(htf, d, overhang=goal.overhang, check=False)
+    by_scatter = fit_multipliers(htf, d, overhang=goal.overhang, check=False)
+    by_level = fit_multipliers(htf, d, overhang=goal.overhang, check=False, errors="variance")
+    fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     groups = group_htf(htf, error_weights(htf, check_values(htf)), size)
     return Estimate(fit, noise, _doubt(groups, htf, fit))
 

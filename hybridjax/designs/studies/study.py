@@ -68,10 +68,10 @@ class Study(eqx.Module):
     normal in the limit of many strides (Wu, Biometrika 72, 1985, for designs that depend on
     estimates; Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36,
     1965, for stopping as soon as an interval of given width is reached). What spoils it is a
-    standard error that happens to be small. Therefore the noise is estimated from all lines
-    together, and what is compared with the precision asked is the width of the interval by
-    Student's distribution with the degrees of freedom that the standard error has, as in Stein's
-    two stages (Ann. Math. Stat. 16, 1945).
+    standard error that happens to be small. Therefore the larger of two is taken, from the scatter
+    at the lines that matter and from the level of the noise in all of them, and what is compared
+    with the precision asked is the width of the interval by Student's distribution with the degrees
+    of freedom that it has, as in Stein's two stages (Ann. Math. Stat. 16, 1945).
 
     A study is never changed: `add` returns a new one. It depends on its arguments and blocks only,
     so that it can be made again from stored data.

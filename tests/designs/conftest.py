@@ -1,0 +1,14 @@
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Two states, slow and with little damping, pushed and seen in changing directions."""
+    turn = 2 * np.pi * np.arange(8) / 8
+    A = 0.97 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    B = np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, :, None]
+    C = np.stack([np.ones((8, 2)), np.stack([np.sin(turn), np.cos(turn)], axis=1)], axis=1)
+    return hj.LDTP(np.broadcast_to(A, (8, 2, 2)), B, C, inputs="u", outputs=("x", "v"))

@@ -1,0 +1,157 @@
+"""Sequential designs: they stop when they may, and what they say then is true."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+NOISE = {"x": 1e-4, "v": 3e-4}
+ASKED = 7e-5
+
+
+@pytest.fixture(scope="module")
+def first():
+    return hj.multisine(8, periods=32, lines="odd", band=(0, 4)).scaled(0.001)
+
+
+def measured(model, design, seed=0, factor=1.0):
+    """A laboratory."""
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    return hj.experiments.add_noise(data, std=factor * np.array(list(NOISE.values())), seed=seed)
+
+
+@pytest.fixture(scope="module")
+def studies(model, first):
+    """One, after each of its blocks."""
+    found = [hj.designs.Study(first, order=2, standard_error=ASKED)]
+    while not found[-1].done:
+        data = measured(model, found[-1].design, seed=len(found))
+        found.append(found[-1].add(data))
+    return found
+
+
+def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
+    end = studies[-1]
+    assert end.blocks == len(studies) - 1 >= 2
+    assert end.standard_errors[-1].max() <= ASKED < studies[-2].standard_errors[-1].max()
+    truth = model.multipliers
+    assert end.fit.contains(truth, 0.999).all()
+    plan = hj.optimal_design(model, first, noise=NOISE)
+    equal = plan.usual_criterion * plan.usual.cycles(0) / end.standard_errors[-1, 0] ** 2
+    assert equal > 4 * end.strides[-1]
+    # The bound of as many strides, all of them with the best design for the true model.
+    bound = np.linalg.norm(plan.standard_errors) * np.sqrt(plan.strides / end.strides[-1])
+    assert end.standard_errors[-1, 0] > 0.95 * bound
+
+
+def test_every_block_is_counted_and_none_is_changed(studies, first):
+    assert [one.blocks for one in studies] == list(range(len(studies)))
+    assert studies[0].design is first and studies[0].fit is None
+    cycles = [one.design.cycles(0) for one in studies[:-1]]
+    np.testing.assert_array_equal(studies[-1].strides, np.cumsum(cycles))
+    for before, after in zip(studies[1:], studies[2:], strict=False):
+        assert after.strides[-1] <= 3 * before.strides[-1]
+
+
+def test_the_noise_is_found(studies):
+    for one in studies[1:]:
+        for name, std in NOISE.items():
+            assert one.noise[name] == pytest.approx(std, rel=0.1)
+
+
+def test_a_study_can_be_made_again_from_its_data(studies, model, first):
+    again = hj.designs.Study(first, order=2, standard_error=ASKED)
+    for k, one in enumerate(studies[1:], 1):
+        again = again.add(measured(model, studies[k - 1].design, seed=k))
+        np.testing.assert_array_equal(again.standard_errors, one.standard_errors)
+        np.testing.assert_array_equal(again.design.phase, one.design.phase)
+
+
+def test_blocks_of_one_design_are_as_good_as_one_block(model, first):
+    """The same experiments in one block and in two: but for the noise of each, the same problem."""
+    data = measured(model, first.realizations(2))
+    half = len(data.u) // 2
+    parts = [
+        hj.ExperimentData(
+            data.u[k], data.y[k], n_sections=8, periods=32, inputs="u", outputs=("x", "v")
+        )
+        for k in (slice(half), slice(half, None))
+    ]
+    study = hj.designs.Study(first, order=2, standard_error=1e-5)
+    together = study.add(data).fit
+    apart = study.add(parts[0]).add(parts[1]).fit
+    np.testing.assert_allclose(
+        apart.multipliers, together.multipliers, atol=0.1 * together.standard_errors[0]
+    )
+    np.testing.assert_allclose(apart.standard_errors, together.standard_errors, rtol=0.05)
+
+
+def test_few_degrees_of_freedom_do_not_end_it(model, first):
+    """The first block's standard error rests on a few lines."""
+    data = measured(model, first)
+    error = hj.designs.Study(first, 2, 1e-3).add(data).standard_errors[0, 0]
+    assert not hj.designs.Study(first, 2, 1.1 * error).add(data).done
+    assert hj.designs.Study(first, 2, 3 * error).add(data).done
+
+
+def test_too_much_noise_to_begin_with(model, first):
+    """Equal amplitudes are repeated with other phases."""
+    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    lost = study.add(measured(model, first, factor=1e4))
+    assert not lost.done and np.isnan(lost.standard_errors).all() and lost.plan is None
+    assert "equal amplitudes again, since the data carry" in repr(lost)
+    np.testing.assert_array_equal(lost.design.line, first.line)
+    assert (lost.design.phase != first.phase).all()
+    found = lost.add(measured(model, lost.design))
+    assert np.isnan(found.standard_errors[0]).all() and found.plan is not None
+
+
+@pytest.mark.parametrize("goal", [dict(which=0), dict(part="modulus"), dict(harmonics=(-1, 0, 1))])
+def test_goals(model, first, goal):
+    study = hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(**goal))
+    study = study.add(measured(model, first))
+    assert study.standard_errors.shape == (1, 1)
+    assert study.plan.saved > 3
+    whole = study.fit.standard_errors[0]
+    assert study.standard_errors[0, 0] <= whole * (1 + 1e-12)
+
+
+def test_repeated_windows_count(model, first):
+    """Twice the windows, half the variance."""
+    long = hj.experiments.simulate_experiments(model, first, discard=32, start="periodic")
+    noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
+    study = hj.designs.Study(first, 2, 1e-5)
+    once, twice = study.add(noisy), study.add(noisy, repeats=2)
+    assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
+    assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
+    assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(first=hj.multisine(lines="two-phase", periods=4)), "is a multiple of 1/2"),
+        (dict(first=hj.multisine(inputs=("a", "b"))), "inputs a, b: study one at a time"),
+        (dict(goal=hj.designs.Multipliers(estimator="fit_ldtp")), "no other estimator"),
+        (dict(goal=hj.designs.Multipliers(weights=(1.0, 2.0))), "may have no weights"),
+        (dict(limit=hj.designs.Limits(strides=3)), "ends at a precision"),
+        (dict(standard_error=0.0), "positive"),
+    ],
+)
+def test_bad_arguments(first, arguments, message):
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.designs.Study(**(dict(first=first, order=2, standard_error=1e-4) | arguments))
+
+
+def test_bad_data(model, first):
+    study = hj.designs.Study(first, 2, 1e-4)
+    data = measured(model, first)
+    other = hj.ExperimentData(data.u, data.y, n_sections=8, periods=32, outputs=("a", "b"))
+    with pytest.raises(hj.DefinitionError, match="different outputs do not belong together"):
+        study.add(data).add(other)
+    failed = hj.ExperimentData(data.u, data.y, n_sections=8, periods=32, result=[3] * len(data.u))
+    with pytest.raises(hj.DefinitionError, match="nothing was learnt: 0/8 ok"):
+        study.add(failed)
+    with pytest.raises(hj.DefinitionError, match="no multiplier 4, the order is 2"):
+        hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(4)).add(data)
