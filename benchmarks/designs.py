@@ -8,17 +8,24 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
   input or output limited, what is saved, the certificate, and seconds of the process to find it.
 - `known`: rms errors of draws with new noise, four draws of the phases; the model is known. The
   input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise.
-- `nothing`: from nothing: 1280 strides of equal amplitudes, a design from what they say, 2560 of
-  that, and one fit to both, against the bound of as many strides of equal amplitudes. Four
-  first blocks; the harmonic mean of what they save, and the least.
+- `nothing`: from nothing, by `hj.designs.Study`, which is asked for a standard error of 5e-5: 640
+  strides of equal amplitudes, then designs made from what was measured, until it stops. The noise
+  is not known either. All strides are counted, and compared with those of equal amplitudes whose
+  bound is the rms error that was reached.
+- `stopping`: of the same studies, how many regions of 95 % held the true multipliers at the time of
+  stopping, the p-value of that number, and the standard error that was asked for, said and true.
 
-    python benchmarks/designs.py [--draws 200] [--only bound known nothing]
+    python benchmarks/designs.py [--draws 200] [--only bound known nothing stopping]
+
+(`nothing` and `stopping` take some 5 CPU seconds for each draw and family.)
 """
 
 import argparse
+import functools
 import time
 
 import numpy as np
+from scipy import stats
 from second_order import OUTPUTS, sections
 
 import hybridjax as hj
@@ -27,8 +34,8 @@ import hybridjax as hj
 HARMONICS = (-2, -1, 0, 1, 2)
 RMS = 0.001
 PHASES = 4
-# First blocks from which a design is made.
-BLOCKS = 4
+# Standard error of the multiplier that studies are asked for.
+PRECISION = 5e-5
 
 
 class Family:
@@ -69,17 +76,6 @@ def with_variance(htf: hj.HTF, variance) -> hj.HTF:
     return hj.HTF(
         htf.f, htf.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs, variance=variance
     )
-
-
-def joined(one: hj.HTF, other: hj.HTF) -> hj.HTF:
-    """Estimates at different frequencies as one."""
-    order = np.argsort(np.concatenate([one.f, other.f]))
-    H, v = (
-        np.concatenate([np.asarray(a), np.asarray(b)], axis=1)[:, order]
-        for a, b in ((one.H, other.H), (one.variance, other.variance))
-    )
-    f = np.concatenate([one.f, other.f])[order]
-    return hj.HTF(f, H, one.harmonics, one.n_sections, one.inputs, one.outputs, variance=v)
 
 
 def rms_error(family: Family, fit, draws: int, seed: int) -> float:
@@ -128,37 +124,64 @@ def known(family: Family, draws: int) -> None:
     family.show("known.saved", (found[0] / found[1]) ** 2)
 
 
+def study(family: Family, rng, first, begun, noise: dict[str, float]) -> hj.designs.Study:
+    """One, from nothing to its end; `begun`: responses to the first blocks, without noise."""
+    k = int(rng.integers(PHASES))
+    found = hj.designs.Study(
+        first[k], order=2, standard_error=PRECISION, seed=int(rng.integers(999))
+    )
+    data = begun[k]
+    while not found.done:
+        std, seed = list(noise.values()), int(rng.integers(2**31))
+        found = found.add(hj.experiments.add_noise(data, std=std, seed=seed))
+        if not found.done:
+            data = hj.run_experiments(
+                family.cycle, family.placed, found.design, OUTPUTS, start="steady"
+            )
+    return found
+
+
+@functools.cache
+def studies(family: Family, draws: int) -> np.ndarray:
+    """Strides, blocks, error, and whether the region of 95 % held the truth, of each draw."""
+    equal = hj.multisine(periods=32, lines="odd").scaled(RMS)
+    first = [equal.realizations(1, seed=1 + k) for k in range(PHASES)]
+    begun = family.recorded(equal)
+    truth, rows = family.model.multipliers, []
+    for seed in range(draws):
+        done = study(family, np.random.default_rng(seed), first, begun, family.noise(begun[0]))
+        error = done.fit.compare(truth).error[0]
+        held = bool(done.fit.contains(truth)[0])
+        rows.append((done.strides[-1], done.blocks, error, held, done.standard_errors[-1, 0]))
+    return np.array(rows)
+
+
 def nothing(family: Family, draws: int) -> None:
-    usual = hj.multisine(periods=128, lines="odd").scaled(RMS)
-    first = hj.multisine(periods=64, lines="odd").scaled(RMS)
-    begun = family.recorded(first)
-    noise = family.noise(begun[0])
-    strides, saved = [], []
-
-    def guess(rng):
-        return measured(begun[rng.integers(PHASES)], first, noise, rng)
-
-    for seed in range(BLOCKS):
-        known = guess(np.random.default_rng(seed))
-        plan = hj.optimal_design(hj.fit_multipliers(known, 2), usual, noise=noise)
-        data = family.recorded(plan.design)
-
-        def fit(rng, data=data, plan=plan):
-            block = measured(data[rng.integers(PHASES)], plan.design, noise, rng)
-            return hj.fit_multipliers(joined(guess(rng), block), 2)
-
-        error = rms_error(family, fit, draws // BLOCKS, seed)
-        strides.append(first.cycles(0) + plan.strides)
-        truth = hj.optimal_design(family.model, usual, noise=noise)
-        equal = truth.usual_criterion * usual.cycles(0) / strides[-1]
-        saved.append(equal / error**2)
-    family.show("nothing.first_strides", first.cycles(0))
-    family.show("nothing.strides", strides[0])
-    family.show("nothing.saved", len(saved) / np.sum(1 / np.array(saved)))
-    family.show("nothing.saved.least", np.min(saved))
+    strides, blocks, error, *_ = studies(family, draws).T
+    equal = hj.multisine(periods=32, lines="odd").scaled(RMS)
+    noise = family.noise(family.recorded(equal)[0])
+    bound = hj.optimal_design(family.model, equal, noise=noise)
+    as_much = bound.usual_criterion * equal.cycles(0) / np.mean(error**2)
+    family.show("nothing.first_strides", equal.cycles(0))
+    family.show("nothing.strides", np.mean(strides))
+    family.show("nothing.strides.most", np.max(strides))
+    family.show("nothing.blocks", np.mean(blocks))
+    family.show("nothing.rms_error", np.sqrt(np.mean(error**2)))
+    family.show("nothing.equal_strides", as_much)
+    family.show("nothing.saved", as_much / np.mean(strides))
 
 
-STEPS = {"bound": bounds, "known": known, "nothing": nothing}
+def stopping(family: Family, draws: int) -> None:
+    *_, error, held, said = studies(family, draws).T
+    family.show("stopping.draws", draws)
+    family.show("stopping.held", np.sum(held))
+    family.show("stopping.p", stats.binomtest(int(held.sum()), draws, 0.95).pvalue)
+    family.show("stopping.asked", PRECISION)
+    family.show("stopping.said", np.sqrt(np.mean(said**2)))
+    family.show("stopping.rms_error", np.sqrt(np.mean(error**2)))
+
+
+STEPS = {"bound": bounds, "known": known, "nothing": nothing, "stopping": stopping}
 
 
 def main() -> None:

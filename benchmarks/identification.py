@@ -9,10 +9,10 @@ fits with several estimates of it, the closest).
 - `small`: 20 experiments of 64 cycles at amplitude 0.001, with all 620 lines and with the odd ones,
   from the periodic start that the linearization predicts and from the nonlinear one (`steady`).
 - `noise.S`: 20 experiments of 84 cycles (odd lines, rms 0.02, predicted periodic start) with white
-  noise at S dB, `--seeds` draws of it. `bound`: the Cramer-Rao bound of the rms error with all
-  numerators unknown. `rms`: of the structured fit, which is told no variances; `bias`: the error
-  without noise; `said`: the rms of its standard errors; `covered`: how often its 95 % region holds
-  the true multiplier. `ratio`: rms / bound.
+  noise at S dB (`none`: without), `--seeds` draws of it and of the phases. `bound`: the Cramer-Rao
+  bound of the rms error with all numerators unknown. `rms`: of the structured fit, which is told no
+  variances; `said`: the rms of its standard errors; `covered`: how often its 95 % region holds the
+  true multiplier, and `covered.p`: the p-value of that. `ratio`: rms / bound.
 - `white`: 300 cycles of white input (rms 0.002) from the limit cycle: output error without noise
   and at 20 dB, `--series` draws.
 - `coverage`: as in estimation.py, of the multiplier: `--runs` runs at 20 dB, each four realizations
@@ -74,24 +74,30 @@ def paper(family: Identification) -> None:
 
 
 def noise(family: Identification, seeds: int) -> None:
+    """Phases are drawn anew in each run: distortion is random only where they are."""
     design = hj.multisine(periods=84, lines="odd").scaled(0.02)
-    data = family.run(design, start="periodic")
-    clean = hj.fit_multipliers(hj.estimate_htf(data, BAND), 2)
-    family.show("noise.bias", family.error(clean))
-    for snr in (40, 20, 0):
-        noisy = [hj.experiments.add_noise(data, snr=snr, seed=seed) for seed in range(seeds)]
-        sigma = np.std(data.y, axis=(0, 1)) * 10 ** (-snr / 20)
-        exact = family.model.htf(design.frequencies, BAND)
-        a = design.amplitude[0]
-        variance = np.broadcast_to(
-            4 * sigma[:, None] ** 2 / (N * design.periods * a**2), exact.H.shape
-        )
+    exact = family.model.htf(design.frequencies, BAND)
+    clean, fits, size = [], {snr: [] for snr in (40, 20, 0)}, []
+    for seed in range(seeds):
+        data = family.run(design.realizations(1, seed), start="periodic")
+        size.append(np.var(data.y, axis=(0, 1)))
+        clean.append(hj.fit_multipliers(hj.estimate_htf(data, BAND), 2))
+        for snr, found in fits.items():
+            noisy = hj.experiments.add_noise(data, snr=snr, seed=seed)
+            found.append(hj.fit_multipliers(hj.estimate_htf(noisy, BAND), 2))
+    report(family, "noise.none", clean)
+    for snr, found in fits.items():
+        # Of white noise; distortion comes on top.
+        variance = np.mean(size, axis=0)[:, None] * 10 ** (-snr / 10)
+        variance = variance * design.expected_variance()[:, None, :]
         bound = hj.identify.multiplier_bound(
             family.model,
-            hj.HTF(exact.f, exact.H, BAND, N, data.inputs, OUTPUTS, variance=variance),
-        ).standard_errors[0]
-        fits = [hj.fit_multipliers(hj.estimate_htf(one, BAND), 2) for one in noisy]
-        report(family, f"noise.{snr}", fits, bound)
+            hj.HTF(
+                exact.f, exact.H, BAND, N, exact.inputs, OUTPUTS,
+                variance=np.broadcast_to(variance, exact.H.shape),
+            ),
+        ).standard_errors[0]  # fmt: skip
+        report(family, f"noise.{snr}", found, bound)
 
 
 def report(family: Identification, name: str, fits, bound=None) -> None:
@@ -102,7 +108,9 @@ def report(family: Identification, name: str, fits, bound=None) -> None:
         family.show(f"{name}.ratio", rms / bound)
     family.show(f"{name}.rms", rms)
     family.show(f"{name}.said", np.sqrt(np.mean([f.standard_errors[0] ** 2 for f in fits])))
-    family.show(f"{name}.covered", np.mean([f.contains(family.true).all() for f in fits]))
+    hits = sum(int(f.contains(family.true).all()) for f in fits)
+    family.show(f"{name}.covered", hits / len(fits))
+    family.show(f"{name}.covered.p", stats.binomtest(hits, len(fits), 0.95).pvalue)
 
 
 def white(family: Identification, draws: int) -> None:

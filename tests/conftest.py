@@ -63,6 +63,28 @@ stored._WORTH_A_PROCESS = np.inf
 stored.ONE_PROGRAM = False
 
 
+# Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.
+_KEPT = 200
+_compiled = []
+
+
+def _count(event, duration, **_):
+    if "backend_compile" in event:
+        _compiled.append(event)
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Of earlier files, where there are many. (They stay on disk.)"""
+    yield
+    if len(_compiled) > _KEPT:
+        _compiled.clear()
+        jax.clear_caches()
+
+
 class no_compilation:
     """A context in which nothing may be compiled, also not since the host has done it so often."""
 

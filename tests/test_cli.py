@@ -1,6 +1,7 @@
 """The command line: fast help, the short form of the main job, bad input."""
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -224,8 +225,13 @@ def test_an_interruption_in_a_callback_is_not_lost(tmp_path, monkeypatch, capsys
         pytest.fail("the interruption was lost")
 
     monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
-    with pytest.raises(SystemExit) as error:
-        main(["reproduce", "--out", str(tmp_path / "new")])
+    # (Jobs in the background of a shell are started with interruptions ignored.)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as error:
+            main(["reproduce", "--out", str(tmp_path / "new")])
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert error.value.code == 130 and capsys.readouterr().err == "hybridjax: interrupted.\n"
 
 

@@ -40,6 +40,10 @@ hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
 hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
 hj.convert.to_lti(model).multipliers.shape
 hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modulus")).advice
+hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).sequence(64, "binary").u.shape
+hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.FrequencyResponse((0.1, 1.0))).saved
+hj.designs.Window([1.0, 0.0]).seen_from_signal(model).multipliers.shape
+hj.designs.choose_window(model, lambda m: hj.optimal_design(m)).saved
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
 hj.Recording.beside([recording, recording]).units
 hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
@@ -152,10 +156,10 @@ UNCHECKED = {
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
         "NaturalMultipliers", "OptimalDesign", "OutputLevels", "ParameterGuesses", "Phase",
         "PhaseResponse",
-        "PlacedSections", "Plan", "Plot",
+        "PlacedSections", "Plan", "Plot", "RandomInput",
         "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",
-        "Winding",
+        "Winding", "WindowChoice",
     },
 }  # fmt: skip
 

@@ -48,9 +48,9 @@ def to_pandas(thing: Tabular) -> Any:
         return frame({"output": outputs, "pole": poles, "multiplier": multipliers})
     dataset = to_xarray(thing)
     if isinstance(thing, HTF):
-        return dataset.drop_vars(
-            ["input_unit", "output_unit", "variance_freedom"], errors="ignore"
-        ).to_dataframe()
+        left_out = ["input_unit", "output_unit", "variance_freedom"]
+        left_out += ["realizations.parts", "realizations.shares"]
+        return dataset.drop_vars(left_out, errors="ignore").to_dataframe()
     row = next(iter(dataset.data_vars.values())).dims[0]
     columns = {}
     for name, x in {**dataset.coords, **dataset.data_vars}.items():

@@ -5,5 +5,11 @@ from .goals import (
     Order as Order,
     Parameters as Parameters,
 )
+from .information import InformationMap as InformationMap, information_map as information_map
 from .limits import Limits as Limits
+from .model_draws import draws as draws
 from .optimal_design import OptimalDesign as OptimalDesign
+from .sequences import RandomInput as RandomInput
+from .studies.study import Study as Study
+from .window import Window as Window
+from .windows import WindowChoice as WindowChoice, choose_window as choose_window

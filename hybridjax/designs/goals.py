@@ -45,6 +45,7 @@ class Multipliers(eqx.Module):
     overhang: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
+        _check_weights(self.weights)
         if self.harmonics is not None:
             _check_harmonics(self.harmonics)
 
@@ -73,6 +74,7 @@ class Parameters(eqx.Module):
     harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
 
     def __check_init__(self):
+        _check_weights(self.weights)
         _check_harmonics(self.harmonics)
         as_family(self.sections)
 
@@ -140,6 +142,12 @@ class Order(eqx.Module):
 
 
 Goal = Multipliers | Parameters | FrequencyResponse | ImpulseResponse | Order
+
+
+def _check_weights(weights: tuple[float, ...] | None) -> None:
+    """**Raises:** `DefinitionError` where all are zero, or there are none."""
+    if weights is not None and not any(weights):
+        raise DefinitionError("`weights` of a goal must not all be zero.")
 
 
 def _check_harmonics(harmonics: Harmonics) -> None:

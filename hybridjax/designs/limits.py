@@ -38,11 +38,15 @@ class Limits(eqx.Module):
 Limit = Literal["input", "output"] | Mapping[str, Positive] | Limits
 
 
+def peak_of(name: str) -> str:
+    return f"peak of {name}"
+
+
 class PowerLimits(NamedTuple):
     """L limits of quantities that are sums over all cosines, and one of each cosine."""
 
     names: tuple[str, ...]
-    """Of the signals that are limited."""
+    """What is limited: rms values of signals by their names, rates and peaks."""
     cost: Float[np.ndarray, "L K"]
     """W: share of each limit that a unit of a cosine's power takes."""
     largest: Float[np.ndarray, " K"]
@@ -89,7 +93,7 @@ def power_limits(
         raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
     cost = np.stack(
         [
-            one[n] / rms**2
+            one[n.removeprefix(peak_of(""))] / rms**2
             for one, level in zip(squares, levels, strict=True)
             for n, rms in level.items()
         ]
@@ -120,9 +124,7 @@ def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[st
             )
     level = {str(n): float(x) for n, x in limit.rms.items()}
     level |= {rate_of(n): float(x) for n, x in limit.rate.items()}
-    for name, peak in limit.peak.items():
-        level[name] = min(level.get(name, np.inf), float(peak))
-    return level
+    return level | {peak_of(n): float(x) for n, x in limit.peak.items()}
 
 
 def largest_power(

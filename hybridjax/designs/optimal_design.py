@@ -1,13 +1,17 @@
 """What an optimal design is, and what it is worth."""
 
+from typing import Literal
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
-from .._core.boundary.kinds import Positive
+from .._core.boundary.kinds import PeriodCount, Positive, Seed
 from .._core.html.parts import card, table, text
+from ..errors import DefinitionError
 from ..experiments.design.design import Design
+from .sequences import RandomInput, random_sequence
 
 
 # Strides saved by a factor above this are worth another design. Doubled: more designs are said to
@@ -39,8 +43,8 @@ class OptimalDesign(eqx.Module):
       `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
       which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
       power belongs, less elsewhere.
-    - `limited`: names of what is limited. `rms`, `usual_rms`: of all signals, by name, as the
-      model predicts them.
+    - `limited`: names of signals whose rms is limited, and of rates and peaks.
+    - `rms`, `usual_rms`: of all signals, by name, as the model predicts them.
     """
 
     design: Design
@@ -87,17 +91,39 @@ class OptimalDesign(eqx.Module):
         `design`."""
         return int(np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2))
 
+    def sequence(
+        self,
+        cycles: PeriodCount,
+        kind: Literal["gaussian", "binary"] = "gaussian",
+        seed: Seed = 0,
+    ) -> RandomInput:
+        """A random input with the spectrum of `design`, for a recording (`fit_series`).
+
+        **Arguments:** `cycles`, its length; `kind`: normal values, or two values of the same
+        size, whose spectrum is close to that of the design at best: `RandomInput.power` says which.
+
+        **Raises:** `DefinitionError` for an odd number of samples.
+        """
+        N, P = self.design.n_sections, self.design.periods
+        if N * cycles % 2:
+            raise DefinitionError(f"{cycles} cycles of {N} sections are an odd number of samples.")
+        lines = np.rint(self.frequencies * P).astype(int)
+        shape = N, P, cycles, len(self.design.input_names)
+        return random_sequence(lines, self.channels, self.power, shape, kind, seed)
+
     @property
     def advice(self) -> str:
         """Which case this is, in a sentence."""
-        what = " and ".join(self.limited)
+        rest = [n for n in self.limited if n.startswith(("rate of ", "peak of "))]
+        rms = " and ".join(n for n in self.limited if n not in rest)
+        what = " and ".join([f"rms of {rms}"] * bool(rms) + rest)
         if self.saved > _WORTH_IT:
             return (
-                f"With the rms of {what} limited it matters where the power is: one stride does "
+                f"With the {what} limited it matters where the power is: one stride does "
                 f"the work of {self.saved:.3g}."
             )
         return (
-            f"With the rms of {what} limited the usual design is nearly optimal (one stride does "
+            f"With the {what} limited the usual design is nearly optimal (one stride does "
             f"the work of {self.saved:.3g}): what is left to gain lies in the estimator."
         )
 

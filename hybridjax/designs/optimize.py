@@ -85,6 +85,8 @@ def optimal_design(
     multipliers that are not simple, and arguments that do not fit together.
     """
     models = [model] if isinstance(model, Model) else list(model)
+    if not models:
+        raise DefinitionError("`model` holds no model.")
     usual = _usual(models) if design is None else design
     _check_alike(models, usual)
     cosines = Candidates.of(usual)
@@ -102,7 +104,7 @@ def optimal_design(
     usual = scaled_below(usual, peak, each=False)
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
-    shown += [name for name in limits.names if name not in shown]
+    shown += [name for name in limits.names if name in squares[0] and name not in shown]
     usual_rms = rms_of(squares, shown, usual_power)
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)

@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 
 from ..experiments.design.crest import optimize_phases
 from ..experiments.design.design import Design
@@ -24,18 +24,20 @@ def below_peaks(design: Design, peak: dict[str, float], seed: int) -> Design:
 def scaled_below(design: Design, peak: dict[str, float], each: bool) -> Design:
     """The design with amplitudes made smaller where a signal exceeds its peak.
 
-    **Arguments:** `each`: each experiment by itself, else all by the same factor.
+    **Arguments:** `each`: each signal of each experiment by itself, else all by the same factor.
     """
-    factor = np.ones(design.experiments)
+    factor, highest = np.ones((design.experiments, len(design.input_names))), None
     for name, most in peak.items():
-        u = design.inputs()[:, :, design.input_names.index(name)]
-        factor = np.minimum(factor, most / np.maximum(np.abs(u).max(axis=1), most))
-    factor = factor if each else np.full(design.experiments, factor.min())
-    amplitude = np.asarray(design.amplitude) * factor[design.experiment]
+        i = design.input_names.index(name)
+        highest = np.abs(design.inputs()).max(axis=1) if highest is None else highest
+        factor[:, i] = most / np.maximum(highest[:, i], most)
+    if not each:
+        factor[:] = factor.min()
+    amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
     return dataclasses.replace(design, amplitude=amplitude)
 
 
-def _one(design: Design, here: Float[np.ndarray, " k"]) -> Design:
+def _one(design: Design, here: Int[np.ndarray, " k"]) -> Design:
     """One experiment."""
     parts = {n: getattr(design, n)[here] for n in ("line", "channel", "amplitude", "phase")}
     return dataclasses.replace(design, experiment=0 * here, experiments=1, **parts)

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import lfilter
 
 from .._core.arguments import Numbers
 from .._core.boundary.arrays import Reals
@@ -78,6 +77,8 @@ def with_memory(
     """Series of the same variance, stationary, with a correlation time of `memory` cycles."""
     if memory == 0:
         return white
+    from scipy.signal import lfilter  # takes long to import
+
     step = np.exp(-1 / (n_sections * memory))
     fresh = np.sqrt(-np.expm1(-2 / (n_sections * memory)))
     found, _ = lfilter([fresh], [1, -step], white[:, 1:], axis=1, zi=step * white[:, :1])

@@ -5,21 +5,20 @@ from typing import Annotated
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Complexes, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
 from .._core.executor import from_host
-from .._core.html.parts import card, table
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html.responses import response_card
 from .._core.precision import require_x64
-from .._core.signal import ratio, with_unit
 from .._core.text import listed
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .frequency_response import Frequencies, Harmonics, check_harmonics
+from .realizations import Realizations
 
 
 # Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
@@ -29,9 +28,6 @@ _SAME_FREQUENCY = 1e-9
 # (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
 _WIDEST_GAP = 2
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
-
-# Outputs and harmonics that a notebook shows: the largest ones of these. Doubled: twice the size.
-_SHOWN_OUTPUTS, _SHOWN_HARMONICS = 3, 5
 
 # Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
 _SILENT_LINE = 1e-10
@@ -63,6 +59,7 @@ class HTF(eqx.Module):
       rest is nonlinear distortion, which random phases make random. None where it was not split.
     - `variance_freedom` (F,): complex degrees of freedom of `variance`; None where it is known
       exactly.
+    - `realizations`: what each experiment tells, where there are few; None where that is not kept.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -72,6 +69,7 @@ class HTF(eqx.Module):
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
     variance_freedom: Float[Array, " F"] | None
+    realizations: Realizations | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -91,6 +89,7 @@ class HTF(eqx.Module):
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
         variance_freedom: Annotated[Numbers, Reals("F", sign="positive")] | None = None,
+        realizations: Realizations | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -110,6 +109,8 @@ class HTF(eqx.Module):
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
         self.variance_freedom = _optional("variance_freedom", variance_freedom, self.f.shape)
+        _optional("realizations", realizations and realizations.parts[0], shape)
+        self.realizations = realizations
 
     def __repr__(self) -> str:
         count = self.f.shape[-1]
@@ -129,24 +130,8 @@ class HTF(eqx.Module):
         """The first input's, as functions of frequency."""
         if is_traced(self) or self.H.ndim != 4 or not self.H.size:
             return None
-        f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
-        order = np.argsort(f)
-        u, peaks = self.inputs[0], np.nanmax(H, axis=1)
-        largest = np.argsort(-np.nanmax(peaks, axis=1), kind="stable")[:_SHOWN_HARMONICS]
-        drawn, rows = [], []
-        for j, y in enumerate(self.outputs[:_SHOWN_OUTPUTS]):
-            curves = [
-                Curve(f[order], H[k, order, j], f"H_{self.harmonics[k]}", COLORS[i])
-                for i, k in enumerate(np.sort(largest))
-            ]
-            name = with_unit(f"|H|, {u} to {y}", ratio(y, u))
-            drawn.append(picture(curves, "f (cycles/period)", name, log=True))
-            rows += [
-                (y, f"H_{self.harmonics[k]}", f"{peaks[k, j]:.4g}", f"{f[H[k, :, j].argmax()]:.4g}")
-                for k in np.sort(largest)
-            ]
-        of = f"({self.source}): {repr(self).partition('; ')[2].removesuffix(')')}"
-        return card("HTF", of, *drawn, table(("output", "", "largest modulus", "at f"), rows))
+        f, H, of = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0], repr(self)
+        return response_card(f, H, self.harmonics, self.inputs[0], self.outputs, of)
 
     def harmonic(self, m: int) -> Complex[Array, "F ny nu"]:
         """`H_m`; `m` counts modulo `N`.
@@ -163,7 +148,10 @@ class HTF(eqx.Module):
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
         variance, noise = (None if v is None else v[rows] for v in self._variances)
-        return self._with(self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom)
+        single = self.realizations and self.realizations.select(rows)
+        return self._with(
+            self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom, single
+        )
 
     def at(self, f: Frequencies) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
@@ -184,8 +172,9 @@ class HTF(eqx.Module):
         variance, noise = (None if v is None else v[:, nearest] for v in self._variances)
         known_by = self.variance_freedom
         freedom = None if known_by is None else known_by[nearest]
+        single = self.realizations and self.realizations.at(nearest)
         return self._with(
-            self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom
+            self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom, single
         )
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
@@ -208,6 +197,24 @@ class HTF(eqx.Module):
         freedom = self.variance_freedom
         quantile = freedom * jnp.expm1(-np.log1p(-level) / freedom)
         return jnp.sqrt(quantile[:, None, None] * self.variance)
+
+    def contains(self, true: "HTF", level: Probability = 0.95) -> Bool[np.ndarray, "M F ny nu"]:
+        """Whether confidence regions of this level hold supposed values (host side).
+
+        The region of an estimate from 2 to 16 realizations is the set of the values that their
+        errors do not speak against, whatever the distribution of these (`Realizations.p_values`);
+        of two it is wide. Elsewhere it is the disc of `confidence_radius`, which counts on normal
+        errors: a little too small for distortion of a few products of cosines.
+
+        **Raises:** `DefinitionError` if the two do not fit together, or without `variance`.
+        """
+        if is_traced(self.H, true.H):
+            raise DefinitionError("`contains` works on the host, not inside jit or derivatives.")
+        self._require_alike(true)
+        radius = np.asarray(self.confidence_radius(level))
+        if self.realizations is None:
+            return np.abs(np.asarray(self.H) - np.asarray(true.H)) <= radius
+        return self.realizations.p_values(np.asarray(true.H)) > 1 - level
 
     def interpolate(self, f: Frequencies) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbors (host side).
@@ -325,6 +332,15 @@ class HTF(eqx.Module):
         or outputs, or have no `H_0`.
         """
         require_x64()
+        self._require_alike(other)
+        scale = jnp.max(jnp.abs(other.harmonic(0)), axis=(0, 2))
+        return jnp.max(jnp.abs(self.H - other.H), axis=(1, 3)) / scale
+
+    def error(self, other: "HTF") -> Float[Array, " ny"]:
+        """The largest of `harmonic_errors`, per output."""
+        return jnp.max(self.harmonic_errors(other), axis=0)
+
+    def _require_alike(self, other: "HTF") -> None:
         for name in ("n_sections", "harmonics", "inputs", "outputs"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:
@@ -335,21 +351,16 @@ class HTF(eqx.Module):
             is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME_FREQUENCY)
         ):
             raise DefinitionError("Two HTFs at different frequencies cannot be compared.")
-        scale = jnp.max(jnp.abs(other.harmonic(0)), axis=(0, 2))
-        return jnp.max(jnp.abs(self.H - other.H), axis=(1, 3)) / scale
-
-    def error(self, other: "HTF") -> Float[Array, " ny"]:
-        """The largest of `harmonic_errors`, per output."""
-        return jnp.max(self.harmonic_errors(other), axis=0)
 
     @property
     def _variances(self):
         return self.variance, self.noise_variance
 
-    def _with(self, f, H, harmonics, variance, noise_variance, freedom):
+    def _with(self, f, H, harmonics, variance, noise_variance, freedom, realizations=None):
         return HTF(
             f, H, harmonics, self.n_sections, self.inputs, self.outputs, self.source,
             variance=variance, noise_variance=noise_variance, variance_freedom=freedom,
+            realizations=realizations,
         )  # fmt: skip
 
     def _circle(self, f):

@@ -1,4 +1,5 @@
 from .branches import branch as branch
+from .designs import information as information, spectrum as spectrum, strides as strides
 from .fit_quality import amplitude as amplitude, validation as validation
 from .frequency import (
     bode as bode,

@@ -60,9 +60,9 @@ def monte_carlo(
     **Returns:** an `xarray.Dataset` along `draw`, with the variables that `function` names, or
     `value`; and `failed`, 1 for draws that raised `ComputationError`.
 
-    **Raises:** `DefinitionError` for results that are no numbers or change their shape, and as
-    `sweep`; `ComputationError` if the first draws fail, so that it is not known what results look
-    like; what else `function` raises.
+    **Raises:** `DefinitionError` for results that are no numbers, or change their names, their
+    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if the first draws
+    fail, so that it is not known what results look like; what else `function` raises.
     """
     blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
     description = {
@@ -130,12 +130,13 @@ class Draws:
                 found["failed"][i] = 1
                 continue
             found["failed"][i] = 0
+            unlike = _difference(values, self.variables)
+            if unlike is not None:
+                raise DefinitionError(
+                    "`function` must always give arrays of the same names and shapes, and real or "
+                    f"complex ones only: draw {rows.start + i} has {unlike}."
+                )
             for name, x in values.items():
-                if name not in found or x.shape != found[name].shape[1:]:
-                    raise DefinitionError(
-                        f"`function` must always give arrays of the same names and shapes: draw "
-                        f"{rows.start + i} has `{name}` of the shape {x.shape}."
-                    )
                 found[name][i] = x
         return found
 
@@ -153,3 +154,14 @@ class Draws:
                 )
             found[name] = x.astype(complex if x.dtype.kind == "c" else float)
         return found
+
+
+def _difference(values: Mapping[str, np.ndarray], variables: Mapping[str, Variable]) -> str | None:
+    """What a draw gives that the first one did not, in words."""
+    for name, x in values.items():
+        if name not in variables or x.shape != variables[name].shape:
+            return f"`{name}` of the shape {x.shape}"
+        if x.dtype.kind == "c" and np.dtype(variables[name].dtype).kind != "c":
+            return f"`{name}` with complex numbers"
+    missing = [name for name in variables if name not in (*values, "failed")]
+    return f"no `{missing[0]}`" if missing else None

@@ -147,6 +147,11 @@ class Wanted:
                     f"`{name}` must give arrays of one shape, not {variable.shape} and "
                     f"{values.shape}."
                 )
+            if values.dtype.kind == "c" and out.dtype.kind != "c":
+                raise DefinitionError(
+                    f"`{name}` must give real numbers or complex ones, not both: let it always "
+                    "return complex ones."
+                )
             out[i] = values
         return out
 

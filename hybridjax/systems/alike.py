@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from .._core.compilation.fingerprint import jaxprs
 from .._core.executor import Array
 from .transition import Scheduled, Transition
 
@@ -49,6 +51,17 @@ def _chosen(column: tuple, place: Int[Array, ""]) -> Any:
         return column[0]
     known = not any(isinstance(x, jax.Array) for x in column)
     return jnp.asarray(np.stack(column) if known else jnp.stack(column))[place]
+
+
+def counts_alike(program: jex.Jaxpr) -> bool:
+    """Whether a program computes with integers as Python does. (Of a power, JAX takes the bits of
+    the exponent: what has a negative one, or too many digits, would be another number.)"""
+    return not any(
+        (eqn.primitive.name.startswith("shift") or eqn.primitive.name == "pow")
+        and all(jnp.issubdtype(v.aval.dtype, jnp.integer) for v in eqn.invars)
+        or not all(map(counts_alike, jaxprs(eqn.params)))
+        for eqn in program.eqns
+    )
 
 
 def _form(x: Transition) -> Hashable:

@@ -75,6 +75,11 @@ def check_system(system: HybridSystem) -> None:
             shape = _shape(f"guard of {label}", lambda t, q, u, g=g: s.guard(g, t, q, u), s, a)
             if shape != ():
                 raise DefinitionError(f"the guard of {label} returns shape {shape}, not a number.")
+        shape = _shape(f"predicate of {label}", lambda t, q, u, g=g: s.enabled(g, t, q, u), s, a)
+        if shape != ():
+            raise DefinitionError(
+                f"`enabled` of {label} returns shape {shape}, not one truth value."
+            )
         shape = _shape(f"reset of {label}", lambda t, q, u, g=g: s.reset(g, t, q, u), s, a)
         if shape != (s.dims[b],):
             raise DefinitionError(
@@ -88,13 +93,27 @@ def check_system(system: HybridSystem) -> None:
 def _shape(what: str, function: Callable, s: Structure, a: int) -> tuple[int, ...]:
     shapes = (), (s.dims[a],), (s.nu,)
     try:
-        return jax.eval_shape(
+        found = jax.eval_shape(
             function, *(jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes)
         ).shape
+        _look_within(function, *(np.full(x, 0.5) for x in shapes))
     except DefinitionError:
         raise
     except Exception as error:
         raise DefinitionError(f"the {what} cannot be evaluated: {error}") from error
+    return found
+
+
+def _look_within(function: Callable, *point: np.ndarray) -> None:
+    """**Raises:** `IndexError` for a state or an input by a number that there is none of: JAX would
+    take the last one, without a word, where NumPy's arrays say so."""
+    with np.errstate(all="ignore"):
+        try:
+            jax.eval_shape(lambda: function(*point))
+        except IndexError:
+            raise
+        except Exception:  # what is for arrays of JAX only
+            return
 
 
 def _check_units(what: str, kind: str, names: Sequence[str], units: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from .._core.lanes.per_lane import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError
-from .alike import Kind, Member, chosen, kinds
+from .alike import Kind, Member, chosen, counts_alike, kinds
 from .chart import Chart
 from .output import Output
 from .solver import ByChart, Method, as_method
@@ -130,7 +130,7 @@ class Structure:
         solver = self.charts[a].solver if solver is None else solver
         return None if solver is None else as_method(solver)
 
-    def chart_input(self, a: int, t: ArrayLike, u: jax.Array) -> jax.Array:
+    def chart_input(self, a: int, t: ArrayLike, u: Array) -> Array:
         """g_a(û): the inputs that chart a uses."""
         if self.drive is not None:
             u = u + jnp.broadcast_to(jnp.asarray(self.drive(t), float), u.shape)
@@ -139,7 +139,7 @@ class Structure:
             return u
         return u[np.array([self.system.inputs.index(n) for n in names], int)]
 
-    def field(self, a: int, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+    def field(self, a: int, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
     @property
@@ -155,8 +155,8 @@ class Structure:
         return _kinds.recall(self.source, None, make)
 
     def _is_one(self, kind: Kind) -> bool:
-        """Whether functions can be traced with the numbers in which they differ as arguments. (Not
-        if a number decides what Python does.)"""
+        """Whether functions can be traced with the numbers in which they differ as arguments, and
+        then mean the same. (Not if a number decides what Python does.)"""
         n = self.dims[self.chart_index(self.transitions[kind[0]].source)]
 
         def at_a_point(system, place, *point):
@@ -166,10 +166,12 @@ class Structure:
         real, array = jnp.result_type(float), jax.ShapeDtypeStruct
         point = array((), real), array((n,), real), array((self.nu,), real)
         try:
-            eqx.filter_eval_shape(at_a_point, one_lane(self.source), array((), int), *point)
+            program, *_ = eqx.filter_make_jaxpr(at_a_point)(
+                one_lane(self.source), array((), jnp.result_type(int)), *point
+            )
         except Exception:  # whatever a user's function raises, or JAX there
             return False
-        return True
+        return counts_alike(program.jaxpr)
 
     def member(self, g: int) -> Member:
         """Transition g by its kind, for one lane."""
@@ -203,7 +205,7 @@ class Structure:
         guard, reset, enabled = functions
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
-    def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+    def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
         a = self.chart_index(tr.source)
@@ -217,11 +219,11 @@ class Structure:
         every = lambda kind: jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))  # noqa: E731
         return [every(kind)(np.arange(len(kind))) for kind in kinds]
 
-    def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+    def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         tr = self.transition(g)
         return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), t, u)))
 
-    def enabled(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: jax.Array) -> jax.Array:
+    def enabled(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         tr = self.transition(g)
         if tr.enabled is None:
             return jnp.asarray(True)

@@ -98,3 +98,54 @@ def test_matrices_that_are_singular():
     assert value == 0.0
     np.testing.assert_allclose(gradient, np.diag([0.0, 0.0, 0.0, 6.0]), atol=1e-14)
     np.testing.assert_allclose(least, [1.0, 0.0, 0.0, 0.0], atol=1e-14)
+
+
+# Matrices at which a column is zero below the diagonal, and in one is nothing else.
+AT_ZEROS = {
+    "diagonal": np.diag([1.0, -2.0, 3.0, 4.0]),
+    "triangular": np.triu(np.arange(1.0, 17.0).reshape(4, 4) % 7 - 3.5),
+}
+
+
+@pytest.mark.parametrize("A", AT_ZEROS.values(), ids=AT_ZEROS)
+def test_q_r_has_its_derivatives_at_zeros(A):
+    function = lambda A: by_triangle(A, jnp.arange(1.0, 5.0))  # noqa: E731
+    for f, g in ((function, vectorized(function)), (jnp.linalg.qr, vectorized(jnp.linalg.qr))):
+        for x, y in zip(jax.tree.leaves(f(A)), jax.tree.leaves(g(A)), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-13)
+        for x, y in zip(
+            jax.tree.leaves(jax.jacfwd(f)(A)), jax.tree.leaves(jax.jacrev(g)(A)), strict=True
+        ):
+            np.testing.assert_allclose(x, y, atol=1e-13)
+
+
+def test_q_r_of_a_column_of_zeros():
+    A = np.array([[0.0, 1.0], [0.0, 2.0]])
+    Q, R = vectorized(jnp.linalg.qr)(A)
+    np.testing.assert_allclose(Q @ R, A, atol=1e-15)
+    np.testing.assert_allclose(Q.T @ Q, np.eye(2), atol=1e-15)
+
+
+@pytest.mark.parametrize("exponent", [-1000, -560, 560, 1000])
+def test_sizes_do_not_matter(exponent):
+    """Squares of these numbers are zero or infinite."""
+    A, size = np.array([[4.0, 2.0], [2.0, 3.0]]), 2.0**exponent
+
+    def found(size):
+        def factors(A):
+            (Q, R), (values, vectors) = jnp.linalg.qr(A), jnp.linalg.eigh(A)
+            U, singular, V = jnp.linalg.svd(A)
+            return Q, R / size, values / size, vectors, U, singular / size, V
+
+        return vectorized(factors)(A * size)
+
+    for x, y in zip(found(size), found(1.0), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("lower", [True, False])
+def test_eigenvalues_of_one_triangle(lower):
+    A = np.array([[2.0, 9.0], [1.0, 3.0]])
+    options = {"lower": lower, "symmetrize_input": False}
+    values = lambda A: jax.lax.linalg.eigh(A, **options)[1]  # noqa: E731
+    np.testing.assert_allclose(vectorized(values)(A), values(A), rtol=1e-14)

@@ -130,8 +130,7 @@ def test_a_sum_with_weights(model, usual):
     [
         (hj.designs.Order(2), "2 multipliers are not fewer than the model's 2"),
         (hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
-        (hj.designs.Multipliers(weights=(1.0,)), "must be 2 numbers, not all zero"),
-        (hj.designs.Multipliers(weights=(0.0, 0.0)), "must be 2 numbers, not all zero"),
+        (hj.designs.Multipliers(weights=(1.0,)), "must be 2 numbers: one for each of"),
     ],
 )
 def test_bad_goals(model, usual, goal, message):
@@ -141,6 +140,8 @@ def test_bad_goals(model, usual, goal, message):
         hj.optimal_design(model, usual, goal=goal, noise=NOISE)
 
 
-def test_a_band_must_rise():
+def test_goals_of_nothing():
+    with pytest.raises(hj.DefinitionError, match="must not all be zero"):
+        hj.designs.Multipliers(weights=(0.0, 0.0))
     with pytest.raises(hj.DefinitionError, match="must rise"):
         hj.designs.FrequencyResponse((1.0, 0.5))

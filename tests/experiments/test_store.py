@@ -101,6 +101,8 @@ def test_processes_share_the_chunks(arguments, whole, tmp_path):
         (dict(design=hj.multisine(experiments=COUNT, seed=1)), "design"),
         (dict(design=DESIGN.inputs(84), discard=20), "design"),
         (dict(outputs="yM"), "data.outputs"),
+        (dict(outputs=("yM", hj.Output("vM", lambda t, q, u: -q[1], "m/s"))), "outputs"),
+        (dict(sections=hj.ClockPhase(32, anchor=hj.Crossing("vM", "rising"))), "family"),
         (dict(chunk=7), "batch"),
         (dict(discard=1), "cycles"),
         (dict(accuracy=1e-8), "accuracy"),

@@ -224,6 +224,9 @@ def fitting(t):
 def designs(t):
     ask = hj.designs.Multipliers(harmonics=0, overhang=6)
     amplitudes = [*POSITIVE, lambda f: "x", lambda f: f * NAN, lambda f: -1 - f]
+    weights = ["x", 3, (), (NAN,), ("1",), Other()]
+    window = hj.designs.Window(np.ones(6))
+    other = hj.LDTP(np.ones((2, 1, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)))
     limits = [
         None,
         3,
@@ -249,13 +252,51 @@ def designs(t):
     }  # fmt: skip
     yield "Multipliers", hj.designs.Multipliers, {}, {
         "which": optional(WHOLE), "part": WORD, "criterion": WORD, "estimator": WORD,
+        "weights": optional(weights),
         "harmonics": optional(HARMONICS), "overhang": optional(WHOLE),
     }  # fmt: skip
     yield "Parameters", hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",)), {
         "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],
         "free": [None, 3, (), (3,), ("x", "x"), Other()],
         "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "criterion": WORD,
-        "harmonics": HARMONICS,
+        "harmonics": HARMONICS, "weights": optional(weights),
+    }  # fmt: skip
+    band = [None, 3, "x", (1,), (1, NAN), (2.0, 1.0), (-1.0, 1.0), (0, 1, 2), Other()]
+    yield "FrequencyResponse", hj.designs.FrequencyResponse, dict(band=(0.1, 1.0)), {
+        "band": band, "wanted": HARMONICS, "harmonics": optional(HARMONICS),
+    }  # fmt: skip
+    yield "ImpulseResponse", hj.designs.ImpulseResponse, dict(lags=4), {
+        "lags": COUNT, "harmonics": optional(HARMONICS),
+    }  # fmt: skip
+    yield "Order", hj.designs.Order, dict(fewer=1), {
+        "fewer": WHOLE, "harmonics": HARMONICS, "overhang": optional(WHOLE),
+    }  # fmt: skip
+    named = [None, 3, "nope", ["u0"], {"u0": 0.0}, {"u0": NAN}, {"u0": "1"}, Other()]
+    yield "Limits", hj.designs.Limits, dict(rms={"u0": 1.0}), {
+        "rms": named, "rate": named, "peak": named, "strides": optional(COUNT),
+    }  # fmt: skip
+    yield "Window", hj.designs.Window, dict(weights=np.ones(6)), {
+        "weights": [*array(np.ones(6)), np.zeros(6)],
+    }  # fmt: skip
+    yield "Window.seen_from_signal", window.seen_from_signal, dict(model=t.model), {
+        "model": instance(t.design, other),
+    }  # fmt: skip
+    yield "Window.pushes", window.pushes, dict(design=t.design), {
+        "design": instance(t.model), "cycles": optional(LIMITED),
+    }  # fmt: skip
+    yield "Window.with_signal", window.with_signal, dict(data=t.data, design=t.design), {
+        "data": instance(t.design), "design": instance(t.model),
+    }  # fmt: skip
+    yield "choose_window", hj.designs.choose_window, dict(
+        model=t.model, plan=lambda m: t.plan
+    ), {
+        "model": instance(t.design), "plan": [*CALLABLE, lambda m: 3], "shortest": COUNT,
+    }  # fmt: skip
+    yield "draws", hj.designs.draws, dict(fit=t.joint, count=1), {
+        "fit": instance(t.design), "count": COUNT, "seed": SEED,
+    }  # fmt: skip
+    yield "OptimalDesign.sequence", t.plan.sequence, dict(cycles=2), {
+        "cycles": LIMITED, "kind": WORD, "seed": SEED,
     }  # fmt: skip
     yield "OptimalDesign.strides_for", t.plan.strides_for, dict(standard_error=1.0), {
         "standard_error": POSITIVE,

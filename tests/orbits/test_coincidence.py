@@ -51,7 +51,52 @@ class Ticked(hj.HybridSystem):
         return 1.0
 
 
+class Race(hj.HybridSystem):
+    """x and y rise to 1 together; the other goes on at its own speed when one is there. Both fall
+    then, until the clock starts them again."""
+
+    def charts(self):
+        speeds = {"a": (1.0, 1.0), "x first": (1.0, 2.0), "y first": (3.0, 1.0), "c": (-4.0, -5.0)}
+        return {
+            name: Field(("x", "y"), lambda t, q, u, speed=speed: speed)
+            for name, speed in speeds.items()
+        }
+
+    def transitions(self):
+        x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
+        again = lambda t, q, u: (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))  # noqa: E731
+        return (
+            hj.Transition("x", "a", "x first", x, "rising"),
+            hj.Transition("y", "a", "y first", y, "rising"),
+            hj.Transition("y second", "x first", "c", y, "rising"),
+            hj.Transition("x second", "y first", "c", x, "rising"),
+            hj.Transition("start", "c", "a", hj.Scheduled(1.0), reset=again),
+        )
+
+    def period(self):
+        return 1.0
+
+
 GUESS = hj.Guess("a", (0.1, 0.1))
+
+
+def test_derivatives_of_both_orders():
+    """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
+    cycle = hj.find_limit_cycle(Race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
+    assert cycle.result == hj.Result.COINCIDENCE
+    (found,) = hj.orbits.coincidences(cycle)
+    assert found.time % 1.0 == pytest.approx(0.5) and not found.commute
+    exact = {
+        ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),
+        ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
+    }
+    assert set(found.orders) == set(exact)
+    for order, derivative, values in zip(
+        found.orders, found.derivatives, found.multipliers, strict=True
+    ):
+        np.testing.assert_allclose(derivative, exact[order], atol=1e-12)
+        expected = 0.1 * np.linalg.eigvals(exact[order])
+        np.testing.assert_allclose(np.sort(values), np.sort(expected), atol=1e-9)
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():

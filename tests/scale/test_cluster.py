@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,10 +103,57 @@ def test_stores_may_have_addresses(tmp_path):
 
 
 def test_draws_must_stay_alike():
-    with pytest.raises(hj.DefinitionError, match="the same names and shapes: draw 1 "):
+    with pytest.raises(hj.DefinitionError, match="the same names and shapes, .* draw 1 "):
         hj.monte_carlo(lambda rng: np.ones(rng.integers(1, 1000)), 5)
     with pytest.raises(hj.DefinitionError, match="must give numbers"):
         hj.monte_carlo(lambda rng: "one", 5)
+    turns = iter([1.0, 1.0, 1j, 1.0, 1.0, {}])
+    with pytest.raises(hj.DefinitionError, match="draw 1 has `value` with complex numbers"):
+        hj.monte_carlo(lambda rng: next(turns), 2)
+    with pytest.raises(hj.DefinitionError, match="draw 1 has no `value`"):
+        hj.monte_carlo(lambda rng: next(turns), 2)
+    with pytest.raises(hj.DefinitionError, match="a `share` needs a `store`"):
+        hj.monte_carlo(walk, DRAWS, share=(1, 2))
+
+
+def drawn(rng, size=1.0, *, offset=0.0):
+    return size * rng.normal() + offset
+
+
+class Drawn:
+    def __init__(self, size):
+        self.size = size
+
+    def __call__(self, rng):
+        return self.size * rng.normal()
+
+    def draw(self, rng):
+        return self.size * rng.normal()
+
+
+def with_default(offset):
+    def draw(rng, *, offset=offset):
+        return rng.normal() + offset
+
+    return draw
+
+
+# Pairs of functions that are not the same.
+UNLIKE = {
+    "partial": (partial(drawn, size=1.0), partial(drawn, size=2.0)),
+    "an object": (Drawn(1.0), Drawn(2.0)),
+    "a method": (Drawn(1.0).draw, Drawn(2.0).draw),
+    "a default": (with_default(1.0), with_default(2.0)),
+    "of another library": (np.random.Generator.normal, np.random.Generator.random),
+}
+
+
+@pytest.mark.parametrize(("one", "other"), UNLIKE.values(), ids=UNLIKE)
+def test_a_store_knows_its_function(tmp_path, one, other):
+    for _ in range(2):
+        hj.monte_carlo(one, 2, store=tmp_path / "draws.zarr")
+    with pytest.raises(hj.DefinitionError, match="its `function` is not the same"):
+        hj.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
 
 
 def test_a_cluster_gives_the_same_numbers(client, whole):

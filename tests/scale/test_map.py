@@ -150,6 +150,7 @@ WRONG = {
     "no client": ({"slope": [0.08]}, {"client": "tcp://here"}, "`client` must be .* `submit`"),
     "a store below a file": ({"slope": [0.08]}, {"store": "{}/file/map.zarr"}, "file"),
     "no share": ({"slope": [0.08]}, {"share": (2, 2)}, "0 <= rank < size"),
+    "a share of nothing": ({"slope": [0.08]}, {"share": (0, 2)}, "a `share` needs a `store`"),
     "no want": ({"slope": [0.08]}, {"want": "speed"}, "`want` must be"),
     "a taken name": ({"slope": [0.08]}, {"measures": {"period": float}}, "which is taken"),
 }  # fmt: skip

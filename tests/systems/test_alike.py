@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.executor import to_host
 from hybridjax.engine import kernels
+from hybridjax.engine.chain import chain
 from hybridjax.models.chain import Contact
 from hybridjax.systems.structure import Structure
 
+from ..conftest import unchecked_host
+from ..engine.test_chain import flow
 from ..toys import Field
 
 
@@ -36,6 +40,20 @@ class Stubborn(Mark):
 
     def guard(self, t, q, u):
         return (q[0] - self.levels[self.i]) if self.i != 1 else q[0] - self.levels[1]
+
+
+class Growing(Mark):
+    """Multiplies with the weight."""
+
+    def reset(self, t, q, u):
+        return q.at[2].multiply(self.weight)
+
+
+class Halving(Mark):
+    """Adds 2^-i."""
+
+    def reset(self, t, q, u):
+        return q.at[2].add(2**-self.i)
 
 
 class Circle(hj.HybridSystem):
@@ -86,6 +104,22 @@ def test_events_are_those_of_transitions_of_their_own(other):
     assert [e.name for e in one.events] == [e.name for e in two.events]
     np.testing.assert_allclose([e.time for e in one.events], [e.time for e in two.events])
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+
+
+def test_numbers_are_those_of_python():
+    """In JAX, an integer to the power of one that is negative is another number."""
+    one, two = run(Circle(mark=Halving)), run(Circle(mark=Halving, apart=True))
+    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+    assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
+
+
+def test_jacobians_are_those_of_each():
+    s = Structure(to_host(Circle(mark=Growing)))
+    with unchecked_host():
+        end, lanes, target, done = flow(s, 0.0, np.array([*START[:2], 1.0]), np.zeros(s.nu), 3.0)
+        jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
+    assert end[3] == 6.0  # three different factors
+    np.testing.assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)
 
 
 def test_times_of_events_are_exact():

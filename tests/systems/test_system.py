@@ -101,6 +101,13 @@ def replaced(**changes):
         (replaced(target="c"), "there is no chart 'c'"),
         (replaced(reset=lambda t, q, u: q), r"reset of transition 'go' \(a -> b\) returns shape"),
         (replaced(guard=lambda t, q, u: q), r"guard of transition 'go' \(a -> b\) returns shape"),
+        (replaced(enabled=lambda t, q, u: q > 0), r"`enabled` of transition 'go' .* returns shape"),
+        (
+            Anything({"a": Field(("x", "v"), lambda t, q, u: (q[1], -q[2]))}),
+            "field of chart 'a' cannot be evaluated: index 2 is out of bounds",
+        ),
+        (replaced(guard=lambda t, q, u: q[0] - u[1]), "guard of .* cannot be evaluated: index 1"),
+        (replaced(reset=lambda t, q, u: (q[3],)), "reset of .* cannot be evaluated: index 3"),
         (Anything(ROOM, (TO_B, TO_B)), "two transitions are called 'go'"),
         (
             eqx.tree_at(lambda s: s.k, HOPPER, jnp.array(np.inf)),

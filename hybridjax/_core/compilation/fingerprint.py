@@ -28,7 +28,8 @@ from ..vector_math import rewrite
 _PACKAGE = __name__.partition(".")[0]
 # Objects of JAX in the parameters of equations that their names and `repr` describe.
 _BY_REPR = (
-    "UnspecifiedValue", "Mesh", "AbstractMesh", "NamedSharding", "PartitionSpec", "AvalLayout"
+    "UnspecifiedValue", "Mesh", "AbstractMesh", "NamedSharding", "PartitionSpec", "AvalLayout",
+    "FTTuple", "FTPyTree",  # how loops group their variables (JAX 0.12)
 )  # fmt: skip
 # Functions in the parameters of equations. Derivative rules are described by the derivative of the
 # program that has them (see `Program`).
@@ -137,12 +138,12 @@ def _processor() -> list[str]:
 
 def _has_rules(jaxpr: jex.Jaxpr) -> bool:
     return any(
-        eqn.primitive.name in _RULES or any(map(_has_rules, _jaxprs(eqn.params)))
+        eqn.primitive.name in _RULES or any(map(_has_rules, jaxprs(eqn.params)))
         for eqn in jaxpr.eqns
     )
 
 
-def _jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
+def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
     """Those among the parameters of an equation, or in tuples of these. (`jax.extend.core` has a
     function for it since JAX 0.10.)"""
     values = [x for v in params.values() for x in (v if isinstance(v, tuple) else (v,))]

@@ -21,7 +21,7 @@ def enable_loop_kernels() -> None:
     experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long, since large
     functions do (docs/benchmarks.md has figures). So it pays for long computations of your own,
     around `response_function`; `run_experiments` has such programs made where they pay. Results are
-    the same up to rounding.
+    the same up to rounding. (The XLA of JAX 0.12 makes whole loops without being asked.)
 
     Call it before JAX computes anything: XLA reads its options once. It concerns all programs of
     JAX in this process and in those that it starts, by the environment variable `XLA_FLAGS`. On

@@ -1,10 +1,12 @@
 """Whether a store holds what is asked for; and how what users wrote is described there."""
 
+import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -51,32 +53,78 @@ def digest_of(*words: str) -> str:
 
 def function_digest(function: Callable) -> str:
     """A digest of what a function does, as far as its code, its defaults and the numbers and words
-    that it holds show it."""
+    that it holds show it: in variables around it, as a `functools.partial`, or as an object that
+    can be called. Of other objects that it holds, the class stands for all."""
     return digest_of(*_words(function, 0))
 
 
+def definition_digest(x: Any) -> str:
+    """A digest of a definition, as families of sections and outputs are: of all that its fields
+    hold."""
+    return digest_of(*_definition(x))
+
+
 _DIGEST = "sha256:"
-# Functions within functions that are looked at.
+# Functions and objects within others that are looked at.
 _DEPTH = 5
 
 
+def _definition(x: Any) -> list[str]:
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        held = [(f.name, getattr(x, f.name)) for f in dataclasses.fields(x)]
+        return [_name(type(x)), *(word for name, y in held for word in (name, *_definition(y)))]
+    if isinstance(x, tuple | list):
+        return [type(x).__name__, str(len(x)), *(word for y in x for word in _definition(y))]
+    return _words(x, 0)
+
+
 def _words(x: Any, depth: int) -> list[str]:
-    if isinstance(x, types.FunctionType) and depth < _DEPTH:
-        held = [cell.cell_contents for cell in x.__closure__ or ()]
-        inside = [word for y in (*held, *(x.__defaults__ or ())) for word in _words(y, depth + 1)]
-        return ["function", x.__qualname__, *_words(x.__code__, depth), *inside]
+    inside = functools.partial(_words, depth=depth + 1)
+    if x is None or isinstance(x, bool | int | float | complex | str | bytes):
+        return [repr(x)]
     if isinstance(x, types.CodeType):
         constants = [word for y in x.co_consts for word in _words(y, depth)]
         return [x.co_code.hex(), *x.co_names, *constants]
-    if isinstance(x, tuple | list | frozenset):
-        items = sorted(x, key=repr) if isinstance(x, frozenset) else x
-        return [type(x).__name__, *(word for y in items for word in _words(y, depth))]
-    if x is None or isinstance(x, bool | int | float | complex | str | bytes):
-        return [repr(x)]
+    if isinstance(x, tuple | list | set | frozenset):
+        items = x if isinstance(x, tuple | list) else sorted(x, key=repr)
+        return [type(x).__name__, str(len(x)), *(word for y in items for word in _words(y, depth))]
     if hasattr(x, "__array__"):
         return [array_digest(x)]
-    kind = x if isinstance(x, type) else type(x)
-    return [f"{kind.__module__}.{kind.__qualname__}"]
+    parts = _parts(x) if depth < _DEPTH else ()
+    name = _name(x if hasattr(x, "__qualname__") else type(x))
+    return [type(x).__name__, name, *(word for y in parts for word in inside(y))]
+
+
+def _parts(x: Any) -> Iterable[Any]:
+    """What an object is made of that says what it does."""
+    if isinstance(x, types.FunctionType):
+        variables = map(_contents, x.__closure__ or ())
+        return x.__code__, *variables, x.__defaults__, x.__kwdefaults__
+    if isinstance(x, types.MethodType):
+        return x.__func__, *_held(x.__self__)
+    if isinstance(x, functools.partial):
+        return x.func, x.args, x.keywords
+    if isinstance(x, Mapping):
+        return tuple(x.items())
+    if callable(x) and not isinstance(x, type):
+        return type(x).__call__, *_held(x)
+    return ()
+
+
+def _contents(cell: types.CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # a name that has not been given yet
+        return None
+
+
+def _held(x: Any) -> Iterable[Any]:
+    """The attributes of an object, with their names."""
+    return tuple(getattr(x, "__dict__", {}).items())
+
+
+def _name(x: Any) -> str:
+    return f"{getattr(x, '__module__', '')}.{x.__qualname__}"
 
 
 def _is_digest(x: Any) -> bool:

@@ -39,6 +39,8 @@ def filled(
     check_share(share)
     store: Store
     if address is None:
+        if share != (0, 1):
+            raise DefinitionError("a `share` needs a `store` to put its pieces into.")
         job, layout, _ = begin()
         store = MemoryStore(layout)
     else:

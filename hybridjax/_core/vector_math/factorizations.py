@@ -107,35 +107,49 @@ def triangular_solve(
 def qr(
     matrix: Float[Array, "*b m n"], *, full_matrices: bool
 ) -> tuple[Float[Array, "*b m _"], Float[Array, "*b _ n"]]:
-    """Q and R by Householder's reflections, with LAPACK's signs."""
+    """Q and R by Householder's reflections, with LAPACK's signs.
+
+    A column that is zero below the diagonal is reflected, too, and its sign put back: so Q has the
+    derivative there that it has nearby. It is zero where all of a column is, which has none.
+    """
     m, n = matrix.shape[-2:]
     index, most = jnp.arange(m), min(m, n)
+    sizes = _size(matrix, axis=-2)  # (Q is the same for columns of any sizes.)
 
     def reflect(k, carry):
         R, Q = carry
         below = jnp.where(index > k, _column(R, k), 0.0)
         first = _row(_column(R, k)[..., None], k)
         rest = jnp.sum(below**2, axis=-1, keepdims=True)
-        there = rest > 0
+        there = first**2 + rest > 0
         size = jnp.sqrt(jnp.where(there, first**2 + rest, 1.0))
         v = jnp.where(index == k, first + jnp.where(first < 0, -size, size), below)
         scale = jnp.where(there, 2 / jnp.sum(jnp.where(there, v, 1.0) ** 2, -1, keepdims=True), 0.0)
+        sign = jnp.where((index == k) & there & (rest == 0), -1.0, 1.0)
         R = R - (scale * v)[..., :, None] * jnp.sum(v[..., :, None] * R, -2, keepdims=True)
-        return R, Q - _times(Q, v)[..., :, None] * (scale * v)[..., None, :]
+        Q = Q - _times(Q, v)[..., :, None] * (scale * v)[..., None, :]
+        return sign[..., :, None] * R, sign[..., None, :] * Q
 
     eye = jnp.broadcast_to(jnp.eye(m, dtype=matrix.dtype), (*matrix.shape[:-1], m))
-    R, Q = jax.lax.fori_loop(0, most, reflect, (matrix, eye))
-    R = jnp.where(index[:, None] <= jnp.arange(n), R, 0.0)
+    R, Q = jax.lax.fori_loop(0, most, reflect, (matrix / sizes, eye))
+    R = jnp.where(index[:, None] <= jnp.arange(n), R * sizes, 0.0)
     return (Q, R) if full_matrices else (Q[..., :, :most], R[..., :most, :])
 
 
-@jax.jit
-def eigh(matrix: Float[Array, "*b n n"]) -> tuple[Float[Array, "*b n n"], Float[Array, "*b n"]]:
-    """Eigenvectors and eigenvalues, the smallest first, of symmetric matrices, by Jacobi's method.
+@ft.partial(jax.jit, static_argnames="lower")
+def eigh(
+    matrix: Float[Array, "*b n n"], *, lower: bool
+) -> tuple[Float[Array, "*b n n"], Float[Array, "*b n"]]:
+    """Eigenvectors and eigenvalues, the smallest first, of symmetric matrices, of which one
+    triangle is read, by Jacobi's method.
 
     Vectors have the signs that the rotations give them.
     """
     n = matrix.shape[-1]
+    index, mirrored = jnp.arange(n), jnp.swapaxes(matrix, -1, -2)
+    read = index[:, None] >= index if lower else index[:, None] <= index
+    size = _size(matrix, axis=(-2, -1))
+    matrix = jnp.where(read, matrix, mirrored) / size
     eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype), matrix.shape)
     outside = ~np.eye(n, dtype=bool)
 
@@ -153,7 +167,7 @@ def eigh(matrix: Float[Array, "*b n n"]) -> tuple[Float[Array, "*b n n"], Float[
         return jnp.any(off > (jnp.finfo(matrix.dtype).eps ** 2) * jnp.sum(square, axis=(-1, -2)))
 
     A, V = _swept(rotate, unsettled, n, (matrix, eye))
-    values = jnp.diagonal(A, axis1=-2, axis2=-1)
+    values = jnp.diagonal(A, axis1=-2, axis2=-1) * size[..., 0]
     return _ordered(values, V, values)
 
 
@@ -186,17 +200,28 @@ def svd(
         small = m * jnp.finfo(matrix.dtype).eps * size[..., :, None] * size[..., None, :]
         return jnp.any(outside & (jnp.abs(gram) > small))
 
-    W, V = _swept(rotate, unsettled, n, (matrix, eye))
+    whole = _size(matrix, axis=(-2, -1))
+    W, V = _swept(rotate, unsettled, n, (matrix / whole, eye))
     size = jnp.sum(W**2, axis=-2)
     V, _ = _ordered(-size, V, size)
     W, _ = _ordered(-size, W, size)
     Q, R = qr(W, full_matrices=full_matrices)
-    signed = jnp.diagonal(R, axis1=-2, axis2=-1)
+    signed = jnp.diagonal(R, axis1=-2, axis2=-1) * whole[..., 0]
     if not compute_uv:
         return (jnp.abs(signed),)
     sign = jnp.where(signed < 0, -1.0, 1.0)
     Q = jnp.concatenate([Q[..., :n] * sign[..., None, :], Q[..., n:]], axis=-1)
     return jnp.abs(signed), Q, jnp.swapaxes(V, -1, -2)
+
+
+def _size(matrix, axis):
+    """A power of two near the largest number along some axes (any, where all are zero): over it,
+    squares neither overflow nor vanish, and nothing is rounded."""
+    largest = jnp.max(jnp.abs(jax.lax.stop_gradient(matrix)), axis=axis, keepdims=True)
+    exponent = np.array(np.inf, matrix.dtype).view(f"i{matrix.dtype.itemsize}")  # (all its bits)
+    bits = jax.lax.bitcast_convert_type(largest, exponent.dtype) & exponent
+    power = jax.lax.bitcast_convert_type(bits, matrix.dtype)
+    return jnp.where((power > 0) & jnp.isfinite(power), power, 1.0)
 
 
 def _angle(off, first, second):

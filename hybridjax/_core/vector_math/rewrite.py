@@ -241,7 +241,7 @@ def _factorization(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
     if name == "qr":
         return _Ours(factorizations.qr, avals, some("full_matrices"))
     if name == "eigh":
-        ours = factorizations.eigh
+        ours = ft.partial(factorizations.eigh, **dict(some("lower")))
     else:
         ours = ft.partial(factorizations.svd, **dict(some("full_matrices", "compute_uv")))
     theirs = ft.partial(eqn.primitive.bind, **given)

@@ -34,20 +34,20 @@ def about_multipliers(
         c, slopes = unknowns.characteristic()
         multipliers = np.roots([1.0, *c])
         multipliers = multipliers[np.lexsort((-multipliers.imag, -np.abs(multipliers)))]
-        wanted, names = _wanted(goal, multipliers, c)
+        wanted, names = wanted_parts(goal, multipliers, c)
         wanted, names = weighted(wanted @ slopes, names, goal.weights)
         return unknowns.question(wanted, names, goal.criterion)
     multipliers = np.asarray(model.multipliers)
     c = np.poly(multipliers).real[1:]
     harmonics = _FEW if goal.harmonics is None else goal.harmonics
     seen = list(measured(model, cosines, harmonics, noise))
-    wanted, names = weighted(*_wanted(goal, multipliers, c), goal.weights)
+    wanted, names = weighted(*wanted_parts(goal, multipliers, c), goal.weights)
     sensitivities = denominator_sensitivities(seen, c, goal.overhang)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return Question(sensitivities, wanted, names, unknowns, goal.criterion)
 
 
-def _wanted(
+def wanted_parts(
     goal: Multipliers, multipliers: Complex[np.ndarray, " d"], c: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, "g d"], tuple[str, ...]]:
     """Derivatives of real and imaginary parts, or moduli, by c, and their names."""

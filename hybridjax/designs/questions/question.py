@@ -91,13 +91,13 @@ def weighted(
 ) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
     """The sum of the wanted quantities with weights, or without weights themselves.
 
-    **Raises:** `DefinitionError` for another number of weights, or weights that are all zero.
+    **Raises:** `DefinitionError` for another number of weights.
     """
     if weights is None:
         return wanted, names
-    if len(weights) != len(names) or not any(weights):
+    if len(weights) != len(names):
         raise DefinitionError(
-            f"`weights` of the goal must be {len(names)} numbers, not all zero: one for each of "
+            f"`weights` of the goal must be {len(names)} numbers: one for each of "
             f"{', '.join(names)}."
         )
     text = " ".join(f"{w:+.3g} {name}" for w, name in zip(weights, names, strict=True) if w)

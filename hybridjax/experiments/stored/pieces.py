@@ -10,7 +10,7 @@ import numpy as np
 from ..._core.compilation import stored
 from ..._core.execution import Execution
 from ..._core.pieces.blocks import Blocks
-from ..._core.pieces.description import array_digest, digest_of, versions
+from ..._core.pieces.description import array_digest, definition_digest, digest_of, versions
 from ..._core.pieces.layout import Constant, Layout, Variable
 from ..._core.results import Result
 from ..._core.signal import unit_of
@@ -152,13 +152,13 @@ def describe(job: ExperimentJob) -> dict[str, Any]:
     """What makes these experiments what they are."""
     campaign = job.campaign
     placed, inputs, noise = campaign.placed, campaign.inputs, campaign.process_noise
-    system = placed.cycle.system
+    system, outputs = placed.cycle.system, campaign.outputs.items
     return {
         "kind": KIND,
         "versions": versions(),
         "model": describe_system(system),
         "cycle": rough(placed.cycle),
-        "family": _digest_of_arrays(placed.family),
+        "family": definition_digest(placed.family),
         "design": _design(inputs.source),
         "start": campaign.start.name,
         "process_noise": None if noise is None else dataclasses.asdict(noise),
@@ -177,6 +177,7 @@ def describe(job: ExperimentJob) -> dict[str, Any]:
             "label": placed.family.label,
             "transitions": [t.name for t in placed.structure().transitions],
         },
+        "outputs": [x if isinstance(x, str) else definition_digest(x) for x in outputs],
     }
 
 
@@ -190,8 +191,3 @@ def _design(source: Design | np.ndarray) -> str:
         return digest_of(*map(array_digest, arrays), repr(source.input_names))
     parts = (source[k : k + 1024] for k in range(0, len(source), 1024))  # (may lie on disk)
     return digest_of(*map(array_digest, parts))
-
-
-def _digest_of_arrays(tree: Any) -> str:
-    arrays = jax.tree_util.tree_leaves(eqx.filter(tree, eqx.is_array))
-    return digest_of(type(tree).__qualname__, tree.label, *map(array_digest, arrays))

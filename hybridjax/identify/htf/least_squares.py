@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...errors import DefinitionError
+from ...linear.realizations import Realizations
 from .spectral_sums import SpectralSums
 
 
@@ -28,6 +29,8 @@ class LineEstimates(NamedTuple):
     variance: Float[np.ndarray, "M F ny nu"] | None
     noise_variance: Float[np.ndarray, "M F ny nu"] | None
     variance_freedom: Float[np.ndarray, " F"] | None
+    single: Realizations | None
+    """What each experiment tells, where the variance is that of realizations."""
     noise: NoiseVariance
     realizations: Int[np.ndarray, " F"]
     """How many experiments there are beyond those that the unknowns need."""
@@ -39,7 +42,9 @@ class LineEstimates(NamedTuple):
     def of_noise(self) -> "LineEstimates":
         """The same with the variance of noise alone."""
         variance, freedom = self.noise
-        return self._replace(variance=variance, noise_variance=None, variance_freedom=freedom)
+        return self._replace(
+            variance=variance, noise_variance=None, variance_freedom=freedom, single=None
+        )
 
     def require_total(self, f: Float[np.ndarray, " F"]) -> None:
         """**Raises:** `DefinitionError` if the scatter over realizations is not known."""
@@ -92,12 +97,13 @@ def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimate
         mean = sums.noise[rows] / count[:, None, None]
         noise = NoiseVariance(variance(mean), count * (sums.repeats - 1.0))
     why_not = _why_not(sums, rows)
-    total, of_noise, freedom = None, None, None
+    total, of_noise, freedom, single = None, None, None, None
     if (realizations > 0).any() and not why_not:
         residual = left / np.maximum(realizations, 1)[:, None, None]
         residual[realizations < 1] = np.inf
         total, of_noise = variance(residual), noise.variance
         freedom = np.maximum(realizations, 1).astype(float)
+        single = _single(sums, rows)
     elif repeated:
         total, freedom = noise
     H = H.transpose(2, 0, 3, 1)
@@ -111,11 +117,23 @@ def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimate
         variance=total,
         noise_variance=of_noise,
         variance_freedom=freedom,
+        single=single,
         noise=noise,
         realizations=realizations,
         coherence=coherence,
         why_not=why_not,
     )
+
+
+def _single(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> Realizations | None:
+    """None where unknowns share experiments, or there are too many of these."""
+    power = sums.ran.power[rows]
+    size = np.einsum("kii->ki", power).real
+    shared = (power * ~np.eye(size.shape[1], dtype=bool)).any()
+    if sums.single is None or shared or sums.mirrored[rows].any():
+        return None
+    parts = sums.single.direct[:, rows] / size[:, :, None, None]
+    return Realizations(parts.transpose(0, 3, 1, 4, 2), sums.single.power[:, rows] / size)
 
 
 def _why_not(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:

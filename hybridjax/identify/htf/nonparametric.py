@@ -107,6 +107,7 @@ def estimate_htf(
         variance=found.variance,
         noise_variance=found.noise_variance,
         variance_freedom=found.variance_freedom,
+        realizations=found.single,
     )
 
 

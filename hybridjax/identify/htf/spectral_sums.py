@@ -24,6 +24,9 @@ Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(Experi
 # Largest change of a line of the input from one window to the next, relative to the largest line.
 # Doubled: inputs that repeat half as well pass, and the noise of their estimates is overrated.
 _REPEATS = 1e-2
+# Experiments that excite a line, up to which their sums are kept singly. Doubled: twice the memory;
+# means of so many errors are normally distributed.
+_SINGLE = 16
 # Part of the largest line of all inputs below which a line is rounding. Doubled: none but rounding.
 _ROUNDING = 1e-12
 
@@ -59,6 +62,15 @@ class InputSums(NamedTuple):
     """Of U U^T: as large as the power where all phases are the same (mod 180 degrees)."""
 
 
+class SingleSums(NamedTuple):
+    """The sums of single experiments: the first, second, ..., R-th that excites a line."""
+
+    power: Float[np.ndarray, "R K nu"]
+    """|U|^2; zero where there is none."""
+    direct: Complex[np.ndarray, "R K nu M ny"]
+    """conj(U[k]) Y[k + l P]."""
+
+
 class SpectralSums(NamedTuple):
     """Sums over experiments, for K lines, ascending."""
 
@@ -81,6 +93,8 @@ class SpectralSums(NamedTuple):
     """Of |Y[k + l P]|^2."""
     noise: Float[np.ndarray, "K M ny"]
     """Of the variance of Y[k + l P], as seen from one window to the next; zero for one window."""
+    single: SingleSums | None
+    """None for lines that more than 16 experiments excite."""
     crest_test: CrestTest
     repeats: int
     """How many windows were averaged."""
@@ -181,9 +195,27 @@ def _sums_of_part(data: ExperimentData, options: SumOptions, first: int) -> Spec
         mirror=total(by * Y[:, None], good),
         energy=total(np.abs(Y) ** 2, good),
         noise=total(noise, good),
+        single=_single_sums(
+            place[good], len(lines), np.abs(U[good]) ** 2, by.conj()[good] * Y[good, None]
+        ),
         crest_test=_test_phases(data, lines, line, first),
         repeats=options.repeats,
     )
+
+
+def _single_sums(place, lines: int, power, direct) -> SingleSums | None:
+    """Entries (for lines at these places) sorted by line, and by which one of the line they are."""
+    order = np.argsort(place, kind="stable")
+    count = np.bincount(place, minlength=lines)
+    most = int(count.max(initial=0))
+    if most > _SINGLE:
+        return None
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    where = rank, place[order]
+    found = [np.zeros((most, lines, *x.shape[1:]), x.dtype) for x in (power, direct)]
+    for out, x in zip(found, (power, direct), strict=True):
+        out[where] = x[order]
+    return SingleSums(*found)
 
 
 def _test_phases(data: ExperimentData, lines, line, first: int) -> CrestTest:
@@ -255,6 +287,17 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
         out[places[1]] += y
         return out
 
+    def single():
+        if a.single is None or b.single is None:
+            return None
+        there = [x.single.power.any(axis=2) for x in (a, b)]
+        place = np.concatenate([p[np.nonzero(t)[1]] for p, t in zip(places, there, strict=True)])
+        parts = zip(a.single, b.single, strict=True)
+        values = [np.concatenate([x[there[0]], y[there[1]]]) for x, y in parts]
+        return _single_sums(place, len(line), *values)
+
     sums = ("mirrored", "tried", "ran", "count", "direct", "mirror", "energy", "noise")
     both = {name: add(getattr(a, name), getattr(b, name)) for name in sums}
-    return a._replace(line=line, crest_test=a.crest_test.merge(b.crest_test), **both)
+    return a._replace(
+        line=line, single=single(), crest_test=a.crest_test.merge(b.crest_test), **both
+    )

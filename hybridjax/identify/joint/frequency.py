@@ -16,6 +16,7 @@ $\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,13 @@ class FrequencyProblem(NamedTuple):
         """How many there are, of real ones."""
         return 2 * self.target.size
 
+    def thinned(self, step: int) -> "FrequencyProblem":
+        """Only every so many lines."""
+        rows = slice(step // 2, None, step)
+        return FrequencyProblem(
+            self.f[rows], self.harmonics, self.target[:, rows], self.weight[:, rows]
+        )
+
     def errors(self, model: PeriodicModel) -> Complex[np.ndarray, "M F ny nu"]:
         """In units of standard deviations."""
         return self.weight * (self.target - transfer(model, self.f, self.harmonics))
@@ -70,11 +78,44 @@ class FrequencyProblem(NamedTuple):
         """Itself: its weights are known."""
         return self
 
+    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
+        """With the B (and D, if it is free) that fit best, in which the HTFs are linear.
+
+        What cannot be computed, as at a resonance, is left as it is.
+        """
+        N, (ny, nu) = model.n_sections, model.D[0].shape
+        m = np.array(self.harmonics)
+        ends = np.cumsum([0, *[len(B) for B in model.B]])
+        waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
+        size = ends[-1] + (N * ny if direct else 0)
+        gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
+        for rows in _chunks(len(self.f), size * len(m) * ny):
+            J = np.zeros((size, len(m), rows.stop - rows.start, ny), complex)
+            np.concatenate(_after(model, self.f[rows], m), out=J[: ends[-1]])
+            if direct:
+                D = J[ends[-1] :].reshape(N, ny, *J.shape[1:])
+                for i in range(ny):
+                    D[:, i, :, :, i] = waves[:, :, None]
+            for j in range(nu):
+                weight = self.weight[:, rows, :, j]
+                columns = (J * weight).reshape(size, -1).view(float)
+                target = np.ascontiguousarray(weight * self.target[:, rows, :, j])
+                gram[j] += columns @ columns.T
+                along[j] += columns @ target.ravel().view(float)
+        try:
+            each = [NormalEquations(g, a).solution() for g, a in zip(gram, along, strict=True)]
+        except np.linalg.LinAlgError:
+            return model
+        found = np.stack(each, axis=1)
+        B = [found[a:b] for a, b in pairwise(ends.tolist())]
+        D = list(found[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
+        return model._replace(B=B, D=D)
+
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P, error = coordinates.size, self.errors(coordinates.model)
         gram, gradient = np.zeros((P, P)), np.zeros(P)
-        for rows, slopes in transfer_slopes(coordinates, self.f, self.harmonics):
-            slopes *= self.weight[:, rows]
+        for rows in _chunks(len(self.f), P * self.weight[:, 0].size):
+            slopes = _slopes(coordinates, self.f[rows], self.harmonics, self.weight[:, rows])
             J = slopes.reshape(P, -1).view(float)
             gram += J @ J.T
             gradient += J @ np.ascontiguousarray(error[:, rows]).ravel().view(float)
@@ -101,32 +142,42 @@ def transfer_slopes(
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
     """Derivatives of the harmonic transfer functions, for some frequencies at a time."""
     ny, nu = coordinates.model.D[0].shape
-    step = max(_HELD // (coordinates.size * len(harmonics) * ny * nu), 1)
-    for first in range(0, len(f), step):
-        rows = slice(first, min(first + step, len(f)))
-        yield rows, _slopes(coordinates, f[rows], np.array(harmonics))
+    for rows in _chunks(len(f), coordinates.size * len(harmonics) * ny * nu):
+        ones = np.ones((len(harmonics), len(f[rows]), ny, nu))
+        yield rows, _slopes(coordinates, f[rows], harmonics, ones)
 
 
-def _slopes(coordinates, f, m):
-    model, places = coordinates.model, coordinates.places
+def _chunks(length: int, size: int) -> list[slice]:
+    """Frequencies in stretches, for each of which so many numbers are held."""
+    step = max(_HELD // size, 1)
+    return [slice(k, min(k + step, length)) for k in range(0, length, step)]
+
+
+def _slopes(
+    coordinates: LocalCoordinates,
+    f: Float[np.ndarray, " F"],
+    harmonics: tuple[int, ...],
+    weight: Float[np.ndarray, "M F ny nu"],
+) -> Complex[np.ndarray, "P M F ny nu"]:
+    """Derivatives of the HTFs times weights."""
+    model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
     N, (ny, nu) = model.n_sections, model.D[0].shape
     states, after = states_at(model, f), _after(model, f, m)
-    J = np.zeros((coordinates.size, len(m), len(f), ny, nu), complex)
+    J = np.zeros((coordinates.size, *weight.shape), complex)
     for n, at in enumerate(places):
-        x = states[n]  # (d, F, nu)
         wave = _waves(m, n, N)[:, None, None]
         shapes = dict(coordinates.blocks(n))
         left = _real_times(coordinates.to_A[n].T, after[n])  # (q, M, F, ny)
         left += coordinates.to_C[n].T[:, None, None, :] * wave
-        Y = J[at["Y"]].reshape(*shapes["Y"], *J.shape[1:])
-        np.multiply(left[:, None, ..., None], x[None, :, None, :, None, :], out=Y)
-        B = J[at["B"]].reshape(*shapes["B"], *J.shape[1:])
+        Y, B = (J[at[name]].reshape(*shapes[name], *weight.shape) for name in ("Y", "B"))
         for j in range(nu):
-            B[:, j, ..., j] = after[n]
+            x = states[n][None, :, None, :, None, j]  # (1, d, 1, F, 1)
+            np.multiply((left * weight[..., j])[:, None], x, out=Y[..., j])
+            B[:, j, ..., j] = after[n] * weight[..., j]
         if coordinates.direct:
-            D = J[at["D"]].reshape(*shapes["D"], *J.shape[1:])
+            D = J[at["D"]].reshape(*shapes["D"], *weight.shape)
             for i, j in np.ndindex(ny, nu):
-                D[i, j, ..., i, j] = wave[..., 0]
+                D[i, j, ..., i, j] = wave[..., 0] * weight[..., i, j]
     return J
 
 

@@ -17,6 +17,7 @@ from ..multipliers.multiplier_estimate import MultiplierEstimate
 from .coordinates import LocalCoordinates
 from .frequency import transfer, transfer_slopes
 from .noise import noise_spectrum
+from .prediction import Predictor
 
 
 class LDTPFit(MultiplierEstimate):
@@ -107,6 +108,20 @@ class LDTPFit(MultiplierEstimate):
                 "(`HTF.variance`); fit to series."
             )
         return noise_spectrum(self.noise, f, harmonics)
+
+    @property
+    def predictor(self) -> Predictor | None:
+        """Of outputs one step ahead; None where no noise was fitted."""
+        if self.noise is None:
+            return None
+        model, size = self._coordinates.model, self._scale[:, None]
+        D = np.asarray(self.noise.D)
+        model = model._replace(
+            C=[size * C for C in model.C],
+            D=[size * x for x in model.D],
+            K=[K / size.T if K.shape[1] else K for K in model.K],
+        )
+        return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
 
     def __repr__(self) -> str:
         return f"LDTPFit(multipliers {self.show_multipliers()}; {self._about()})"

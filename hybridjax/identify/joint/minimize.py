@@ -3,7 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
+from .characteristic import characteristic_slopes
 from .coordinates import LocalCoordinates, local_coordinates
 from .frequency import FrequencyProblem
 from .normal_equations import NormalEquations
@@ -14,15 +16,21 @@ from .series import SeriesProblem
 # Damping of the first step, relative to the squared length of each column. Doubled: first steps are
 # shorter by up to a half, in directions that the data show badly.
 _FIRST_DAMPING = 1e-4
-# Factors by which damping falls after a step that lowers the cost, and rises after one that does
-# not. Doubled: fewer attempts in all, of which more fail.
-_LESS, _MORE = 0.1, 4.0
+# Damping falls by this factor at most after a step that lowers the cost as expected, and stays
+# where half of the gain comes (Nielsen 1999). Doubled: fewer steps fail, more are short.
+_LESS = 0.1
+# Factor by which damping rises after a step that does not lower the cost. Doubled: fewer attempts,
+# shorter steps.
+_MORE = 4.0
 # Largest damping. Doubled: one attempt more before an iteration stalls.
 _MOST_DAMPING = 1e8
-# Decrease of the cost, expected or found, in units of variances or relative to a cost below 1, that
-# is the last. Doubled: the minimum is missed by 0.14 instead of 0.1 standard errors of one
-# combination; more where steps are short, since the data show some combinations badly.
+# The last step is expected to lower the cost by less than this for each unknown, in units of the
+# errors' variance: at the minimum the errors of all unknowns add up to 1 for each. Doubled: rms
+# errors grow by another 0.5 %.
 _SETTLED_GAIN = 1e-2
+# And to change the characteristic polynomial's coefficients by less than this part of their
+# variance. Doubled: multipliers miss the minimum by 4.5 instead of 3.2 % of their standard errors.
+_SETTLED_SHIFT = 1e-3
 # If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
 # rounding explains. Doubled: iterations that stall count as converged more often.
 _STALLED_GAIN, _STALLED_STEP = 1e-6, 1e-8
@@ -38,36 +46,53 @@ class Minimum(NamedTuple):
 
 
 def minimize(
-    problem: FrequencyProblem | SeriesProblem, model: PeriodicModel, direct: bool, max_steps: int
+    problem: FrequencyProblem | SeriesProblem,
+    model: PeriodicModel,
+    direct: bool,
+    max_steps: int,
+    settled_gain: float = _SETTLED_GAIN,
 ) -> Minimum:
     """The model that makes the cost smallest, from this one on.
 
     After each step the problem takes the weights that its errors suggest, where these are unknown.
-    The cost is concave in the covariance of the errors up to terms without the model, so that a
-    step that lowers it with the weights of before raises the likelihood.
+    The log determinant of their covariance is concave, so that a step that lowers the cost with the
+    weights of before raises the likelihood.
 
-    **Arguments:** `direct`: whether D is free.
+    **Arguments:** `direct`: whether D is free. `settled_gain`: of the cost, for each unknown, that
+    is the last.
     """
+    model = problem.refined(model, direct)
     cost, damping = problem.cost(model), _FIRST_DAMPING
     coordinates = local_coordinates(model, direct)
     equations = problem.linearize(coordinates)
     for _ in range(max_steps):
         step, gain = equations.step(damping)
-        if gain <= _SETTLED_GAIN * min(1.0, cost):
+        unit = min(1.0, cost / max(problem.residuals - coordinates.size, 1))
+        enough = settled_gain * coordinates.size * unit
+        if gain <= enough and _shift(coordinates, equations, step) <= _SETTLED_SHIFT * unit:
             return Minimum(coordinates, equations, cost, True, problem)
-        model = coordinates.moved(step)
+        model, more = problem.refined(coordinates.moved(step), direct), _MORE
         while (lower := problem.cost(model)) >= cost:
             if damping > _MOST_DAMPING:
                 small = gain <= _STALLED_GAIN * cost or np.abs(step).max() < _STALLED_STEP
                 return Minimum(coordinates, equations, cost, bool(small), problem)
-            damping *= _MORE
-            model = coordinates.moved(equations.step(damping)[0])
-        settled = cost - lower <= _SETTLED_GAIN * min(1.0, cost)
+            damping, more = damping * more, 2 * more
+            step, gain = equations.step(damping)
+            model = problem.refined(coordinates.moved(step), direct)
+        damping *= max(_LESS, 1 - (2 * min((cost - lower) / gain, 1.0) - 1) ** 3)
         again = problem.reweighted(model)
         cost = lower if again is problem else again.cost(model)
-        problem, damping = again, damping * _LESS
+        problem = again
         coordinates = local_coordinates(model, direct)
         equations = problem.linearize(coordinates)
-        if settled:
-            return Minimum(coordinates, equations, cost, True, problem)
     return Minimum(coordinates, equations, cost, False, problem)
+
+
+def _shift(
+    coordinates: LocalCoordinates, equations: NormalEquations, step: Float[np.ndarray, " P"]
+) -> float:
+    """The squared change of the characteristic polynomial's coefficients, in units of their
+    covariance, for each of them."""
+    _, slopes = characteristic_slopes(coordinates)
+    change = np.linalg.lstsq(slopes @ equations.covariance_root(), slopes @ step)[0]
+    return float(change @ change) / len(slopes)

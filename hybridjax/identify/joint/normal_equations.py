@@ -26,6 +26,12 @@ class NormalEquations:
         part = self._slope / (np.maximum(self._values, 0) + damping)
         return self._vectors @ part / self._size, float(part @ self._slope)
 
+    def solution(self) -> Float[np.ndarray, " P"]:
+        """The step to the minimum, without what the data do not show."""
+        kept = self._values > _SINGULAR * self._values[-1]
+        part = self._slope[kept] / self._values[kept]
+        return self._vectors[:, kept] @ part / self._size
+
     def covariance_root(self) -> Float[np.ndarray, "P r"]:
         """R with $R R^T = (J^T J)^+$: combinations that the data do not show are left out."""
         kept = self._values > _SINGULAR * self._values[-1]

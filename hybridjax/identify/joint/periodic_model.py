@@ -55,6 +55,10 @@ class PeriodicModel(NamedTuple):
             product = self.A[(first + k) % self.n_sections] @ product
         return product
 
+    def predictor(self) -> "PeriodicModel":
+        """With the A that carries errors of predictions on."""
+        return self._replace(A=[A - K @ C for A, K, C in zip(self.A, self.K, self.C, strict=True)])
+
     def to_ldtp(
         self, scale: Float[np.ndarray, " ny"], inputs: tuple[str, ...], outputs: tuple[str, ...]
     ) -> LDTP:

@@ -54,6 +54,8 @@ class SeriesProblem(NamedTuple):
     by_section: bool
     """Whether the covariance is one for each section."""
     free_start: bool
+    residuals: int
+    """How many numbers are predicted."""
 
     def cost(self, model: PeriodicModel) -> float:
         """Infinite for a model whose predictions grow beyond all numbers."""
@@ -69,6 +71,10 @@ class SeriesProblem(NamedTuple):
                     for w, e in zip(path.whiten, path.error, strict=True)
                 )
         return cost if np.isfinite(cost) else np.inf
+
+    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
+        """Itself: there is nothing in which predictions are linear that is cheaper than a step."""
+        return model
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
         """With the covariance that the errors of a model have."""

@@ -57,7 +57,8 @@ def fit_to_series(
             f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
         )
     ny = len(parts.outputs)
-    problem = SeriesProblem(series, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start)
+    same = np.tile(np.eye(ny), (N, 1, 1))
+    problem = SeriesProblem(series, same, innovations, free_start, series.numbers)
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     found = minimize(problem.reweighted(model), model, direct, max_steps)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from ...experiments.record import Record
 from ...linear.ldtp import LDTP
+from ..joint.prediction import Predictor
 from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
 from .cycle_grid import count_cycles, drift_waves
 from .series_fit import SeriesFit
@@ -17,7 +18,7 @@ from .series_fit import SeriesFit
 _SAMPLES_PER_UNKNOWN = 3
 
 
-def can_be_compared(model: LDTP | SeriesFit, record: Record, free_start: bool) -> bool:
+def can_be_compared(model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool) -> bool:
     """Whether a record says more than where it started and how it drifts, which are fitted to it:
     short pieces agree with any model."""
     N, ny = record.n_sections, record.y.shape[1]
@@ -30,13 +31,16 @@ def can_be_compared(model: LDTP | SeriesFit, record: Record, free_start: bool) -
 
 
 def simulate_record(
-    model: LDTP | SeriesFit, record: Record, free_start: bool
+    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
 ) -> Float[np.ndarray, "n ny"]:
-    """The outputs that a model predicts.
+    """The outputs that a model predicts: a `Predictor` one step ahead, others without looking at
+    them.
 
     **Arguments:** `record`, without unknown inputs. `free_start`: from the state that fits the
     record best, or from zero. A drift that the record announces is estimated in either case.
     """
+    if isinstance(model, Predictor):
+        return model.predict(record, free_start)
     if isinstance(model, SeriesFit):
         return _simulate_fit(model, record, free_start)
     return _simulate_ldtp(model, record, free_start)

@@ -15,6 +15,8 @@ from ..._core.text import p_value
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
+from ..joint.ldtp_fit import LDTPFit
+from ..joint.prediction import Predictor
 from .checks.comparable import Comparable
 from .checks.power import smallest_visible
 from .checks.residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
@@ -128,9 +130,10 @@ class Validation(eqx.Module):
 
 @checked
 def validate(
-    model: LDTP | SeriesFit,
+    model: LDTP | SeriesFit | LDTPFit,
     data: RecordedData,
     *,
+    noise: LDTP | None = None,
     start: Literal["free", "cycle"] = "free",
     lags: Count | None = None,
     level: Probability = 0.01,
@@ -145,12 +148,18 @@ def validate(
     part of the residuals that lagged inputs explain, compared with the rest (an F ratio for each
     section), whatever the spectrum of the input; its level holds for residuals that are white.
 
+    With `noise`, or a fit of `fit_ldtp` to series, what is tested are the errors of predictions one
+    step ahead (Ljung 1999): they are white for a true model whatever noise drives the system, if
+    that is described. All fields are then those of the predictions.
+
     Records with three samples or fewer for each unknown of their start and drift are left out: they
     agree with any model.
 
     **Arguments:**
 
-    - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is.
+    - `model`: identified or exact, or a `SeriesFit`, which is simulated as it is, or an `LDTPFit`.
+    - `noise`: an `LDTP` that makes the noise of the outputs from white inputs of variance one, as
+      `LDTPFit.noise`; for an LDTP as `model` only. None: what is left is tested as it is.
     - `data`: as for `fit_series`, best those that the model was not made from; those that it was
       made from always fit too well. `StoredExperiments` are read twice, part by part.
     - `start`: "free" estimates the state at the start of each record from it; "cycle" takes it as
@@ -159,9 +168,11 @@ def validate(
     - `level`: of the tests.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
-    cycles, or all records are too short to be compared or for so many lags.
+    cycles, or all records are too short to be compared or for so many lags; for noise that does not
+    belong to the model, or leaves an output without any of its own.
     """
     free_start = start == "free"
+    model = _as_predicted(model, noise)
     records = Comparable(model, data, free_start, lags)
     N, outputs, ny = records.n_sections, records.outputs, len(records.outputs)
     counts = records.counts
@@ -219,3 +230,18 @@ def validate(
         inputs=records.inputs,
         outputs=outputs,
     )
+
+
+def _as_predicted(
+    model: LDTP | SeriesFit | LDTPFit, noise: LDTP | None
+) -> LDTP | SeriesFit | Predictor:
+    if noise is not None and not isinstance(model, LDTP):
+        raise DefinitionError(
+            f"`noise` belongs to an LDTP, but `model` is a {type(model).__name__}: give an LDTP, "
+            "as `LDTPFit.model`, or one of `hj.identify.realize`."
+        )
+    if isinstance(model, LDTPFit):
+        return model.predictor or model.model
+    if noise is not None and isinstance(model, LDTP):
+        return Predictor.of(model, noise)
+    return model

@@ -9,6 +9,7 @@ from ....errors import DefinitionError
 from ....experiments.data import ExperimentData
 from ....experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ....linear.ldtp import LDTP
+from ...joint.prediction import Predictor
 from ..parts import in_groups
 from ..series_fit import SeriesFit
 from ..simulation import can_be_compared
@@ -23,7 +24,11 @@ class Comparable:
     """
 
     def __init__(
-        self, model: LDTP | SeriesFit, data: RecordedData, free_start: bool, lags: int | None
+        self,
+        model: LDTP | SeriesFit | Predictor,
+        data: RecordedData,
+        free_start: bool,
+        lags: int | None,
     ):
         """**Arguments:** `lags` that will be looked at, at most; None: N.
 
@@ -97,7 +102,7 @@ class Counts:
         return np.sqrt(self._square / np.maximum(self._count, 1))
 
 
-def require_same_kind(model: LDTP | SeriesFit, data: Record | ExperimentData) -> None:
+def require_same_kind(model: LDTP | SeriesFit | Predictor, data: Record | ExperimentData) -> None:
     """**Raises:** `DefinitionError` if model and data have different N, inputs or outputs."""
     for name in ("n_sections", "inputs", "outputs"):
         its, of_data = getattr(model, name), getattr(data, name)

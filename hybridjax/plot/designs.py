@@ -1,0 +1,154 @@
+"""Designs for a question: where their power is, where they learn, and what strides buy."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from .._core.boundary.checked import checked
+from .._core.signal import unit_of, with_unit
+from ..designs.information import InformationMap
+from ..designs.optimal_design import OptimalDesign
+from ..designs.signals import Model
+from ..designs.studies.study import Study
+from ..errors import DefinitionError
+from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, panels
+
+
+_FREQUENCY = "input frequency $f$ (cycles/period)"
+# Part of the information or power that a figure shows. Closer to 1: a wider band, mostly empty.
+_SHOWN = 0.99
+
+
+@checked
+def spectrum(
+    plan: OptimalDesign,
+    model: Model,
+    *,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
+    """The spectrum of an optimal design, and of the usual one, below |H_0| of all outputs.
+
+    Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
+    twice its power over all experiments), of all inputs together. Lines that no experiment holds
+    are not drawn.
+    """
+    with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
+        above, below = axes[:, 0]
+        f = np.unique(plan.frequencies)
+        H = np.abs(np.asarray(model.htf(f, 0).H)[0])
+        for k, name in enumerate(model.outputs):
+            for i, _ in enumerate(model.inputs):
+                size = H[:, k, i] / H[:, k, i].max()
+                above.plot(f, size, color=CYCLE[k % len(CYCLE)], label=label_of(name, labels))
+        above.set(yscale="log", ylabel="$|H_0|$ / largest")
+        above.legend()
+        for power, color, label in (
+            (plan.usual_power, COLORS["gray"], "usual"),
+            (plan.power, COLORS["red"], "optimal"),
+        ):
+            amplitude = np.sqrt(2 * np.array([power[plan.frequencies == x].sum() for x in f]))
+            used = amplitude > 0
+            style = dict(marker="o", ms=2, lw=0, color=color, label=label)
+            below.plot(f[used], amplitude[used], **style)
+        unit = unit_of(model.inputs[0])
+        below.set(yscale="log", xlabel=_FREQUENCY, ylabel=with_unit("amplitude", unit))
+        below.set_xlim(0, f.max())
+        below.legend()
+        axes[0, 0].get_figure(root=True).align_ylabels(axes)
+    return Plot(axes)
+
+
+@checked
+def information(
+    found: InformationMap,
+    *,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
+    """Where an experiment learns: one row per output.
+
+    Left: how dense the information is over input frequency and the phase at which the output is
+    measured, relative to its mean over the band shown (white: none). Right: over the phase alone,
+    where 1 is the mean of all outputs and phases. The band shown holds 99 % of it.
+    """
+    ny, _, N = found.share.shape
+    lines = np.rint(found.f * found.periods).astype(int)
+    by_line = found.share.sum(axis=(0, 2))
+    order = np.argsort(-by_line)
+    kept = order[: 1 + int(np.argmax(np.cumsum(by_line[order]) >= _SHOWN))]
+    first, last = lines[kept].min(), lines[kept].max()
+    density = np.zeros((ny, last - first + 1, N))
+    inside = (lines >= first) & (lines <= last)
+    density[:, lines[inside] - first] = found.share[:, inside]
+    density /= density.sum(axis=0).mean()
+    edges = (np.arange(first, last + 2) - 0.5) / found.periods
+    phase = np.arange(N + 1) / N
+    profile = found.share.sum(axis=1) * N
+    size = {"width": PAGE, "height": 0.5 + 1.7 * ny, "width_ratios": (4, 1)}
+    with panels(ax, ny, 2, **size, sharey=True) as axes:
+        for k, name in enumerate(found.outputs):
+            chart, side = axes[k]
+            drawn = chart.pcolormesh(
+                edges, phase - 0.5 / N, density[k].T, cmap="Blues", vmin=0, vmax=density.max(),
+                rasterized=True,
+            )  # fmt: skip
+            chart.set_ylabel("phase (cycles)")
+            chart.set_title(f"measured in {label_of(name, labels)}")
+            bar = chart.get_figure(root=True).colorbar(drawn, ax=chart, pad=0.01)
+            bar.set_label("information / mean")
+            bar.ax.tick_params(labelsize=7)
+            side.barh(np.arange(N) / N, profile[k], height=1 / N, color=CYCLE[0])
+            side.axvline(1 / ny, color="0.5", lw=0.6)
+        axes[-1, 0].set_xlabel(_FREQUENCY)
+        axes[-1, 1].set_xlabel("over all $f$")
+    return Plot(axes)
+
+
+@checked
+def strides(
+    plan: OptimalDesign,
+    studies: Mapping[str, Study | Sequence[Study]] | None = None,
+    *,
+    ax: AxesLike | None = None,
+) -> Plot:
+    """The standard error against the number of strides, on logarithmic axes.
+
+    Lines are bounds: of the usual design (equal amplitudes) and of the optimal one. Points are what
+    studies found after each of their blocks; the first ones have equal amplitudes. With several
+    quantities, the root of the sum of their squares.
+
+    **Arguments:** `studies`: by the label that they get, one or several.
+
+    **Raises:** `DefinitionError` for a study without a block.
+    """
+    with panels(ax, height=2.4) as axes:
+        panel = axes[0, 0]
+        reached: list[float] = [plan.strides]
+        for k, (label, given) in enumerate((studies or {}).items()):
+            several = [given] if isinstance(given, Study) else list(given)
+            for number, one in enumerate(several):
+                reached += _steps(panel, one, label if number == 0 else None, CYCLE[k])
+        low, high = min(reached) / 1.5, max(reached) * 1.5
+        for errors, cycles, color, label in (
+            (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], "equal amplitudes"),
+            (plan.standard_errors, plan.strides, COLORS["black"], "optimal, model known"),
+        ):
+            n = np.array([low, high])
+            size = np.linalg.norm(errors) * np.sqrt(cycles / n)
+            panel.plot(n, size, color=color, lw=1.2, label=label, zorder=1)
+        panel.set(xscale="log", yscale="log", xlabel="strides", ylabel="standard error")
+        panel.set_xlim(low, high)
+        panel.legend()
+    return Plot(axes)
+
+
+def _steps(panel: Axes, study: Study, label: str | None, color: str) -> list[float]:
+    """A study, block by block, and where its strides are."""
+    if not study.blocks:
+        raise DefinitionError("a study without a block has nothing to show: `add` data first.")
+    size: Float[np.ndarray, " B"] = np.linalg.norm(study.standard_errors, axis=1)
+    panel.plot(study.strides, size, marker="o", ms=3, lw=0.6, color=color, label=label, zorder=2)
+    return study.strides.tolist()

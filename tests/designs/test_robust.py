@@ -1,0 +1,83 @@
+"""Designs for several models, any of which may be true."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+N, NOISE = 4, {"y": 0.02}
+GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+
+
+def of(angle):
+    """A pair of multipliers of modulus 0.9 with this angle."""
+    turn = 0.9 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    A = np.array([turn, np.eye(2), [[1, 0.1], [0, 1]], [[1, -0.1], [0, 1]]])
+    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])[..., None]
+    return hj.LDTP(A, B, np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])[:, None])
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return hj.multisine(N, 32, band=(0, 2))
+
+
+def plan(models, usual):
+    return hj.optimal_design(models, usual, goal=GOAL, noise=NOISE, limit={"u": 0.1})
+
+
+def variance(model, design):
+    """Of the multipliers, as `multiplier_bound` has it."""
+    htf = model.htf(design.frequencies, (-1, 0, 1))
+    v = np.broadcast_to(design.expected_variance(NOISE["y"])[:, None], htf.H.shape)
+    htf = hj.HTF(htf.f, htf.H, (-1, 0, 1), N, "u", "y", variance=v)
+    return np.trace(hj.identify.multiplier_bound(model, htf).multiplier_covariances[0])
+
+
+def test_the_mean_over_models(usual):
+    models = [of(0.8), of(1.6), of(2.4)]
+    both = plan(models, usual)
+    assert both.certificate < 1.03
+    mean = np.mean([variance(one, both.design) for one in models])
+    assert both.criterion == pytest.approx(mean, rel=1e-3)
+    for one in models:
+        alone = plan(one, usual)
+        assert np.mean([variance(other, alone.design) for other in models]) > 1.2 * mean
+        assert variance(one, both.design) > alone.criterion / alone.certificate
+    # Where the resonances of all of them are.
+    for angle in (0.8, 1.6, 2.4):
+        there = np.abs((both.frequencies + 0.5) % 1 - 0.5) - angle / (2 * np.pi)
+        assert both.power[np.abs(there) < 0.05].sum() > 0.1 * both.power.sum()
+
+
+def test_limits_hold_for_each(usual):
+    models = [of(0.8), of(2.4)]
+    found = hj.optimal_design(models, usual, goal=GOAL, noise=NOISE, limit={"u": 9.0, "y": 0.1})
+    rms = []
+    for one in models:
+        data = hj.experiments.simulate_experiments(one, found.design, start="periodic")
+        rms.append(np.sqrt(np.mean(data.y**2)))
+    assert max(rms) == pytest.approx(0.1, rel=1e-2)
+
+
+def test_models_that_differ_are_refused(usual):
+    other = hj.testing.synthetic_ldtp()
+    with pytest.raises(hj.DefinitionError, match="model 1 has other n_sections than model 0"):
+        plan([of(1.0), other], usual)
+    with pytest.raises(hj.DefinitionError, match="holds no model"):
+        plan([], usual)
+
+
+def test_draws_have_the_covariance_of_the_fit():
+    model, design = of(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
+    htf = model.htf(design.frequencies)
+    v = np.broadcast_to(design.expected_variance(NOISE["y"])[:, None], htf.H.shape)
+    htf = hj.HTF(htf.f, htf.H, htf.harmonics, N, "u", "y", variance=v)
+    fit = hj.fit_ldtp(htf, model)
+    drawn = hj.designs.draws(fit, 400)
+    c = np.array([np.poly(one.multipliers).real[1:] for one in drawn])
+    np.testing.assert_allclose(
+        np.cov(c.T), fit.covariance, atol=0.3 * np.diag(fit.covariance).max()
+    )
+    assert plan(drawn[:3], design).certificate < 1.03
