@@ -2,7 +2,7 @@
 
 Between 8 isochrons, 4 realizations of a multisine (odd lines, P = 32, rms of u 0.01); 95 % regions
 of the multipliers. Two estimators see the same records: `fit_multipliers` of the HTFs, with the
-variances that realizations show, and `fit_series`. The noise:
+variances that realizations show (`htf`) and without (`htf_plain`), and `fit_series`. The noise:
 
 - `white`: process noise, white and the same at all sections.
 - `colored`: process noise with a correlation time of one cycle, nine times as strong at one phase
@@ -19,6 +19,7 @@ regions held the true multipliers (`held`), and `p` of the binomial test of 95 %
 
 import argparse
 
+import equinox as eqx
 import numpy as np
 from scipy import stats
 
@@ -92,7 +93,11 @@ def one_case(case: str, draws: int) -> None:
         series = {"series": data}
         if case == "drift":
             series["series_told"] = [told_of_drift(r) for r in data.records]
-        fits = {"htf": hj.fit_multipliers(htf, 2, check=False)}
+        plain = eqx.tree_at(lambda h: (h.variance, h.noise_variance), htf, (None, None))
+        fits = {
+            "htf": hj.fit_multipliers(htf, 2, check=False),
+            "htf_plain": hj.fit_multipliers(plain, 2, check=False),
+        }
         fits |= {
             name: hj.fit_series(x, 2, start="cycle", check=False, distortion=False)
             for name, x in series.items()
@@ -102,7 +107,7 @@ def one_case(case: str, draws: int) -> None:
         }
 
     values = hj.monte_carlo(one, draws, seed=1)
-    for name in ("htf", "series", "series_told"):
+    for name in ("htf", "htf_plain", "series", "series_told"):
         if name != "series_told" or case == "drift":
             kinds = ("error", "said", "held")
             show(f"{case}.{name}", {k: np.asarray(values[f"{name}.{k}"].values) for k in kinds})
