@@ -22,8 +22,8 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 
     python benchmarks/designs.py [--draws 200] [--only bound known nothing stopping ...]
 
-(For 200 draws `bound` and `known` take some 2 CPU minutes, `walkers` 6. `nothing` and `stopping`
-take some 5 CPU seconds for each draw and family, `deviation` 40, `parameters` PAR.)
+(For 200 draws `walkers` takes 6 CPU minutes. `nothing` and `stopping` take some 5 CPU seconds for
+each draw and family, `deviation` 40; `parameters` first compiles for a minute or two.)
 """
 
 import argparse
