@@ -2,8 +2,8 @@
 
 The compass gait and the rimless wheel are pushed by phase: sections are crossings of levels of the
 stance leg's angle, N = 32 at equal times from mid-stance on, and the input is held from one to the
-next. Samples of all angles and rates have white noise; so a noisy angle also finds each crossing too
-early or too late, which moves the other outputs by their slope, all together.
+next. Samples of all angles and rates have white noise; so a noisy angle also finds each crossing
+too early or too late, which moves the other outputs by their slope, all together.
 """
 
 from typing import NamedTuple

@@ -15,9 +15,15 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 - `stopping`: of the same studies, how many regions of 95 % held the true multipliers at the time of
   stopping, the p-value of that number, and the standard error that was asked for, said and true.
 
-    python benchmarks/designs.py [--draws 200] [--only bound known nothing stopping]
+- `parameters`: stiffness and damping of the spring by `fit_model`, input limited.
+- `deviation`: deviations of both outputs limited: all lines and `fit_multipliers` against a design
+  for `fit_ldtp` and that fit. Beside it bounds of the multiplier by `fit_model`.
+- `walkers`: the compass gait's leading pair and the rimless wheel, pushed by phase, input limited.
 
-(`nothing` and `stopping` take some 5 CPU seconds for each draw and family.)
+    python benchmarks/designs.py [--draws 200] [--only bound known nothing stopping ...]
+
+(For 200 draws `walkers` takes 6 CPU minutes. `nothing` and `stopping` take some 5 CPU seconds for
+each draw and family, `deviation` 40; `parameters` first compiles for a minute or two.)
 """
 
 import argparse
@@ -25,13 +31,14 @@ import functools
 import time
 
 import numpy as np
+from design_questions import HARMONICS, deviation, measured, parameters
+from design_walkers import walkers
 from scipy import stats
 from second_order import OUTPUTS, sections
 
 import hybridjax as hj
 
 
-HARMONICS = (-2, -1, 0, 1, 2)
 RMS = 0.001
 PHASES = 4
 # Standard error of the multiplier that studies are asked for.
@@ -61,21 +68,6 @@ class Family:
         """20 dB below the outputs."""
         rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
         return dict(zip(OUTPUTS, 0.1 * rms, strict=True))
-
-
-def measured(data, design: hj.Design, noise: dict[str, float], rng) -> hj.HTF:
-    """HTFs from data with noise, whose variance is known."""
-    std = np.array(list(noise.values()))
-    noisy = hj.experiments.add_noise(data, std=std, seed=int(rng.integers(2**31)))
-    found = hj.estimate_htf(noisy, HARMONICS, variance="auto")
-    variance = design.expected_variance()[:, None, :] * std[:, None] ** 2
-    return with_variance(found, np.broadcast_to(variance, found.H.shape))
-
-
-def with_variance(htf: hj.HTF, variance) -> hj.HTF:
-    return hj.HTF(
-        htf.f, htf.H, htf.harmonics, htf.n_sections, htf.inputs, htf.outputs, variance=variance
-    )
 
 
 def rms_error(family: Family, fit, draws: int, seed: int) -> float:
@@ -114,7 +106,7 @@ def known(family: Family, draws: int) -> None:
     ):
 
         def fit(rng, data=data, design=design):
-            htf = measured(data[rng.integers(PHASES)], design, noise, rng)
+            htf = measured(data[rng.integers(PHASES)], design, noise, HARMONICS, rng)
             return hj.fit_multipliers(htf, 2)
 
         found.append(rms_error(family, fit, draws, seed=3))
@@ -181,21 +173,32 @@ def stopping(family: Family, draws: int) -> None:
     family.show("stopping.rms_error", np.sqrt(np.mean(error**2)))
 
 
-STEPS = {"bound": bounds, "known": known, "nothing": nothing, "stopping": stopping}
+STEPS = {
+    "bound": bounds,
+    "known": known,
+    "nothing": nothing,
+    "stopping": stopping,
+    "parameters": parameters,
+    "deviation": deviation,
+}
+ALL = [*STEPS, "walkers"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--only", nargs="+", choices=STEPS, default=list(STEPS))
+    parser.add_argument("--only", nargs="+", choices=ALL, default=ALL)
     options = parser.parse_args()
     hj.enable_x64()
     hj.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         family = Family(name, cycle, definition)
-        for step in options.only:
-            STEPS[step](family, options.draws)
+        for step in STEPS:
+            if step in options.only:
+                STEPS[step](family, options.draws)
+    if "walkers" in options.only:
+        walkers(options.draws)
 
 
 if __name__ == "__main__":
