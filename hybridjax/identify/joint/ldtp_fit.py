@@ -9,6 +9,8 @@ from jaxtyping import Complex, Float
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Scalar, Vector
 from ..._core.results import Result
+from ..._core.signal import unit_of
+from ..._core.text import number
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
@@ -128,7 +130,10 @@ class LDTPFit(MultiplierEstimate):
 
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
-        return (
-            f"misfit {self.cost:.6g}, expected {self.freedom}; {self.unknowns} unknowns, "
-            f"{self.n_sections} sections{state}"
-        )
+        about = f"misfit {self.cost:.6g}, expected {self.freedom}"
+        if self.noise is not None:
+            size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
+            each = zip(self.outputs, size, strict=True)
+            shown = ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in each)
+            about = f"errors one step ahead {shown}"
+        return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
