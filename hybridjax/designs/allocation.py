@@ -38,6 +38,9 @@ _LONGER = 1.15
 # the choice of an order, which the sum only approximates.) Half of it: some of these end closer to
 # the optimum.
 _SHORTEST = 1 / 16
+# Relative rise of the criterion that is left to rounding, and to weak cosines on their floor. Ten
+# times more: of the worst of several models shorter steps are missed.
+_RISE = 1e-6
 
 
 class Certificate(NamedTuple):
@@ -89,10 +92,11 @@ def allocate(
         trial = _along(power, short, longer, limits)
         found = question.answer(trial)
         if found.criterion > now.criterion:
-            longer = max(longer / 2, 1.0) if longer > 1 else max(longer / 2, _SHORTEST)
-            trial = _along(power, short, longer, limits)
+            surely = longer > 1
+            longer = max(longer / 2, 1.0 if surely else _SHORTEST)
+            trial = _along(power, short, 1.0 if surely else longer, limits)
             found = question.answer(trial)
-        if found.criterion <= now.criterion:
+        if found.criterion <= now.criterion * (1 + _RISE):
             power, now, longer = trial, found, longer * _LONGER
     return Allocation(power, now, certificate)
 

@@ -2,8 +2,8 @@ r"""A question about several models, any of which may be true.
 
 The mean of the r-th powers of their criteria, $(\frac{1}{J} \sum_j \Psi_j^r)^{1/r}$, is convex in
 the powers of the cosines and halved where these are doubled, as each of them is: the certificate
-holds for any $r \ge 1$. With r = 1 it is the mean. With a large r it is hardly less than the largest
-one, by a factor of $J^{-1/r}$ at most.
+holds for any $r \ge 1$. With r = 1 it is the mean. With a large r it is hardly less than the
+largest one, by a factor of $J^{-1/r}$ at most.
 """
 
 import numpy as np
