@@ -56,7 +56,7 @@ def parameters(family, draws: int) -> None:
             std = {k: scale * x for k, x in noise.items()}
             htf = measured(data[rng.integers(len(data))], design, std, HARMONICS, rng)
             fit = hj.fit_model(system, hj.ObservedHTF(htf, sections), SPRING, guess=family.cycle)
-            return np.array([fit.parameters[x] for x in SPRING]) / truth - 1
+            return np.asarray(fit.values) / truth - 1
 
         errors = hj.monte_carlo(error, draws, seed=3).value.values
         clean = error(np.random.default_rng(0), scale=1e-3)
