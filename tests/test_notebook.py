@@ -35,6 +35,11 @@ def test_the_executed_notebook_has_the_code_of_its_source(name):
     assert "Traceback" not in printed and "Warning" not in printed and "stderr" not in printed
 
 
+def how_to_push(found):
+    assert found.study.done and found.study.strides[-1] <= found.budget
+    assert found.study.fit.contains(found.cycle.multipliers, 0.999).all()
+
+
 def paper(found):
     for fit in found.structured.values():
         assert fit.compare(found.cycle.multipliers).max_error < 5e-5
@@ -81,7 +86,8 @@ def walking(found):
 
 
 CHECKS = {
-    "fit": fit, "neurons": neurons, "own_system": own_system, "paper": paper,
+    "fit": fit, "how_to_push": how_to_push, "neurons": neurons,
+    "own_system": own_system, "paper": paper,
     "recording": recording, "robot": robot, "strides": strides, "sweep": sweep,
     "walking": walking,
 }  # fmt: skip

@@ -150,7 +150,8 @@ UNCHECKED = {
     },
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
-        "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses", "Inspection",
+        "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
+        "InformationMap", "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",

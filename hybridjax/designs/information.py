@@ -90,8 +90,14 @@ def information_map(
     estimators, several inputs.
     """
     goal = Multipliers() if goal is None else goal
-    if goal.estimator != "fit_multipliers" or len(design.input_names) > 1:
-        raise DefinitionError("a map of information needs one input, and `fit_multipliers`.")
+    if goal.estimator != "fit_multipliers":
+        raise DefinitionError("`goal`: a map of information is made for fit_multipliers only.")
+    if len(design.input_names) > 1 or len(model.inputs) > 1:
+        raise DefinitionError("`model` and `design` must have one input for a map of information.")
+    if model.n_sections != design.n_sections:
+        raise DefinitionError(
+            f"`model` has {model.n_sections} sections, but `design` {design.n_sections}."
+        )
     unknown = [name for name in noise if name not in model.outputs]
     if unknown or not noise:
         what = f"names '{unknown[0]}'" if unknown else "names no output"

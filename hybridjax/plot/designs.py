@@ -37,7 +37,12 @@ def spectrum(
     Above: |H_0|, each relative to its largest value. Below: the amplitude of each line (the root of
     twice its power over all experiments), of all inputs together; three decades of it. Lines that
     no experiment holds are not drawn.
+
+    **Raises:** `DefinitionError` for a model of other signals.
     """
+    known = {*model.inputs, *model.outputs}
+    if model.n_sections != plan.design.n_sections or known != set(plan.rms) & known:
+        raise DefinitionError("`model` is not the one that the plan was made for: other signals.")
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
         f = np.unique(plan.frequencies)

@@ -46,8 +46,8 @@ def test_phases():
     [
         (dict(noise={"z": 1.0}), "`noise` names 'z'; the outputs are x, v"),
         (dict(noise={}), "`noise` names no output"),
-        (dict(design=hj.multisine(8, inputs=2)), "needs one input"),
-        (dict(goal=hj.designs.Multipliers(estimator="fit_ldtp")), "and `fit_multipliers`"),
+        (dict(design=hj.multisine(8, inputs=2)), "must have one input"),
+        (dict(goal=hj.designs.Multipliers(estimator="fit_ldtp")), "for fit_multipliers only"),
         (dict(goal=hj.designs.Multipliers(harmonics=(0, 1))), "symmetric about 0"),
         (dict(design=hj.multisine(8, periods=4)), "frequencies are too few"),
     ],

@@ -304,6 +304,22 @@ def designs(t):
     ), {
         "model": instance(t.design), "plan": [*CALLABLE, lambda m: 3], "shortest": COUNT,
     }  # fmt: skip
+    yield "Study", hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0), {
+        "first": instance(t.model, t.design), "order": COUNT, "standard_error": POSITIVE,
+        "goal": optional([3, "nope", hj.designs.Multipliers(estimator="fit_ldtp")]),
+        "limit": [None, 3, "nope", hj.designs.Limits(strides=9), Other()],
+        "largest": optional([0.0, -1.0, NAN, "x", Other()]), "seed": SEED,
+    }  # fmt: skip
+    yield "Study.add", t.study.add, dict(data=t.block), {
+        "data": instance(t.model, t.data), "repeats": [*COUNT, 2],
+    }  # fmt: skip
+    yield "information_map", hj.designs.information_map, dict(
+        model=t.decaying, design=t.one_input, noise={"y": 1.0}, goal=t.study.goal
+    ), {
+        "model": instance(t.design), "design": instance(t.model, t.design),
+        "noise": [None, 3, "nope", {}, {"z": 1.0}, {"y": 0.0}, {"y": NAN}, {"y": "1"}, Other()],
+        "goal": optional([3, "nope", hj.designs.Multipliers(estimator="fit_ldtp")]),
+    }  # fmt: skip
     yield "draws", hj.designs.draws, dict(fit=t.joint, count=1), {
         "fit": instance(t.design), "count": COUNT, "seed": SEED,
     }  # fmt: skip

@@ -47,6 +47,16 @@ def calls(t):
     yield "plot.magnitude", one(plot.magnitude), dict(htfs=t.estimate), {
         "htfs": htf, "output": drawn, "input": drawn, "harmonics": HARMONICS, "decades": POSITIVE,
     } | look  # fmt: skip
+    yield "plot.spectrum", plot.spectrum, dict(plan=t.plan, model=t.model), {
+        "plan": instance(t.design), "model": instance(t.design, t.decaying),
+    } | look  # fmt: skip
+    yield "plot.information", plot.information, dict(found=t.information), {
+        "found": instance(t.plan),
+    } | look  # fmt: skip
+    yield "plot.strides", plot.strides, dict(plan=t.plan, studies={"a": t.studied}), {
+        "plan": instance(t.design), "ax": AXES,
+        "studies": [3, "x", {"a": 3}, {"a": t.study}, {3: t.studied}, Other()],
+    }  # fmt: skip
     named = ["nope", 3, ["x"], Other()]
     yield "plot.cycle", plot.cycle, dict(cycle=t.cycle), {
         "cycle": instance(t.system), "x": named, "y": named, "sections": ["x", 3, PHASE],

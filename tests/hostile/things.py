@@ -112,6 +112,31 @@ class Things:
         return hj.optimal_design(self.model, self.design, goal=goal, max_steps=1)
 
     @ft.cached_property
+    def decaying(self):
+        return hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+
+    @ft.cached_property
+    def block(self):
+        data = hj.experiments.simulate_experiments(self.decaying, self.one_input, start="periodic")
+        return hj.experiments.add_noise(data, snr=30)
+
+    @ft.cached_property
+    def study(self):
+        goal = hj.designs.Multipliers(harmonics=0)
+        return hj.designs.Study(self.one_input, order=1, standard_error=1e-9, goal=goal)
+
+    @ft.cached_property
+    def studied(self):
+        return self.study.add(self.block)
+
+    @ft.cached_property
+    def information(self):
+        goal = hj.designs.Multipliers(harmonics=0)
+        return hj.designs.information_map(
+            self.decaying, self.one_input, noise={"y": 1.0}, goal=goal
+        )
+
+    @ft.cached_property
     def joint(self):
         return hj.fit_ldtp(self.uncertain, self.model)
 

@@ -189,10 +189,15 @@ class Study(eqx.Module):
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections; as
         `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
+        if data.n_sections != self.first.n_sections or len(data.inputs) > 1:
+            raise DefinitionError(
+                f"`data` have {data.n_sections} sections and {len(data.inputs)} inputs, the study "
+                f"{self.first.n_sections} and 1."
+            )
         blocks = () if self._found is None else self._found.blocks
         new = block_of(data, self.goal, repeats)
         for known in blocks[:1]:
-            for name in ("n_sections", "inputs", "outputs"):
+            for name in ("inputs", "outputs"):
                 if getattr(new, name) != getattr(known, name):
                     raise DefinitionError(
                         f"blocks with different {name} do not belong together: "

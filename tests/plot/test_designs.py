@@ -1,0 +1,68 @@
+"""Figures of designs show what they say."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+NOISE = {"y": 1e-3}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+
+
+@pytest.fixture(scope="module")
+def goal():
+    return hj.designs.Multipliers(harmonics=0)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return hj.multisine(4, 16, band=(0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def plan(model, usual, goal):
+    return hj.optimal_design(model, usual, noise=NOISE, goal=goal)
+
+
+def test_the_spectrum_of_a_design(plan, model):
+    above, below = hj.plot.spectrum(plan, model).axes[:, 0]
+    f = np.unique(plan.frequencies)
+    H = np.abs(np.asarray(model.htf(f, 0).H)[0, :, 0, 0])
+    np.testing.assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
+    usual, optimal = below.get_lines()
+    np.testing.assert_allclose(np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum())
+    np.testing.assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
+    assert below.get_ylabel() == "amplitude"
+    assert {x.get_text() for x in below.get_legend().get_texts()} == {"usual", "optimal"}
+    with pytest.raises(hj.DefinitionError, match="not the one that the plan was made for"):
+        hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
+
+
+def test_where_one_learns(model, usual, goal):
+    found = hj.designs.information_map(model, usual, noise=NOISE, goal=goal)
+    chart, side = hj.plot.information(found).axes[0]
+    image = np.asarray(chart.collections[0].get_array())
+    assert image.shape[0] == 4 and image.mean() == pytest.approx(1)
+    lengths = [bar.get_width() for bar in side.patches]
+    np.testing.assert_allclose(lengths, 4 * found.share.sum(axis=(0, 1)))
+    assert "f$ (cycles/period)" in chart.get_xlabel() and chart.get_ylabel() == "phase (cycles)"
+
+
+def test_what_strides_buy(plan, model, usual, goal):
+    study = hj.designs.Study(usual, 1, 1e-9, goal=goal)
+    data = hj.experiments.simulate_experiments(model, usual, start="periodic")
+    studied = study.add(hj.experiments.add_noise(data, std=1e-3))
+    ax = hj.plot.strides(plan, {"here": [studied, studied]}).ax
+    lines = {line.get_label(): line for line in ax.get_lines()}
+    assert lines["here"].get_xdata() == studied.strides
+    assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
+    equal = lines["equal amplitudes"]
+    at = np.interp(np.log(usual.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata()))
+    assert np.exp(at) == pytest.approx(np.linalg.norm(plan.usual_standard_errors))
+    with pytest.raises(hj.DefinitionError, match="without a block"):
+        hj.plot.strides(plan, {"here": study})
