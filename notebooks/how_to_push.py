@@ -100,7 +100,7 @@ hj.plot.strides(study.plan, {"this study": study})
 # %% [markdown]
 # ## Was it right?
 #
-# The region was computed at a time that the data chose, and still holds the true multipliers in
+# The region was computed at a time that the data chose, and is made to hold the true multipliers in
 # 95 % of studies (`docs/experiments.md`).
 
 # %%

@@ -88,8 +88,7 @@ def test_blocks_of_one_design_are_as_good_as_one_block(model, first):
 
 
 def test_few_lines_do_not_make_it_sure(model, first):
-    """The scatter at the few lines that matter in a first block understates the error, but the level
-    of the noise does not."""
+    """Their scatter understates the error of a first block, but the level of the noise does not."""
     data = measured(model, first)
     error = hj.designs.Study(first, 2, 1e-3).add(data).standard_errors[0, 0]
     plan = hj.optimal_design(model, first, noise=NOISE)
