@@ -1,7 +1,7 @@
-"""The hopper's spring and damper, and its multipliers where deviations from the cycle are limited.
+"""Other questions, the hopper's spring and damper, and deviations from the cycle limited.
 
-Two rows of `designs.py`. HTFs of the hopper itself have white noise, 20 dB below the outputs in the
-usual design; their variances are known.
+Three rows of `designs.py`. HTFs of the hopper itself have white noise, 20 dB below the outputs in
+the usual design; their variances are known.
 """
 
 import time
@@ -34,6 +34,32 @@ def measured(data, design: hj.Design, noise: dict[str, float], harmonics, rng) -
 
 def rms(values) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def goals(family, draws: int) -> None:
+    """Bounds of other goals and with a limit of peaks; 620 lines."""
+    design = hj.designs
+    asked = {
+        "fit_ldtp": design.Multipliers(estimator="fit_ldtp", harmonics=HARMONICS),
+        "response": design.FrequencyResponse((0.1, 1.0), harmonics=HARMONICS),
+        "order": design.Order(1),
+    }
+    for limit in ("input", "output"):
+        for name, goal in asked.items():
+            show(family, f"goals.{name}.{limit}", goal=goal, limit=limit)
+    usual = hj.multisine(periods=16)
+    peaks = design.Limits(rms={"u": 0.01}, peak={"u": 0.02})
+    plan = show(family, "goals.peak", usual, limit=peaks)
+    family.show("goals.peak.price", plan.for_peaks)
+
+
+def show(family, name: str, *design, **about):
+    begin = time.process_time()
+    plan = hj.optimal_design(family.model, *design, **about)
+    family.show(f"{name}.saved", plan.saved)
+    family.show(f"{name}.certificate", plan.certificate)
+    family.show(f"{name}.cpu_seconds", time.process_time() - begin)
+    return plan
 
 
 def parameters(family, draws: int) -> None:

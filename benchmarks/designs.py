@@ -14,7 +14,9 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
   bound is the rms error that was reached.
 - `stopping`: of the same studies, how many regions of 95 % held the true multipliers at the time of
   stopping, the p-value of that number, and the standard error that was asked for, said and true.
-
+- `goals`: bounds of other goals, of both limits: multipliers by `fit_ldtp`, the harmonic transfer
+  functions for f from 0.1 to 1, one multiplier or two. `peak`: multipliers, rms of u 0.01 and peak
+  0.02; `price`: strides that the peak costs.
 - `parameters`: stiffness and damping of the spring by `fit_model`, input limited.
 - `deviation`: deviations of both outputs limited: all lines and `fit_multipliers` against a design
   for `fit_ldtp` and that fit. Beside it bounds of the multiplier by `fit_model`.
@@ -31,7 +33,7 @@ import functools
 import time
 
 import numpy as np
-from design_questions import HARMONICS, deviation, measured, parameters
+from design_questions import HARMONICS, deviation, goals, measured, parameters
 from design_walkers import walkers
 from scipy import stats
 from second_order import OUTPUTS, sections
@@ -178,6 +180,7 @@ STEPS = {
     "known": known,
     "nothing": nothing,
     "stopping": stopping,
+    "goals": goals,
     "parameters": parameters,
     "deviation": deviation,
 }

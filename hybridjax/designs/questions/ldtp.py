@@ -62,15 +62,20 @@ class LDTPUnknowns(NamedTuple):
         criterion: str,
         part: Int[np.ndarray, " rows"] | None = None,
     ) -> Question:
-        """**Arguments:** `wanted`, derivatives by the coordinates.
+        """**Arguments:** `wanted`, derivatives by the coordinates; `part`, the wanted quantity that
+        each row belongs to, if its variance is a sum over several.
 
         **Raises:** `DefinitionError` if the usual design does not show it.
         """
         kept = _shown(self.values)
         turned = wanted / self.size @ self.vectors
         least = np.maximum(self.values, _SINGULAR * self.values[-1])
-        variances = turned**2 / least
-        if (variances[:, ~kept].sum(axis=1) > _MISSED * variances.sum(axis=1)).any():
+        of = np.arange(len(wanted)) if part is None else part
+        everything, missed = (
+            np.bincount(of, (turned[:, some] ** 2 / least[some]).sum(axis=1))
+            for some in (slice(None), ~kept)
+        )
+        if (missed > _MISSED * everything).any():
             raise DefinitionError(
                 "the usual design does not show what `goal` asks for: measure more harmonics or "
                 "lines."
