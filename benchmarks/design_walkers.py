@@ -117,6 +117,7 @@ def walkers(draws: int) -> None:
         noise = dict(zip(walker.outputs, np.sqrt(lab.variance(std)).tolist(), strict=True))
         goal = hj.designs.Multipliers(which=0)
         plan = hj.optimal_design(lab.model, usual, goal=goal, noise=noise)
+        everything = hj.optimal_design(lab.model, usual, noise=noise)
         found = [lab.rms_error(design, std, draws) for design in (usual, plan.design)]
         for what, value in {
             "usual.bound": np.linalg.norm(plan.usual_standard_errors),
@@ -125,5 +126,6 @@ def walkers(draws: int) -> None:
             "optimal.rms_error": found[1],
             "bound.saved": plan.saved,
             "saved": (found[0] / found[1]) ** 2,
+            "all.bound.saved": everything.saved,
         }.items():
             print(f"designs.{name}.{what} {value:.4g}", flush=True)

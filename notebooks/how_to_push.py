@@ -21,8 +21,12 @@
 # nothing but records.
 
 # %%
+import os
 import pathlib
 import tempfile
+
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy; more of them make fits slower
 
 import numpy as np
 
@@ -128,5 +132,5 @@ for name in ("time.csv", "phase.csv"):
 
 # %% [markdown]
 # What comes back is a recording. `section_data(...).experiments(block.periods)` makes of it what
-# `study.add` takes ([from a recording](recording.ipynb)); a study can be made again from its
+# `study.add` takes (the notebook `recording` shows how); a study can be made again from its
 # blocks on another day, since it depends on nothing else.

@@ -139,7 +139,7 @@ def _measured(model: Model, design: Design, noise: Mapping[str, float], harmonic
 
 
 def _by_harmonic(
-    htf: HTF, groups: list[HTFGroup], parts: list[Float[np.ndarray, "g 2 E K"]]
+    htf: HTF, groups: list[HTFGroup], parts: list[Float[np.ndarray, "g 2 _ _"]]
 ) -> Complex[np.ndarray, "g M F ny"]:
     """Of each harmonic at f alone. (Rows of pairs hold H_m at f, and then the conjugate of H_{-m},
     which is H_m at -f.)"""

@@ -92,7 +92,7 @@ def _impulses(
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, "P N lags ny nu"]]:
     """Responses at section n to a push r sections earlier, and their derivatives."""
     P, places = coordinates.size, coordinates.places
-    A, B, C, D = ([x.astype(complex)[None] for x in blocks] for blocks in coordinates.model)
+    A, B, C, D = ([x.astype(complex)[None] for x in blocks] for blocks in coordinates.model[:4])
     N, (ny, nu) = coordinates.model.n_sections, coordinates.model.D[0].shape
     found = np.zeros((P, N, lags, ny, nu), complex)
 

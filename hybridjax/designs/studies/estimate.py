@@ -74,6 +74,8 @@ class Estimate(NamedTuple):
     """What all blocks together say."""
 
     fit: StructuredFit
+    by_level: StructuredFit
+    """The same, as sure as white noise of these levels lets it be."""
     noise: Float[np.ndarray, "B ny"]
     """Standard deviation of each output's noise in each block."""
     doubt: str
@@ -115,7 +117,7 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     by_level = fit_multipliers(htf, d, overhang=goal.overhang, check=False, errors="variance")
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     groups = group_htf(htf, error_weights(htf, check_values(htf)), size)
-    return Estimate(fit, noise, _doubt(groups, htf, fit))
+    return Estimate(fit, by_level, noise, _doubt(groups, htf, fit))
 
 
 def _joined(

@@ -274,7 +274,7 @@ class Study(eqx.Module):
             return f"next: equal amplitudes again, since {self._found.estimate.doubt}"
         plan = self._found.plan
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
-        equal = usual / (self.standard_errors[-1] ** 2).sum()
+        equal = usual / (_asked(self._found.estimate.by_level, self.goal) ** 2).sum()
         said = f"with equal amplitudes as much takes about {equal:.3g} strides"
         if self.done:
             return said
