@@ -21,12 +21,8 @@
 # nothing but records.
 
 # %%
-import os
 import pathlib
 import tempfile
-
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy; more of them make fits slower
 
 import numpy as np
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from .blas import libraries, one_blas_thread
 from .cores import core_count
 from .device import on_cpu
 from .precision import require_x64
@@ -34,11 +35,11 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     """`work` of each item, in order: large operations of NumPy and SciPy, during which other
     threads can run. Each sees the caller's `np.errstate`.
 
-    Threads of BLAS would be in the way of these, so that the cores are left to them unless
-    OPENBLAS_NUM_THREADS is 1.
+    Threads of BLAS would be in the way of these: where they cannot be told to stop, the cores are
+    left to them unless OPENBLAS_NUM_THREADS is 1.
     """
-    alone = os.environ.get("OPENBLAS_NUM_THREADS") == "1"
-    with ThreadPoolExecutor(core_count() if alone else 1) as pool:
+    alone = bool(libraries()) or os.environ.get("OPENBLAS_NUM_THREADS") == "1"
+    with one_blas_thread(), ThreadPoolExecutor(core_count() if alone else 1) as pool:
         running = [pool.submit(copy_context().run, work, item) for item in items]
         return [one.result() for one in running]
 

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Int
 
+from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
 from .._core.progress import working
@@ -42,6 +43,7 @@ _AS_GOOD = 1.01
 
 @checked
 @working("optimal_design")
+@one_blas_thread()
 def optimal_design(
     model: Model | Sequence[Model],
     design: Design | None = None,

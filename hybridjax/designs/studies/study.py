@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Order, Positive, Seed
 from ..._core.html.multipliers import multiplier_table
@@ -179,6 +180,7 @@ class Study(eqx.Module):
         return self._found.plan.design
 
     @working("Study.add")
+    @one_blas_thread()
     def add(self, data: ExperimentData, *, repeats: Count = 1) -> "Study":
         """The study with one block more, its estimate and its next design.
 

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index
 from ...errors import DefinitionError
@@ -53,6 +54,7 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
 
 
 @checked
+@one_blas_thread()
 def multiplier_bound(model: LDTP, htf: HTF, overhang: Index | None = None) -> MultiplierBound:
     r"""The Cramer-Rao bound of the multipliers of a known model.
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, StepCount
 from ...errors import DefinitionError
@@ -94,6 +95,7 @@ class OrderSelection(eqx.Module):
 
 
 @checked
+@one_blas_thread()
 def select_order(
     htf: HTF,
     max_order: Order = 5,

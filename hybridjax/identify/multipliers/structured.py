@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
 from ..._core.results import Result
@@ -97,6 +98,7 @@ class StructuredFit(MultiplierEstimate):
 
 
 @checked
+@one_blas_thread()
 def fit_multipliers(
     htf: HTF,
     order: Order | LDTP,

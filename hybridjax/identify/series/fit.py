@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, StepCount
 from ..._core.precision import require_x64
@@ -47,6 +48,7 @@ _ROUNDING = 1e-15
 
 
 @checked
+@one_blas_thread()
 def fit_series(
     data: RecordedData,
     order: Order | LDTP,
