@@ -12,6 +12,7 @@ def analyze(cycle):
 
 
 def test_another_hopper_compiles_nothing(hopper_cycle, isochron_ldtp, kinematic_ldtp):
-    analyze(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.05)))
+    for numbers in ({"k": 10.05}, {"k": 10.07, "M": 2.01}):
+        analyze(hj.find_limit_cycle(hj.models.VerticalHopper(**numbers)))
     with no_compilation():
         analyze(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.1, M=2.02)))
