@@ -52,14 +52,12 @@ def goals(family, draws: int) -> None:
     plan = show(family, "goals.peak", usual, limit=peaks)
     family.show("goals.peak.price", plan.for_peaks)
 
-    def within(model):
-        harmonics = range(-model.n_sections // 2, model.n_sections // 2)
-        about = {"limit": {"yM": 1e-3, "vM": 3e-3}, "noise": {"yM": 1e-4, "vM": 3e-4}}
-        return hj.optimal_design(
-            model, usual, goal=design.Multipliers(harmonics=tuple(harmonics)), **about
-        )
-
-    family.show("goals.window.saved", design.choose_window(family.model, within).saved)
+    N = family.model.n_sections
+    choice = design.choose_window(
+        family.model, usual, limit={"yM": 1e-3, "vM": 3e-3}, noise={"yM": 1e-4, "vM": 3e-4},
+        goal=design.Multipliers(harmonics=tuple(range(-N // 2, N // 2))),
+    )  # fmt: skip
+    family.show("goals.window.saved", choice.saved)
 
 
 def show(family, name: str, *design, **about):

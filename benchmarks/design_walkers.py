@@ -18,6 +18,8 @@ N = 32
 PHASES = 4
 # Part of a period by which differences are taken.
 _ASIDE = 1e-3
+# Noise with which errors are still proportional to it, relative to that of the benchmark.
+_QUIET = 0.1
 
 
 class Walker(NamedTuple):
@@ -119,10 +121,13 @@ def walkers(draws: int) -> None:
         plan = hj.optimal_design(lab.model, usual, goal=goal, noise=noise)
         everything = hj.optimal_design(lab.model, usual, noise=noise)
         found = [lab.rms_error(design, std, draws) for design in (usual, plan.design)]
+        quiet = lab.rms_error(usual, _QUIET * std, draws)
+        bound = np.linalg.norm(plan.usual_standard_errors)
         for what, value in {
-            "usual.bound": np.linalg.norm(plan.usual_standard_errors),
+            "usual.bound": bound,
             "optimal.bound": np.linalg.norm(plan.standard_errors),
             "usual.rms_error": found[0],
+            "usual.quiet.ratio": quiet / (_QUIET * bound),
             "optimal.rms_error": found[1],
             "bound.saved": plan.saved,
             "saved": (found[0] / found[1]) ** 2,

@@ -22,12 +22,13 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 - `deviation`: deviations of both outputs limited: all lines and `fit_multipliers` against a design
   for `fit_ldtp` and that fit. Beside it bounds of the multiplier by `fit_model`.
 - `walkers`: the compass gait's leading pair and the rimless wheel, pushed by phase, input limited;
-  `all`: the bound where all multipliers are wanted.
+  `all`: the bound where all multipliers are wanted; `usual.quiet.ratio`: rms error to bound with a
+  tenth of the noise.
 
-    python benchmarks/designs.py [--draws 200] [--only bound known nothing stopping ...]
+    python benchmarks/designs.py [--draws 200] [--only bound known ...] [--families isochron ...]
 
 (For 200 draws `walkers` takes 6 CPU minutes. `nothing` and `stopping` take some 5 CPU seconds for
-each draw and family, `deviation` 40; `parameters` first compiles for a minute or two.)
+each draw and family, `deviation` 12; `parameters` first compiles for a minute or two.)
 """
 
 import argparse
@@ -193,12 +194,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--only", nargs="+", choices=ALL, default=ALL)
+    parser.add_argument("--families", nargs="+", default=("isochron", "kinematic"))
     options = parser.parse_args()
     hj.enable_x64()
     hj.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    for name, definition in sections().items():
-        family = Family(name, cycle, definition)
+    for name in options.families:
+        family = Family(name, cycle, sections()[name])
         for step in STEPS:
             if step in options.only:
                 STEPS[step](family, options.draws)

@@ -13,6 +13,10 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
   lines that are not excited, by local polynomials (odd lines, all 84 cycles). All 620 lines or odd
   ones.
 - `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
+- `discs`: how often 95 % discs about means of some complex errors hold zero. Errors are normal, of
+  constant modulus (`constant`), or sums of both, with the rms of the normal part relative to the
+  other. Discs of `size` look at the size of the scatter alone, those of `shape` are
+  `HTF.confidence_radius`; `wider` is the ratio of their mean radii.
 - `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % regions of H_0, H_1 and H_-1 at ten fixed frequencies
   (`region`: by `htf_p_values`, `disc`: discs) hold the best linear approximation, the mean over
@@ -35,7 +39,7 @@ import hybridjax as hj
 
 HARMONICS = (-2, -1, 0, 1, 2)
 N = 32
-STEPS = ("crest", "leakage", "periodic", "unknown", "coverage")
+STEPS = ("crest", "discs", "leakage", "periodic", "unknown", "coverage")
 SEED = {"isochron": 41 * 10**6, "kinematic": 57 * 10**6}
 # rms of the inputs where distortion is a small and a large part of the variance, and realizations.
 COVERAGE = {
@@ -115,6 +119,30 @@ def crest() -> None:
         print(f"estimation.crest.{name}.max {factors.max():.2f}")
 
 
+def discs(draws: int = 200_000) -> None:
+    rng = np.random.default_rng(0)
+    kinds = {"normal": (0, 1), "constant": (1, 0), "0.3": (1, 0.3), "0.6": (1, 0.6), "1": (1, 1)}
+    for count in (2, 3, 4, 6, 8, 16):
+        freedom = np.full(draws, count - 1.0)
+        for kind, (constant, noise) in kinds.items():
+            error = constant * np.exp(2j * np.pi * rng.random((count, draws)))
+            error += noise * rng.normal(size=(count, draws, 2)) @ (np.array([1, 1j]) / np.sqrt(2))
+            mean = error.mean(axis=0)
+            rest = error - mean
+            power = np.sum(np.abs(rest) ** 2, axis=0)
+            roundness = np.ones(draws)
+            if count > 2:
+                line = np.abs(np.sum(rest**2, axis=0)) / power
+                roundness = (1 - np.minimum(line, 1) ** 2) * count / (count - 2)
+            radii = []
+            for name, shape in (("size", None), ("shape", roundness[None, :, None, None])):
+                quantile = np.asarray(hj.Scatter(freedom, shape).quantile(0.95))
+                radii.append(np.sqrt(np.ravel(quantile) * power / count / (count - 1)))
+                inside = np.mean(np.abs(mean) <= radii[-1])
+                print(f"estimation.discs.{count}.{kind}.{name} {inside:.4f}")
+            print(f"estimation.discs.{count}.{kind}.wider {radii[1].mean() / radii[0].mean():.3f}")
+
+
 def leakage(family: Family) -> None:
     design = hj.multisine(highest_harmonic=2)
     for output, value in zip(
@@ -174,6 +202,8 @@ def main() -> None:
     hj.enable_compilation_cache()
     if "crest" not in options.skip:
         crest()
+    if "discs" not in options.skip:
+        discs()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         family = Family(name, cycle, definition)

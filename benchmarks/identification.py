@@ -148,13 +148,13 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
         phases, noise = rng.integers(2**31, size=2).tolist()
         noisy = hj.experiments.add_noise(run(4, phases), snr=20, seed=noise)
         estimate = hj.estimate_htf(noisy, chosen, repeats=2)
-        freedom = estimate.variance_freedom
+        freedom = estimate.scatter.freedom
         return {"H": estimate.H, "variance": estimate.variance, "freedom": freedom}
 
     def fitted(H, variance, freedom):
         htf = hj.HTF(
             mean.f, H, chosen, N, mean.inputs, mean.outputs,
-            variance=variance, variance_freedom=freedom,
+            variance=variance, scatter=hj.Scatter(freedom),
         )  # fmt: skip
         return hj.fit_multipliers(htf, 2)
 

@@ -90,7 +90,7 @@ def bound(joint: hj.LDTP, noise: hj.LDTP, records: list[hj.Record]) -> float:
     parts = [SeriesPart.of(CycleGrid.from_records([r]), np.ones(2)) for r in records]
     problem = SeriesProblem(parts, filtered.S, True, True, 0)
     c, slopes = characteristic_slopes(coordinates)
-    root = slopes @ problem.linearize(coordinates).covariance_root() * np.sqrt(len(records))
+    root = slopes @ problem.linearize(coordinates).spread().root * np.sqrt(len(records))
     found = MultiplierBound(multipliers_of(c), c, root @ root.T)
     true = system().multipliers[0]
     return float(found.standard_errors[np.abs(found.multipliers - true).argmin()])

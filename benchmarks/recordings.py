@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [bag]
-[coverage] [short] [losses] [real]
+[coverage] [products] [short] [losses] [real]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -131,7 +131,7 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16):
+def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases=PHASES):
     print(
         f"\nCoverage of 95 % regions: {draws} draws, {strides} strides, {n_sections} sections, "
         f"noise {noise:g}"
@@ -144,12 +144,18 @@ def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16):
         dirty = [noisy(r, noise, seed) for r, seed in zip(recordings, seeds, strict=True)]
         return {
             name: [found_in(at_sections(d, name, n_sections).records, true) for d in dirty]
-            for name in PHASES
+            for name in phases
         }
 
     found = hj.monte_carlo(some, draws // chunk)
-    for name in PHASES:
+    for name in phases:
         print(f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}", flush=True)
+
+
+def products(draws=200):
+    """Where next to no noise is left, and products of second order are taken."""
+    coverage(draws, noise=0.0, n_sections=N_SECTIONS, phases=("apex",))
+    walks("van der Pol", *oscillator(0.02), draws, 100, 5, 1e-4)
 
 
 def found_in(records, true, **options):
@@ -355,8 +361,6 @@ def losses(draws=200, strides=200):
 def walker(draws=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
-    oscillator = hj.models.VanDerPol(mu=0.1)
-    angle = hj.KinematicPhase(16, position="x", velocity="v")
     middle = hj.AtEvent("middle")
     # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
     # in cycles (what smaller multipliers leave after it is neglected).
@@ -365,13 +369,17 @@ def walker(draws=30, strides=100, trials=5, noise=1e-4):
         "compass gait": (
             gait, "heelstrike", ("n", "s", "vn", "vs"), middle, ("s", "falling"), 0.05, 2, 2,
         ),
-        "van der Pol": (oscillator, None, ("x", "v"), angle, None, 0.02, 1, 1),
-        "van der Pol, a quarter of the force": (
-            oscillator, None, ("x", "v"), angle, None, 0.005, 1, 1,
-        ),
+        "van der Pol": oscillator(0.02),
+        "van der Pol, a quarter of the force": oscillator(0.005),
     }  # fmt: skip
     for label, about in systems.items():
         walks(label, *about, draws, strides, trials, noise)
+
+
+def oscillator(force):
+    """Van der Pol's, as `walks` takes it, under a force of this rms."""
+    angle = hj.KinematicPhase(16, position="x", velocity="v")
+    return hj.models.VanDerPol(mu=0.1), None, ("x", "v"), angle, None, force, 1, 1
 
 
 def walks(
@@ -506,7 +514,7 @@ def write_trials(files, minutes, rate):
 
 ALL = (
     "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage",
-    "short", "losses", "real",
+    "products", "short", "losses", "real",
 )  # fmt: skip
 
 if __name__ == "__main__":

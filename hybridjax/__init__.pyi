@@ -56,6 +56,7 @@ from .identify.series.validation import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF
 from .linear.ldtp import LDTP as LDTP
+from .linear.scatter import Scatter as Scatter
 from .maps.linearize import linearize as linearize
 from .maps.place import place_sections as place_sections
 from .maps.placed import PlacedSections as PlacedSections

@@ -1,5 +1,5 @@
-"""Pages of the site run as they stand, and print what they show: those on how to do something, and
-the examples of the reference."""
+"""Pages of the site run as they stand, and print what they show: those on how to do something, on
+experiments, and the examples of the reference."""
 
 import pytest
 from matplotlib import pyplot
@@ -8,7 +8,8 @@ from .sessions import ROOT, Session, blocks, same_output
 
 
 FOLDERS = ("docs/how-to", "docs/reference")
-PAGES = ["docs/index.md", *(f"{x}/{p.name}" for x in FOLDERS for p in (ROOT / x).glob("*.md"))]
+PAGES = ["docs/index.md", "docs/experiments.md"]
+PAGES += [f"{x}/{p.name}" for x in FOLDERS for p in (ROOT / x).glob("*.md")]
 
 
 @pytest.mark.slow

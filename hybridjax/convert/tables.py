@@ -49,7 +49,7 @@ def to_pandas(thing: Tabular) -> Any:
     dataset = to_xarray(thing)
     if isinstance(thing, HTF):
         return dataset.drop_vars(
-            ["input_unit", "output_unit", "variance_freedom"], errors="ignore"
+            ["input_unit", "output_unit", "scatter.freedom"], errors="ignore"
         ).to_dataframe()
     row = next(iter(dataset.data_vars.values())).dims[0]
     columns = {}

@@ -50,19 +50,19 @@ class Certificate(NamedTuple):
     """e: with none can the criterion be smaller than a part 1/e of what it is."""
     relative: Float[np.ndarray, " K"]
     """Sensitivities, relative to what a cosine's power costs: 1 on the average over the power, and
-    e at most where no limit of single cosines holds."""
+    e at most. NaN where no limit that is reached holds for a cosine."""
 
 
 def certify(found: Answer, power: Float[np.ndarray, " K"], limits: PowerLimits) -> Certificate:
     """**Arguments:** `found`, the answer with these powers."""
-    bounds = np.stack([np.zeros_like(power), limits.largest], axis=1)
-    total = power @ found.sensitivity
-    best = linprog(
-        -found.sensitivity / total, limits.cost, np.ones(len(limits.cost)), bounds=bounds
-    )
-    price = -best.ineqlin.marginals @ limits.cost
-    relative = found.sensitivity / total / np.where(price > 0, price, np.nan)
-    return Certificate(float(-best.fun), -best.fun * relative)
+    # In units of the power that each cosine may have alone, since the solver's tolerances are
+    # absolute.
+    alone = 1 / limits.cost.max(axis=0)
+    gain = alone * found.sensitivity / (power @ found.sensitivity)
+    best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
+    price = -best.ineqlin.marginals @ (limits.cost * alone)
+    relative = gain / gain.max() / np.where(price > 0, price, np.nan)
+    return Certificate(float(-best.fun * gain.max()), -best.fun * relative)
 
 
 class Allocation(NamedTuple):
@@ -119,7 +119,6 @@ def _cheapest(
     r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
     prices $\mu$ of the limits, which rise where a limit is exceeded."""
     for _ in range(_PRICES):
-        power = np.minimum(a / np.sqrt(prices @ limits.cost), limits.largest)
-        use = limits.use(power)
-        prices = prices * use**2
+        power = a / np.sqrt(prices @ limits.cost)
+        prices = prices * limits.use(power) ** 2
     return limits.within(power), prices

@@ -15,12 +15,9 @@ from ..identify.multipliers.error_weights import check_values, error_weights, re
 from ..identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
 from ..linear.htf import HTF
 from .goals import Multipliers
-from .questions.multipliers import wanted_parts
+from .questions.multipliers import FEW, wanted_parts
+from .questions.question import weighted
 from .signals import Model
-
-
-# Harmonics of `fit_multipliers`, where the goal does not say.
-_FEW = (-2, -1, 0, 1, 2)
 
 
 class InformationMap(eqx.Module):
@@ -102,7 +99,7 @@ def information_map(
     if unknown or not noise:
         what = f"names '{unknown[0]}'" if unknown else "names no output"
         raise DefinitionError(f"`noise` {what}; the outputs are {', '.join(model.outputs)}.")
-    htf = _measured(model, design, noise, _FEW if goal.harmonics is None else goal.harmonics)
+    htf = _measured(model, design, noise, FEW if goal.harmonics is None else goal.harmonics)
     c = np.poly(np.asarray(model.multipliers)).real[1:]
     N, d = htf.n_sections, len(c)
     size = d * N + (N if goal.overhang is None else goal.overhang) + 1
@@ -111,7 +108,8 @@ def information_map(
     jacobians = [misfit_of(group, c).jacobian for group in groups]
     rows = [x.reshape(d, -1) for x in jacobians]
     covariance = np.linalg.inv(sum(x @ x.T for x in rows))
-    wanted, _ = wanted_parts(goal, np.asarray(model.multipliers), c)
+    wanted, names = wanted_parts(goal, np.asarray(model.multipliers), c)
+    wanted, _ = weighted(wanted, names, goal.weights)
     influence = wanted @ covariance
     if goal.criterion == "D":
         influence = np.linalg.solve(np.linalg.cholesky(influence @ wanted.T), influence)

@@ -1,5 +1,6 @@
-r"""What an experiment may cost: powers p of the cosines with $W p \le 1$ and $p \le$ `largest`."""
+r"""What an experiment may cost: powers p of the cosines with $W p \le 1$."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
@@ -10,6 +11,8 @@ from jaxtyping import Float, Int
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
 from ..errors import DefinitionError
+from ..experiments.design.design import Design
+from ..experiments.design.partition import line_class
 from .candidates import Candidates
 from .signals import Squares, rate_of
 
@@ -38,19 +41,27 @@ class Limits(eqx.Module):
 Limit = Literal["input", "output"] | Mapping[str, Positive] | Limits
 
 
+def require_inputs(limit: Limits, inputs: tuple[str, ...]) -> None:
+    """**Raises:** `DefinitionError` for rates and peaks of what is no input."""
+    for word, given in (("rate", limit.rate), ("peak", limit.peak)):
+        unknown = [n for n in given if n not in inputs]
+        if unknown:
+            raise DefinitionError(
+                f"`limit` limits the {word} of '{unknown[0]}'; the inputs are {', '.join(inputs)}."
+            )
+
+
 def peak_of(name: str) -> str:
     return f"peak of {name}"
 
 
 class PowerLimits(NamedTuple):
-    """L limits of quantities that are sums over all cosines, and one of each cosine."""
+    """L limits of sums over cosines."""
 
     names: tuple[str, ...]
     """What is limited: rms values of signals by their names, rates and peaks."""
     cost: Float[np.ndarray, "L K"]
     """W: share of each limit that a unit of a cosine's power takes."""
-    largest: Float[np.ndarray, " K"]
-    """The largest power of each cosine; infinite where there is no such limit."""
 
     def use(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " L"]:
         """Share of each limit that is used."""
@@ -58,11 +69,37 @@ class PowerLimits(NamedTuple):
 
     def within(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
         """The same proportions, as large as the limits allow."""
-        return np.minimum(power / self.use(power).max(), self.largest)
+        return power / self.use(power).max()
 
     def only(self, some: Int[np.ndarray, " k"]) -> "PowerLimits":
         """Where only these cosines are applied."""
-        return self._replace(cost=self.cost[:, some], largest=self.largest[some])
+        return self._replace(cost=self.cost[:, some])
+
+    def and_of_amplitudes(
+        self, largest: Float[np.ndarray, " K"], cosines: Candidates
+    ) -> "PowerLimits":
+        r"""These, and limits of the cosines' amplitudes in every experiment.
+
+        A cosine of power p (on the average over all experiments) that has its largest amplitude a
+        takes a share $2p / a^2$ of them, and each experiment has place for one of each class.
+        """
+        classes = line_class(cosines.line, cosines.periods)
+        limited = np.unique(classes[np.isfinite(largest)])
+        share = (classes == limited[:, None]) * 2 / largest**2
+        return self._replace(cost=np.concatenate([self.cost, share]))
+
+    def and_of_powers(self, largest: Float[np.ndarray, " K"]) -> "PowerLimits":
+        """These, and the largest power of each cosine."""
+        return self._replace(cost=np.concatenate([self.cost, np.diag(1 / largest)]))
+
+    def require_limits(self) -> None:
+        """**Raises:** `DefinitionError` if some cosine is not limited."""
+        free = self.cost.max(axis=0) == 0
+        if free.any():
+            raise DefinitionError(
+                f"no limit reaches cosine {int(np.argmax(free))} of the design: limit the input, "
+                "too."
+            )
 
 
 def power_limits(
@@ -70,7 +107,6 @@ def power_limits(
     squares: list[Squares],
     ports: dict[Literal["input", "output"], tuple[str, ...]],
     usual: Float[np.ndarray, " K"],
-    largest: Float[np.ndarray, " K"],
 ) -> PowerLimits:
     """They hold for each of the models. A peak is no smaller than an rms value.
 
@@ -79,8 +115,7 @@ def power_limits(
     - `squares`: of each model. `ports`: names of inputs and of outputs.
     - `usual`: powers with which nothing is to be larger, where `limit` is a word.
 
-    **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies, or
-    that leave the power of some cosine unlimited.
+    **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies.
     """
     if isinstance(limit, str):
         levels = [{n: float(np.sqrt(one[n] @ usual)) for n in ports[limit]} for one in squares]
@@ -88,7 +123,7 @@ def power_limits(
         given = limit if isinstance(limit, Limits) else Limits(limit)
         level = _levels(given, ports["input"], squares[0])
         levels = [level for _ in squares]
-    silent = [n for n, rms in levels[0].items() if rms == 0]
+    silent = [n for level in levels for n, rms in level.items() if rms == 0]
     if silent:
         raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
     cost = np.stack(
@@ -98,14 +133,7 @@ def power_limits(
             for n, rms in level.items()
         ]
     )
-    if not (largest > 0).any():
-        raise DefinitionError("`largest` is zero at all frequencies: no cosine may be applied.")
-    free = (cost.max(axis=0) == 0) & np.isinf(largest)
-    if free.any():
-        raise DefinitionError(
-            f"no limit reaches cosine {int(np.argmax(free))} of the design: limit the input, too."
-        )
-    return PowerLimits(tuple(levels[0]), np.unique(cost, axis=0), largest)
+    return PowerLimits(tuple(levels[0]), np.unique(cost, axis=0))
 
 
 def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[str, float]:
@@ -116,30 +144,46 @@ def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[st
         what = f"limits '{unknown[0]}'" if unknown else "limits nothing"
         known = ", ".join(n for n in squares if n not in rates)
         raise DefinitionError(f"`limit` {what}; what can be limited is the rms value of {known}.")
-    for word, given in (("rate", limit.rate), ("peak", limit.peak)):
-        unknown = [n for n in given if n not in inputs]
-        if unknown:
-            raise DefinitionError(
-                f"`limit` limits the {word} of '{unknown[0]}'; the inputs are {', '.join(inputs)}."
-            )
+    require_inputs(limit, inputs)
     level = {str(n): float(x) for n, x in limit.rms.items()}
     level |= {rate_of(n): float(x) for n, x in limit.rate.items()}
     return level | {peak_of(n): float(x) for n, x in limit.peak.items()}
 
 
-def largest_power(
-    largest: float | Callable[[np.ndarray], np.ndarray] | None, cosines: Candidates, count: int
-) -> Float[np.ndarray, " K"]:
-    """The largest mean square of each cosine, if it stands in one of `count` experiments only."""
+Largest = float | Callable[[np.ndarray], np.ndarray] | None
+"""Amplitude that a cosine may have in an experiment, as a function of its frequency."""
+
+
+def largest_amplitudes(largest: Largest, f: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+    """Infinite where there is no limit.
+
+    **Raises:** `DefinitionError` for anything but numbers that are not negative.
+    """
     if largest is None:
-        return np.full(len(cosines.f), np.inf)
-    given = np.asarray(largest(cosines.f) if callable(largest) else largest)
-    if given.dtype.kind not in "fiu" or given.shape not in ((), cosines.f.shape):
+        return np.full(len(f), np.inf)
+    given = np.asarray(largest(f) if callable(largest) else largest)
+    if given.dtype.kind not in "fiu" or given.shape not in ((), f.shape):
         raise DefinitionError("`largest` must give a real number for each frequency.")
-    amplitude = np.broadcast_to(given, cosines.f.shape)
+    amplitude = np.broadcast_to(given, f.shape)
     if not (amplitude >= 0).all():
         raise DefinitionError("`largest` must give amplitudes that are not negative.")
-    return amplitude**2 / (2 * count)
+    return amplitude
+
+
+def without_forbidden(design: Design, largest: Largest) -> Design:
+    """The lines of a design that may be applied, none of them larger than it may be; experiments
+    without any are left out.
+
+    **Raises:** `DefinitionError` as `largest_amplitudes`, and if none is left.
+    """
+    most = largest_amplitudes(largest, design.line / design.periods)
+    kept = most > 0
+    if not kept.any():
+        raise DefinitionError("`largest` is zero at all frequencies: no cosine may be applied.")
+    used, experiment = np.unique(design.experiment[kept], return_inverse=True)
+    parts = {n: getattr(design, n)[kept] for n in ("line", "channel", "phase")}
+    parts["amplitude"] = np.minimum(design.amplitude, most)[kept]
+    return dataclasses.replace(design, experiment=experiment, experiments=len(used), **parts)
 
 
 def experiments_within(

@@ -102,9 +102,14 @@ class OptimalDesign(eqx.Module):
         **Arguments:** `cycles`, its length; `kind`: normal values, or two values of the same
         size, whose spectrum is close to that of the design at best: `RandomInput.power` says which.
 
-        **Raises:** `DefinitionError` for an odd number of samples.
+        **Raises:** `DefinitionError` for an odd number of samples, and for fewer cycles than the
+        periods of the design, which do not tell its lines apart.
         """
         N, P = self.design.n_sections, self.design.periods
+        if cycles < P:
+            raise DefinitionError(
+                f"{cycles} cycles do not tell lines apart that differ by 1/{P}: take {P} or more."
+            )
         if N * cycles % 2:
             raise DefinitionError(f"{cycles} cycles of {N} sections are an odd number of samples.")
         lines = np.rint(self.frequencies * P).astype(int)

@@ -11,24 +11,27 @@ from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
 from .._core.progress import working
+from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
 from .allocation import Allocation, allocate
 from .candidates import Candidates
 from .goals import Goal, Multipliers
-from .grouping import to_design, worthwhile
+from .grouping import places, to_design, worthwhile
 from .limits import (
+    Largest,
     Limit,
     Limits,
     PowerLimits,
     experiments_within,
-    largest_power,
+    largest_amplitudes,
     power_limits,
+    without_forbidden,
 )
 from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
-from .peaks import below_peaks, scaled_below
+from .peaks import below_peaks
 from .questions.question import AbstractQuestion
 from .questions.question_of import question_of
 from .signals import Model, mean_squares, rms_of
@@ -39,6 +42,9 @@ from .signals import Model, mean_squares, rms_of
 # distortion hides.
 _NEGLIGIBLE = (2e-3, 1e-4, 0.0)
 _AS_GOOD = 1.01
+# Times that the usual design is scaled to the limits, since cosines at their largest amplitude do
+# not grow with the others. Doubled: nothing, unless nearly all are at theirs.
+_SCALINGS = 10
 
 
 @checked
@@ -104,16 +110,20 @@ def optimal_design(
     _check_alike(models, usual)
     cosines = Candidates.of(usual)
     squares = [mean_squares(one, cosines) for one in models]
-    count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
-    most = largest_power(largest, cosines, count)
     ports = {"input": models[0].inputs, "output": models[0].outputs}
-    limits = power_limits(limit, squares, ports, cosines.power_of(usual), most)
+    limits = power_limits(limit, squares, ports, cosines.power_of(usual))
     peak = dict(limit.peak) if isinstance(limit, Limits) else {}
 
-    # The usual proportions, as large as the limits allow.
-    root = np.sqrt(1 / limits.use(cosines.power_of(usual)).max())
-    usual = dataclasses.replace(usual, amplitude=usual.amplitude * root)
-    usual = scaled_below(usual, peak, each=False)
+    usual, most = without_forbidden(usual, largest), largest_amplitudes(largest, cosines.f)
+    allowed = np.flatnonzero(most > 0)
+    cosines, limits, most = cosines.only(allowed), limits.only(allowed), most[allowed]
+    squares = [{name: square[allowed] for name, square in one.items()} for one in squares]
+    count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
+    usual = _as_large_as_allowed(usual, limits, cosines, largest)
+    sums, limits = limits, limits.and_of_amplitudes(most, cosines)
+    limits.require_limits()
+    if peak:
+        usual = below_peaks(usual, peak, seed)
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
     shown += [name for name in limits.names if name in squares[0] and name not in shown]
@@ -123,17 +133,24 @@ def optimal_design(
     question = question_of(goal, models, cosines, errors, usual_power, robust)
 
     before = question.answer(usual_power)
-    allowed = np.flatnonzero(most > 0)
-    ideal = allocate(question.only(allowed), limits.only(allowed), usual_power[allowed], max_steps)
-    kept, best = _with_fewer(question, limits, cosines, (allowed, ideal), count, max_steps)
-    power, relative = np.zeros_like(usual_power), np.zeros_like(usual_power)
-    power[kept], relative[allowed] = best.power, ideal.certificate.relative
-    made = to_design(cosines, power, power * limits.cost.mean(axis=0), count, usual, seed)
-    after = best.answer
+    ideal = allocate(question, limits, usual_power, max_steps)
+    kept, best = _with_fewer(question, limits, cosines, ideal, count, max_steps)
+    one = most**2 / (2 * count)
+    share = limits.cost.mean(axis=0)
+    counts = places(cosines.only(kept), best.power * share[kept], best.power / one[kept], count)
+    if np.isfinite(most).any():
+        # What each may have where it stands.
+        sums = sums.only(kept).and_of_powers(counts * one[kept])
+        best = allocate(question.only(kept), sums, best.power, max_steps)
+    made = to_design(
+        cosines.only(kept), best.power, best.power * share[kept], counts, most[kept], count, usual,
+        seed,
+    )  # fmt: skip
+    after = free = question.only(kept).answer(cosines.power_of(made)[kept])
     if peak:
         made = below_peaks(made, peak, seed)
-        power = cosines.power_of(made)
-        after = question.only(kept).answer(power[kept])
+        after = question.only(kept).answer(cosines.power_of(made)[kept])
+    power = cosines.power_of(made)
     shorter = usual.experiments / count
     return OptimalDesign(
         design=made,
@@ -144,12 +161,12 @@ def optimal_design(
         criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
         certificate=ideal.certificate.excess * after.criterion / ideal.answer.criterion,
-        for_peaks=after.criterion / best.answer.criterion,
+        for_peaks=after.criterion / free.criterion,
         frequencies=cosines.f,
         channels=cosines.channel,
         power=power,
         usual_power=usual_power,
-        sensitivity=relative,
+        sensitivity=ideal.certificate.relative,
         limited=limits.names,
         rms=rms_of(squares, shown, power),
         usual_rms=usual_rms,
@@ -160,23 +177,32 @@ def _with_fewer(
     question: AbstractQuestion,
     limits: PowerLimits,
     cosines: Candidates,
-    ideal: tuple[Int[np.ndarray, " allowed"], Allocation],
+    ideal: Allocation,
     count: int,
     max_steps: int,
 ) -> tuple[Int[np.ndarray, " kept"], Allocation]:
     """The cosines that matter, as so many experiments can hold, and their powers.
 
-    **Arguments:** `ideal`, the cosines that are allowed, with their best powers.
+    **Arguments:** `ideal`, the best powers of all.
     """
-    allowed, found = ideal
+    gain = ideal.power * ideal.answer.sensitivity
     for negligible in _NEGLIGIBLE:
-        gain = found.power * found.answer.sensitivity
-        some = np.flatnonzero(worthwhile(cosines.only(allowed), gain, count, negligible))
-        kept = allowed[some]
-        best = allocate(question.only(kept), limits.only(kept), found.power[some], max_steps)
-        if best.answer.criterion < _AS_GOOD * found.answer.criterion:
+        kept = np.flatnonzero(worthwhile(cosines, gain, count, negligible))
+        best = allocate(question.only(kept), limits.only(kept), ideal.power[kept], max_steps)
+        if best.answer.criterion < _AS_GOOD * ideal.answer.criterion:
             break
     return kept, best
+
+
+def _as_large_as_allowed(
+    design: Design, limits: PowerLimits, cosines: Candidates, largest: Largest
+) -> Design:
+    """The same proportions, but where a cosine has its largest amplitude."""
+    for _ in range(_SCALINGS):
+        root = np.sqrt(1 / limits.use(cosines.power_of(design)).max())
+        design = dataclasses.replace(design, amplitude=design.amplitude * root)
+        design = without_forbidden(design, largest)
+    return design
 
 
 def _check_alike(models: list[Model], design: Design) -> None:
@@ -186,8 +212,9 @@ def _check_alike(models: list[Model], design: Design) -> None:
         for name in ("n_sections", "inputs", "outputs"):
             if getattr(one, name) != getattr(first, name):
                 raise DefinitionError(f"model {k} has other {name} than model 0.")
-    if design.n_sections != first.n_sections or len(design.input_names) != len(first.inputs):
+    if design.n_sections != first.n_sections or design.input_names != first.inputs:
         raise DefinitionError(
-            f"the design has {design.n_sections} sections and {len(design.input_names)} inputs, "
-            f"the model {first.n_sections} and {len(first.inputs)}."
+            f"the design has {design.n_sections} sections and the inputs "
+            f"{listed(design.input_names)}, the model {first.n_sections} and "
+            f"{listed(first.inputs)}."
         )

@@ -18,21 +18,11 @@ def below_peaks(design: Design, peak: dict[str, float], seed: int) -> Design:
         # (Alone, so that a line that stands in several experiments may have any phase.)
         phase[here] = optimize_phases(_one(design, here), seed).phase
     design = dataclasses.replace(design, phase=phase)
-    return scaled_below(design, peak, each=True)
-
-
-def scaled_below(design: Design, peak: dict[str, float], each: bool) -> Design:
-    """The design with amplitudes made smaller where a signal exceeds its peak.
-
-    **Arguments:** `each`: each signal of each experiment by itself, else all by the same factor.
-    """
-    factor, highest = np.ones((design.experiments, len(design.input_names))), None
+    highest = np.abs(design.inputs()).max(axis=1)
+    factor = np.ones_like(highest)
     for name, most in peak.items():
         i = design.input_names.index(name)
-        highest = np.abs(design.inputs()).max(axis=1) if highest is None else highest
         factor[:, i] = most / np.maximum(highest[:, i], most)
-    if not each:
-        factor[:] = factor.min()
     amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
     return dataclasses.replace(design, amplitude=amplitude)
 

@@ -1,17 +1,21 @@
 """The part of the cycle in which pushes tell most."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Count
+from .._core.boundary.kinds import Count, Positive
 from .._core.progress import working
-from ..errors import DefinitionError
+from ..experiments.design.design import Design
 from ..linear.ldtp import LDTP
+from .goals import Multipliers, Order
+from .limits import Limits
+from .noise import NoiseLike
 from .optimal_design import OptimalDesign
+from .optimize import optimal_design
 from .window import Window
 
 
@@ -43,7 +47,7 @@ class WindowChoice(eqx.Module):
     @property
     def saved(self) -> float:
         """How many strides with pushes in the whole cycle one stride with this window replaces."""
-        return float(self.criterion[0] / self.criterion.min())
+        return float(self.criterion[0] / self.plan.criterion)
 
     def __repr__(self) -> str:
         rows = ["WindowChoice", "  sections          criterion  certificate"]
@@ -60,7 +64,13 @@ class WindowChoice(eqx.Module):
 @checked
 @working("choose_window")
 def choose_window(
-    model: LDTP, plan: Callable[[LDTP], OptimalDesign], shortest: Count = 1
+    model: LDTP,
+    design: Design,
+    *,
+    noise: NoiseLike,
+    limit: Mapping[str, Positive] | Limits,
+    goal: Multipliers | Order | None = None,
+    shortest: Count = 1,
 ) -> WindowChoice:
     """The arc of the cycle in which pushes answer the question in the fewest strides.
 
@@ -69,29 +79,27 @@ def choose_window(
     window is better is not proved.
 
     ```python
-    choice = hj.designs.choose_window(
-        model, lambda m: hj.optimal_design(m, usual, noise=noise, limit={"yM": 0.01, "vM": 0.05})
-    )
+    limit = {"yM": 0.01, "vM": 0.05}
+    choice = hj.designs.choose_window(model, usual, noise=noise, limit=limit)
     ```
 
     **Arguments:**
 
-    - `plan`: the optimal design for a model; `noise` and `limit` must be numbers, since what is
-      relative to the usual design is another thing for each window.
+    - `design`, `noise`, `limit`: as for `optimal_design`, but in numbers: what is relative to a
+      design is another thing for each window. `goal`: by default all multipliers.
     - `shortest`: the smallest number of sections.
 
-    **Raises:** `DefinitionError` if `plan` returns something else.
+    **Raises:** `DefinitionError` as `optimal_design`.
     """
+    goal = Multipliers() if goal is None else goal
     N = model.n_sections
     tried: dict[tuple[int, int], OptimalDesign] = {}
 
     def attempt(first: int, length: int) -> float:
         key = first % N, length
         if key not in tried:
-            found = plan(_window(*key, N).seen_from_signal(model))
-            if not isinstance(found, OptimalDesign):
-                raise DefinitionError("`plan` must return what `optimal_design` does.")
-            tried[key] = found
+            seen = _window(*key, N).seen_from_signal(model)
+            tried[key] = optimal_design(seen, design, goal=goal, noise=noise, limit=limit)
         return tried[key].criterion
 
     best = (0, N)

@@ -35,7 +35,7 @@ class ProcessNoise:
     memory: NonNegative = 0.0
 
     def __post_init__(self):
-        if np.ndim(self.std) > 1:
+        if np.ndim(self.std) > 1 or np.size(self.std) == 0:
             raise DefinitionError(
                 f"ProcessNoise: `std` must be one number, or one for each section, not of shape "
                 f"{np.shape(self.std)}."
@@ -75,7 +75,7 @@ def with_memory(
     white: Float[np.ndarray, "S n k"], memory: float, n_sections: int
 ) -> Float[np.ndarray, "S n k"]:
     """Series of the same variance, stationary, with a correlation time of `memory` cycles."""
-    if memory == 0:
+    if memory == 0 or white.shape[1] == 0:
         return white
     from scipy.signal import lfilter  # takes long to import
 

@@ -20,6 +20,7 @@ from .._core.text import listed
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .frequency_response import Frequencies, Harmonics, check_harmonics
+from .scatter import Scatter
 
 
 # Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
@@ -61,8 +62,7 @@ class HTF(eqx.Module):
       be seen; None where they do not.
     - `noise_variance` (M, F, ny, nu): the part of it that is noise, from repeated periods. The
       rest is nonlinear distortion, which random phases make random. None where it was not split.
-    - `variance_freedom` (F,): complex degrees of freedom of `variance`; None where it is known
-      exactly.
+    - `scatter`: how well `variance` is known; None where it is known exactly.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
@@ -71,7 +71,7 @@ class HTF(eqx.Module):
     H: Complex[Array, "M F ny nu"]
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
-    variance_freedom: Float[Array, " F"] | None
+    scatter: Scatter | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -90,7 +90,7 @@ class HTF(eqx.Module):
         *,
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
-        variance_freedom: Annotated[Numbers, Reals("F", sign="positive")] | None = None,
+        scatter: Scatter | None = None,
     ):
         require_x64()
         self.f, self.H = from_host((f, H.astype(complex)))
@@ -109,7 +109,10 @@ class HTF(eqx.Module):
         self.source = source
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
-        self.variance_freedom = _optional("variance_freedom", variance_freedom, self.f.shape)
+        self.scatter = scatter
+        if scatter is not None:
+            _optional("scatter.freedom", scatter.freedom, self.f.shape)
+            _optional("scatter.roundness", scatter.roundness, shape)
 
     def __repr__(self) -> str:
         count = self.f.shape[-1]
@@ -162,8 +165,7 @@ class HTF(eqx.Module):
         """The same with fewer harmonics."""
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
-        variance, noise = (None if v is None else v[rows] for v in self._variances)
-        return self._with(self.f, self.H[rows], harmonics, variance, noise, self.variance_freedom)
+        return self._with(self.f, lambda x: x[rows], harmonics)
 
     def at(self, f: Frequencies) -> "HTF":
         """The same at fewer frequencies (F,), in this order (host side).
@@ -181,19 +183,15 @@ class HTF(eqx.Module):
                 f"f = {wanted[lost][0]:.10g} was not excited or not measured; the nearest one is "
                 f"{known[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
             )
-        variance, noise = (None if v is None else v[:, nearest] for v in self._variances)
-        known_by = self.variance_freedom
-        freedom = None if known_by is None else known_by[nearest]
-        return self._with(
-            self.f[nearest], self.H[:, nearest], self.harmonics, variance, noise, freedom
-        )
+        return self._with(self.f[nearest], lambda x: x[:, nearest], self.harmonics)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
-        $r^2 = v\, F_{2, 2\nu}(level) = v\, \nu\, ((1 - level)^{-1/\nu} - 1)$ for the variance $v$
-        with $\nu$ complex degrees of freedom: the error is complex normal, and $v$ was estimated
-        from few experiments. The true value is the best linear approximation for inputs of the
+        $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. Where it was estimated from
+        few experiments, discs are larger (`Scatter.quantile`). They are right for complex normal
+        errors, and nearly so where one product of two cosines makes errors of equal moduli, from
+        four realizations on. The true value is the best linear approximation for inputs of the
         kind that was applied, not the response to infinitely small ones.
 
         **Raises:** `DefinitionError` without `variance`.
@@ -203,11 +201,9 @@ class HTF(eqx.Module):
                 "the HTFs have no variance: estimate them from several realizations of the "
                 "design or from repeated periods."
             )
-        if self.variance_freedom is None:
+        if self.scatter is None:
             return jnp.sqrt(-np.log1p(-level) * self.variance)
-        freedom = self.variance_freedom
-        quantile = freedom * jnp.expm1(-np.log1p(-level) / freedom)
-        return jnp.sqrt(quantile[:, None, None] * self.variance)
+        return jnp.sqrt(self.scatter.quantile(level) * self.variance)
 
     def interpolate(self, f: Frequencies) -> "HTF":
         """The HTFs at other frequencies, by cubic splines between neighbors (host side).
@@ -254,16 +250,11 @@ class HTF(eqx.Module):
             )
 
         def linear(values):
-            if values is None:
-                return None
             line = make_interp_spline(*self._neighbors(values), k=1, axis=1)
             return line(place)
 
-        freedom = self.variance_freedom
-        if freedom is not None:
-            freedom = linear(freedom[None, :, None, None] + 0 * self.H.real)[0, :, 0, 0]
-        variance, noise = map(linear, self._variances)
-        return self._with(wanted, H, self.harmonics, variance, noise, freedom)
+        found = self._with(wanted, linear, self.harmonics)
+        return eqx.tree_at(lambda x: x.H, found, from_host(H))
 
     def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -342,14 +333,19 @@ class HTF(eqx.Module):
         """The largest of `harmonic_errors`, per output."""
         return jnp.max(self.harmonic_errors(other), axis=0)
 
-    @property
-    def _variances(self):
-        return self.variance, self.noise_variance
-
-    def _with(self, f, H, harmonics, variance, noise_variance, freedom):
+    def _with(self, f, change, harmonics):
+        """The same at other places; `change` does it to each array that is like `H`."""
+        scatter = self.scatter
+        if scatter is not None:
+            freedom = jnp.broadcast_to(scatter.freedom[:, None, None], self.H.shape)
+            roundness = None if scatter.roundness is None else change(scatter.roundness)
+            scatter = Scatter(change(freedom)[0, :, 0, 0], roundness)
+        variance, noise = (
+            None if v is None else change(v) for v in (self.variance, self.noise_variance)
+        )
         return HTF(
-            f, H, harmonics, self.n_sections, self.inputs, self.outputs, self.source,
-            variance=variance, noise_variance=noise_variance, variance_freedom=freedom,
+            f, change(self.H), harmonics, self.n_sections, self.inputs, self.outputs, self.source,
+            variance=variance, noise_variance=noise, scatter=scatter,
         )  # fmt: skip
 
     def _circle(self, f):

@@ -140,8 +140,9 @@ def strides(
         reached: list[float] = [plan.strides]
         for k, (label, given) in enumerate((studies or {}).items()):
             several = [given] if isinstance(given, Study) else list(given)
+            color = CYCLE[k % len(CYCLE)]
             for number, one in enumerate(several):
-                reached += _steps(panel, one, label if number == 0 else None, CYCLE[k])
+                reached += _steps(panel, one, label if number == 0 else None, color)
         low, high = min(reached) / 1.5, max(reached) * 1.5
         for errors, cycles, color, label in (
             (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], "equal amplitudes"),

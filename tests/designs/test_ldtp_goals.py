@@ -77,6 +77,21 @@ def test_only_outputs_that_are_measured_count(model, usual):
     assert one.usual_criterion > both.usual_criterion
 
 
+def test_multipliers_are_counted_as_the_model_has_them():
+    """Of three, the first of which no input reaches."""
+    A, one = np.diag([0.9, 0.6, 0.3]), np.array([0.0, 1.0, 1.0])
+    model = hj.LDTP(np.stack([A, np.eye(3)]), np.stack([one, one])[..., None], np.ones((2, 1, 3)))
+    usual = hj.multisine(2, 32, band=(0, 1))
+
+    def plan(which):
+        goal = hj.designs.Multipliers(which, estimator="fit_ldtp")
+        return hj.optimal_design(model, usual, goal=goal, noise={"y": 0.01})
+
+    assert plan(1).names == ("0.6",) and plan(2).names == ("0.3",)
+    with pytest.raises(hj.DefinitionError, match=r"no input reaches.*the multiplier 0\.9"):
+        plan(0)
+
+
 def test_a_model_without_matrices_is_refused(model, usual):
     fit = hj.fit_multipliers(expected(model, usual, (-1, 0, 1)), 2, check=False)
     with pytest.raises(hj.DefinitionError, match="needs a model with matrices"):

@@ -134,6 +134,53 @@ def test_fewer_experiments_hold_fewer_lines(isochron_ldtp, usual, plan):
     assert found.saved > 0.8 * plan.saved
 
 
+@pytest.mark.parametrize("limit", ["input", "output"])
+def test_units_do_not_matter(isochron_ldtp, usual, limit):
+    """Newtons, piconewtons and meganewtons."""
+    found = [
+        hj.optimal_design(isochron_ldtp, usual.scaled(rms), limit=limit)
+        for rms in (1e-12, 0.01, 1e6)
+    ]
+    for one in found:
+        assert one.certificate == pytest.approx(found[1].certificate, rel=1e-6)
+        assert one.saved == pytest.approx(found[1].saved, rel=1e-6)
+
+
+def test_nothing_within_amplitudes_is_better_than_the_certificate_says(isochron_ldtp, usual):
+    """Beside experiments in which the best lines of each class take turns, as large as allowed."""
+    limit = {"u": 0.01}
+    plan = hj.optimal_design(isochron_ldtp, usual, largest=0.006, noise=NOISE, limit=limit)
+    assert plan.design.amplitude.max() <= 0.006 and plan.saved >= 1 / plan.certificate
+    classes = np.minimum(plan.design.line % 32, -plan.design.line % 32)
+    strongest, rng, f = plan.power * plan.sensitivity, np.random.default_rng(0), []
+    line = np.rint(plan.frequencies * 32).astype(int)
+    each = [np.flatnonzero(np.minimum(line % 32, -line % 32) == c) for c in np.unique(classes)]
+    for e in range(usual.experiments):
+        best = [k[np.argsort(-strongest[k])][e % min(4, len(k))] for k in each]
+        f.append(np.sort(plan.frequencies[best]))
+    other = hj.Design.from_lines(
+        f, 0.006, [rng.uniform(0, 6, len(one)) for one in f], n_sections=32, periods=32
+    )
+    rms = float(np.sqrt(np.mean(other.inputs() ** 2)))
+    found = hj.optimal_design(isochron_ldtp, other, noise=NOISE, limit={"u": rms})
+    assert found.usual_criterion * (1 + 1e-9) > plan.criterion / plan.certificate
+    assert plan.certificate < 1.3
+
+
+def test_the_usual_design_keeps_to_amplitudes(isochron_ldtp, usual):
+    """What is saved is compared with experiments that are allowed as well."""
+    plan = hj.optimal_design(
+        isochron_ldtp, usual, noise=NOISE, largest=lambda f: 0.004 * (f > 1), limit={"u": 0.1}
+    )
+    assert plan.usual.frequencies.min() > 1 and plan.usual.amplitude.max() <= 0.004
+    assert plan.saved >= 1 / plan.certificate
+
+
+def test_inputs_have_the_names_of_the_model(isochron_ldtp):
+    with pytest.raises(hj.DefinitionError, match="the inputs F, the model 32 and u"):
+        hj.optimal_design(isochron_ldtp, hj.multisine(periods=32, inputs=("F",)))
+
+
 @pytest.mark.parametrize(
     "goal",
     [

@@ -35,6 +35,16 @@ def variance(model, design):
     return np.trace(hj.identify.multiplier_bound(model, htf).multiplier_covariances[0])
 
 
+def test_the_worst_of_small_numbers(usual):
+    """Sixteenth powers of 1e-30 are zero."""
+    models = [of(0.8), of(1.6)]
+    about = dict(goal=GOAL, limit={"u": 0.1}, robust="worst")
+    large, small = (
+        hj.optimal_design(models, usual, noise={"y": noise}, **about) for noise in (0.02, 2e-15)
+    )
+    assert small.saved == pytest.approx(large.saved, rel=0.01)
+
+
 def test_the_mean_over_models(usual):
     models = [of(0.8), of(1.6), of(2.4)]
     both = plan(models, usual)

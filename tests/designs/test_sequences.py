@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.designs.sequences import random_sequence
 
 
 NOISE = {"y0": 0.01, "y1": 0.02}
@@ -44,6 +45,22 @@ def test_the_spectrum_is_as_said(plan, kind):
     assert made[0].power.sum() == pytest.approx(plan.power.sum(), rel=0.1)
 
 
+def test_the_arcsine_law():
+    """A binary sequence has a smooth spectrum as it is wanted; 0.2 would be missed without the
+    law."""
+    f = np.arange(1, 96) / 32
+    power = 1 / (1 + f**2)
+    shape = (6, 32, 320, 1)
+    made = random_sequence(np.arange(1, 96), np.zeros(95, int), power, shape, "binary", 0)
+    assert np.abs(made.power - power).sum() < 0.05 * power.sum()
+
+
+@pytest.mark.parametrize("cycles", [1, 16, 31])
+def test_sequences_that_do_not_tell_lines_apart(plan, cycles):
+    with pytest.raises(hj.DefinitionError, match=f"{cycles} cycles do not tell lines apart"):
+        plan.sequence(cycles)
+
+
 def test_two_values(plan):
     u = plan.sequence(64, "binary").u
     np.testing.assert_allclose(np.abs(u), np.full(u.shape, 0.1), rtol=1e-3)
@@ -57,7 +74,7 @@ def test_an_odd_number_of_samples_is_refused():
         model, hj.multisine(3, 32, band=(0, 1.5)), goal=hj.designs.Multipliers(harmonics=0)
     )
     with pytest.raises(hj.DefinitionError, match="odd number of samples"):
-        plan.sequence(5)
+        plan.sequence(33)
 
 
 @pytest.mark.slow

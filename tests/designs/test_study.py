@@ -138,6 +138,9 @@ def test_repeated_windows_count(model, first):
         (dict(goal=hj.designs.Multipliers(weights=(1.0, 2.0))), "may have no weights"),
         (dict(limit=hj.designs.Limits(strides=3)), "ends at a precision"),
         (dict(standard_error=0.0), "positive"),
+        (dict(goal=hj.designs.Multipliers(4)), "no multiplier 4, the order is 2"),
+        (dict(limit=hj.designs.Limits(peak={"x": 1.0})), "the peak of 'x'; the inputs are u"),
+        (dict(largest=lambda f: 0 * f), "`largest` is zero at all frequencies"),
     ],
 )
 def test_bad_arguments(first, arguments, message):
@@ -156,5 +159,41 @@ def test_bad_data(model, first):
         study.add(failed)
     with pytest.raises(hj.DefinitionError, match="4 sections and 1 inputs, the study 8 and 1"):
         study.add(hj.ExperimentData(data.u, data.y, n_sections=4, periods=32))
-    with pytest.raises(hj.DefinitionError, match="no multiplier 4, the order is 2"):
-        hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(4)).add(data)
+
+
+@pytest.fixture(scope="module")
+def from_the_cycle(model, first):
+    """With 20 cycles discarded, after which 0.5 of the transient is left."""
+    data = hj.experiments.simulate_experiments(model, first, discard=20)
+    return hj.experiments.add_noise(data, std=list(NOISE.values()), seed=1)
+
+
+def test_what_is_left_of_the_start_is_refused(model, first, from_the_cycle):
+    study = hj.designs.Study(first, 2, 1e-3)
+    with pytest.raises(
+        hj.DefinitionError, match="of the start's transient is left"
+    ):
+        study.add(from_the_cycle)
+    found = study.add(hj.identify.remove_transient(from_the_cycle, 2).data)
+    assert found.fit.contains(model.multipliers, 0.999).all()
+
+
+def test_a_transient_that_is_gone_is_none(model, first):
+    """300 cycles of a multiplier of 0.97 leave 1e-4 of it."""
+    gone = hj.experiments.simulate_experiments(model, first, discard=300)
+    noisy = hj.experiments.add_noise(gone, std=list(NOISE.values()), seed=1)
+    assert hj.designs.Study(first, 2, 1e-3).add(noisy).blocks == 1
+
+
+def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
+    """Where Student's intervals are half as wide again, a study is not done at the standard error
+    that was asked, and the next block is longer by 1.5 squared, or as long as it may be."""
+    known = hj.designs.Study(first, 2, 1.0).add(measured(model, first))
+    error = known.standard_errors[0, 0]
+    asked = 1.2 * error
+    assert hj.designs.Study(first, 2, asked).add(measured(model, first)).done
+    half = hj.designs.Study(first, 2, 0.4 * error).add(measured(model, first))
+    monkeypatch.setattr("hybridjax.designs.studies.study._student", lambda fit: 1.5)
+    assert not hj.designs.Study(first, 2, asked).add(measured(model, first)).done
+    wider = hj.designs.Study(first, 2, 0.4 * error).add(measured(model, first))
+    assert wider.plan.strides > half.plan.strides

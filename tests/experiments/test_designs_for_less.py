@@ -141,7 +141,7 @@ def test_crest_factors(hopper):
         hj.estimate_htf(data, 0, repeats=2, variance="total")
     auto = hj.estimate_htf(data, 0, repeats=2)
     assert auto.noise_variance is None
-    np.testing.assert_array_equal(auto.variance_freedom, 2)
+    np.testing.assert_array_equal(auto.scatter.freedom, 2)
     with pytest.raises(hj.DefinitionError, match="belong together in several experiments"):
         hj.experiments.optimize_phases(
             hj.multisine(4, 8, (0, 2.0), inputs=2, division="orthogonal")

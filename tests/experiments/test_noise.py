@@ -45,6 +45,11 @@ def test_white_noise_is_one_draw_for_each_sample():
     np.testing.assert_array_equal(x[0], 0.7 * np.random.default_rng((5, 4)).normal(size=(6, 2)))
 
 
+@pytest.mark.parametrize("memory", [0.0, 1.0])
+def test_there_may_be_no_samples(memory):
+    assert ProcessNoise(1.0, memory=memory).draw((2, 0, 1), 2).shape == (2, 0, 1)
+
+
 def test_noise_does_not_depend_on_the_parts_in_which_it_is_drawn():
     noise = ProcessNoise(STD, seed=2, memory=1.0)
     whole = noise.draw((7, 5 * N, 1), N)
@@ -85,5 +90,6 @@ def test_other_numbers_of_sections_are_refused(data, hopper_cycle, placed_isochr
             run()
     with pytest.raises(hj.DefinitionError, match=r"or of shape \(8, 2\)"):
         hj.experiments.add_noise(data, std=np.ones((3, 2)))
-    with pytest.raises(hj.DefinitionError, match="one for each section"):
-        ProcessNoise(np.ones((N, 2)))
+    for std in (np.ones((N, 2)), ()):
+        with pytest.raises(hj.DefinitionError, match="one for each section"):
+            ProcessNoise(std)

@@ -300,9 +300,12 @@ def designs(t):
         "data": instance(t.design), "design": instance(t.model),
     }  # fmt: skip
     yield "choose_window", hj.designs.choose_window, dict(
-        model=t.model, plan=lambda m: t.plan
+        model=t.model, design=t.design, noise={n: 0.01 for n in t.model.outputs},
+        limit={n: 0.1 for n in t.model.inputs}, shortest=t.model.n_sections,
     ), {
-        "model": instance(t.design), "plan": [*CALLABLE, lambda m: 3], "shortest": COUNT,
+        "model": instance(t.design), "design": instance(t.model, other),
+        "noise": [None, 3, "nope", {}, {"nope": 1.0}], "limit": [None, 3, "input", {}, Other()],
+        "goal": optional([3, "nope", Other()]), "shortest": COUNT,
     }  # fmt: skip
     yield "Study", hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0), {
         "first": instance(t.model, t.design), "order": COUNT, "standard_error": POSITIVE,

@@ -241,14 +241,19 @@ def linear(t):
     size = np.ones(H.shape)
     yield "HTF", hj.HTF, dict(
         f=f, H=H, harmonics=(-1, 0, 1), n_sections=6, variance=size, noise_variance=size,
-        variance_freedom=np.ones(len(f)),
+        scatter=hj.Scatter(np.ones(len(f)), size),
     ), {
         "f": array(f), "H": [*array(H.real)[:7], H[:1], H[..., :1], H * NAN], "n_sections": LIMITED,
         "harmonics": [None, *HARMONICS], "inputs": NEW_NAMES, "outputs": NEW_NAMES,
         "source": [None, 3], "variance": ["abc", size[:1], -size, size + 1j],
         "noise_variance": ["abc", size[:1], -size, size + 1j],
-        "variance_freedom": optional([*array(f), -f - 1]),
+        "scatter": [3, "abc", f, hj.Scatter(f[:1]), hj.Scatter(f, size[:1])],
     }  # fmt: skip
+    scatter = hj.Scatter(f, size)
+    yield "Scatter", hj.Scatter, dict(freedom=f, roundness=size), {
+        "freedom": [*array(f), -f - 1], "roundness": ["abc", size[0], -size, 4 * size, size + 1j],
+    }  # fmt: skip
+    yield "Scatter.quantile", scatter.quantile, dict(level=0.9), {"level": SHARE}
     htf = t.estimate
     yield "HTF.harmonic", htf.harmonic, dict(m=0), {"m": INTEGER}
     yield "HTF.__getitem__", htf.__getitem__, dict(m=0), {"m": INTEGER}

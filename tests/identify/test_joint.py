@@ -10,9 +10,13 @@ from scipy import stats
 import hybridjax as hj
 from hybridjax.identify.joint.characteristic import characteristic_slopes
 from hybridjax.identify.joint.coordinates import local_coordinates
-from hybridjax.identify.joint.frequency import transfer, transfer_slopes
+from hybridjax.identify.joint.frequency import FrequencyProblem, transfer, transfer_slopes
+from hybridjax.identify.joint.minimize import minimize
+from hybridjax.identify.joint.normal_equations import NormalEquations
 from hybridjax.identify.joint.periodic_model import PeriodicModel
 from hybridjax.linear.frequency_response import harmonic_transfer
+
+from .test_series import scaled
 
 
 F = np.linspace(0.03, 2.9, 40)
@@ -110,6 +114,66 @@ def test_exact_values_are_met_exactly(model, exact, variance):
     assert fit.compare(model.multipliers).max_error < off
     assert np.max(fit.model.htf(F).error(exact)) < off
     np.testing.assert_allclose(fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12)
+
+
+def test_what_the_data_do_not_show_has_infinite_variance():
+    """Harmonics -1, 0 and 1 of four leave the last one free in part, and the multipliers known."""
+    small = scaled(3, (2, 3, 4, 2), 2, 1)
+    f = np.arange(1, 40) / 80
+    some = small.htf(f, (-1, 0, 1))
+    draw = noisy(with_values(some, some.H, 1e-6), np.random.default_rng(0))
+    fit = hj.fit_ldtp(draw, shaken(small, np.random.default_rng(1)))
+    variance = fit.htf(f, (-2, -1, 0, 1)).variance
+    assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
+    assert fit.contains(small.multipliers[:2], 0.999).all()
+
+
+def test_numbers_that_the_data_do_not_show_are_unknown():
+    """Of two unknowns whose sum is seen, with rounding errors in it."""
+    J = np.random.default_rng(0).normal(size=(50, 1)) * np.array([1.0, 1.0 + 1e-16, 0.0])
+    spread = NormalEquations(J.T @ J, np.zeros(3)).spread(2.0)
+    slopes = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    expected = [2.0 / (J[:, 0] @ J[:, 0]), np.inf, np.inf, 0.0]
+    np.testing.assert_allclose(spread.variance(slopes.T), expected, rtol=1e-9)
+    np.testing.assert_allclose(spread.covariance(slopes[:1])[0], expected[:1], rtol=1e-9)
+    assert np.isinf(spread.covariance(slopes[:2])).all()
+
+
+class Walled(FrequencyProblem):
+    """No step lowers the cost, wherever the minimum is."""
+
+    def cost(self, model):
+        here = all(map(np.array_equal, model.B, self.wall.B))
+        return super().cost(model) if here else np.inf
+
+    def refined(self, model, direct):
+        return model
+
+
+def test_a_stall_is_no_minimum(model, exact):
+    start = PeriodicModel.of(shaken(model, np.random.default_rng(1)), ONE)
+    Walled.wall = start
+    problem = Walled.of(exact, np.sqrt(2 / exact.variance), ONE)
+    assert not minimize(problem, start, True, 10).converged
+
+
+def test_a_step_that_damping_makes_small_is_not_the_last(model):
+    """Beside the minimum, along what the data show worst, by a standard deviation."""
+    some = model.htf(F, (0, 1))
+    draw = noisy(with_values(some, some.H, 4e-4), np.random.default_rng(5))
+    problem = FrequencyProblem.of(draw, np.sqrt(2 / draw.variance), ONE)
+    found = minimize(problem, PeriodicModel.of(model, ONE), True, 500)
+    assert found.converged
+    root = found.equations.spread().root
+    beside = found.coordinates.moved(root[:, np.argmax((root**2).sum(axis=0))] * 3.0)
+    again = minimize(problem, beside, True, 500)
+    assert again.converged and again.cost < found.cost + 0.01 * again.coordinates.size
+
+
+def test_a_misfit_is_said_in_words(model, exact):
+    fit = hj.fit_ldtp(with_values(exact, exact.H, 1e-6), 2)
+    assert fit.cost > 2 * fit.freedom and "too few dimensions" in repr(fit)
+    assert "too few dimensions" not in repr(hj.fit_ldtp(exact, model))
 
 
 def test_what_is_not_direct_stays_so(model):

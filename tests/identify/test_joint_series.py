@@ -11,6 +11,7 @@ from hybridjax.identify.joint.periodic_model import PeriodicModel
 from hybridjax.identify.joint.prediction.predictor import Predictor
 from hybridjax.identify.joint.prediction.problem import SeriesProblem
 from hybridjax.identify.joint.prediction.series_part import SeriesPart
+from hybridjax.identify.joint.prediction.subspace import subspace_model
 from hybridjax.identify.series.cycle_grid import CycleGrid
 
 from .test_series import record, scaled
@@ -86,13 +87,13 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
 @pytest.mark.parametrize("free", (True, False))
 @pytest.mark.parametrize("drift", (None, np.inf))
 def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
+    """With errors of outputs that depend on each other."""
     records = [
         hj.Record(r.u, r.y + 3.0, n_sections=4, first_section=r.first_section, drift=drift)
         for r in gappy
     ]
     part = SeriesPart.of(CycleGrid.from_records(records), ONE)
-    same = np.tile(np.eye(2) * 2.0, (4, 1, 1))  # (a drift is taken out of each output alone)
-    problem = SeriesProblem([part], same, True, free, 0)
+    problem = SeriesProblem([part], COVARIANCES, True, free, 0)
     coordinates = local_coordinates(in_innovation_form(small), True)
     step = np.random.default_rng(1).normal(size=coordinates.size)
     ahead, back = (problem.cost(coordinates.moved(h * step)) for h in (1e-6, -1e-6))
@@ -124,6 +125,48 @@ def test_series_without_noise_are_met_exactly(small, start):
     f = np.array([0.1, 0.4])
     assert fit.htf(f).error(small.htf(f)).max() < 1e-9
     assert fit.unknowns == local_coordinates(PeriodicModel.of(small, ONE), True).size
+
+
+def test_a_drift_is_found_where_samples_are_missing(small):
+    """A constant at each section, of each output."""
+    whole = record(small, 4 * 60, 0)
+    y = whole.y + np.tile(np.arange(8.0).reshape(4, 2), (60, 1))
+    data = with_gaps(hj.Record(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0)
+    shaken = eqx.tree_at(lambda m: m.B, small, 1.05 * small.B)
+    fit = hj.fit_ldtp(data, shaken, start="cycle")
+    assert fit.compare(small.multipliers).max_error < 1e-9
+    # As many numbers less as there are constants.
+    samples = np.isfinite(data.y).sum()
+    assert fit.freedom == samples - 8 - fit.unknowns
+
+
+def test_errors_of_short_records_are_as_large_as_said(small):
+    """Twelve records of five cycles, with starts and drifts of their own: each takes degrees of
+    freedom, without which the distances would be a third too large."""
+    square, runs = 0.0, 40
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        records = []
+        for k in range(12):
+            one = record(small, 20, 100 * seed + k, 0.1, x0=rng.normal(size=2))
+            y = one.y + np.tile(rng.normal(size=(4, 2)), (5, 1))
+            records.append(hj.Record(one.u, y, n_sections=4, drift=np.inf))
+        fit = hj.fit_ldtp(records, small)
+        assert fit.freedom == 12 * (40 - 8 - 2) - fit.unknowns
+        square += fit.distance(small.multipliers)[0]
+    assert 1e-3 < stats.chi2(2 * runs).cdf(square) < 1 - 1e-3
+
+
+def test_the_first_guess_does_not_depend_on_units(small):
+    """With inputs of rms one and of a millionth."""
+    data = record(small, 4 * 100, 0, 0.1)
+
+    def guess(size):
+        grid = CycleGrid.from_records([hj.Record(size * data.u, data.y, n_sections=4)])
+        return subspace_model([SeriesPart.of(grid, ONE)], small.dims.tolist(), True)
+
+    for one, other in zip(guess(1.0).B, guess(1e-6).B, strict=True):
+        np.testing.assert_allclose(one, 1e-6 * other, rtol=1e-6, atol=1e-8)
 
 
 def test_periodic_series_and_their_htfs_agree(small):
@@ -182,24 +225,47 @@ def test_the_true_model_and_its_noise_leave_white_errors(small):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
 
 
-def test_the_filter_is_that_of_riccati(small):
-    """One section: scipy's solution of the algebraic equation."""
+@pytest.mark.parametrize("unit", (1.0, 1e6, 1e-6))
+def test_the_filter_is_that_of_riccati(unit):
+    """One section: scipy's solution of the algebraic equation, in any unit of the outputs."""
     from scipy.linalg import solve_discrete_are
 
-    A, C = np.array([[0.8, 0.3], [-0.2, 0.6]]), np.array([[1.0, 0.5], [0.0, 1.0]])
-    G, R = np.array([[1.0], [0.4]]), 0.3
+    A, C = np.array([[0.8, 0.3], [-0.2, 0.6]]), unit * np.array([[1.0, 0.5], [0.0, 1.0]])
+    G, R = np.array([[1.0], [0.4]]), 0.3 * unit
     noise = hj.LDTP([A], [np.hstack([G, np.zeros((2, 2))])], [C], [np.hstack([np.zeros((2, 1)),
                     R * np.eye(2)])])  # fmt: skip
     plant = hj.LDTP([A], [G], [C])
     found = Predictor.of(plant, noise)
-    P = solve_discrete_are(A.T, C.T, G @ G.T, R**2 * np.eye(2))
+    P = solve_discrete_are(A.T, C.T / unit, G @ G.T, R**2 / unit**2 * np.eye(2))
     S = C @ P @ C.T + R**2 * np.eye(2)
     np.testing.assert_allclose(found.S[0], S, rtol=1e-9)
     np.testing.assert_allclose(found.model.K[0][2:], A @ P @ C.T @ np.linalg.inv(S), rtol=1e-8)
 
 
+def test_the_filter_waits_for_noise_that_comes_late():
+    """Noise of variance 4 that outputs show two sections after it enters, delayed by the state."""
+    A, C = np.diag(np.ones(1), 1), np.array([[1.0, 0.0]])
+    noise = hj.LDTP([A], [[[0.0, 0.0], [2.0, 0.0]]], [C], [[[0.0, 0.1]]])
+    found = Predictor.of(hj.LDTP([A], [[[0.0], [1.0]]], [C]), noise)
+    np.testing.assert_allclose(found.S, 4.01, rtol=1e-12)
+    np.testing.assert_allclose(found.model.K[0], 0.0, atol=1e-12)
+
+
+def test_predictions_begin_at_the_section_of_the_record(small):
+    """The true model and its noise, and data from section 1 on: what is left is white."""
+    noise = driven(small, 0.3)
+    data = noisy(small, noise, 100, 0)
+    later = hj.Record(data.u[1:], data.y[1:], n_sections=4, first_section=1, outputs=data.outputs)
+    error = later.y - Predictor.of(small, noise).predict(later, True)
+    for n in range(4):
+        found = np.cov(error[(n + 3) % 4 :: 4][5:].T)
+        np.testing.assert_allclose(found, Predictor.of(small, noise).S[n], atol=0.4 * found.max())
+    assert hj.validate(small, later, noise=noise, level=1e-3).white
+
+
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
+    assert hj.identify.noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
     f, N = np.array([0.1, 0.3]), 4
     white = hj.LDTP(np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 2, 1)),
                     np.broadcast_to(0.3 * np.eye(2), (N, 2, 2)))  # fmt: skip
@@ -223,6 +289,8 @@ def test_bad_input_is_refused_in_a_sentence(small):
         hj.fit_ldtp(record(small, 4 * 8, 0, 0.1), 4)
     with pytest.raises(hj.DefinitionError, match="HTFs tell nothing of innovations"):
         hj.fit_ldtp(small.htf(np.array([0.1, 0.2])), small, noise="innovations")
+    with pytest.raises(hj.DefinitionError, match="HTFs have no start"):
+        hj.fit_ldtp(small.htf(np.array([0.1, 0.2])), small, start="cycle")
     with pytest.raises(hj.DefinitionError, match="no noise was fitted"):
         hj.fit_ldtp(small.htf(np.linspace(0.01, 1.9, 30)), small).noise_spectrum(0.1)
     with pytest.raises(hj.DefinitionError, match="have no noise of their own"):

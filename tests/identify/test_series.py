@@ -6,7 +6,8 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 from hybridjax.identify.series.arx import delayed_outputs
-from hybridjax.identify.series.linearization import linearize
+from hybridjax.identify.series.gradient_covariance import gradient_covariance
+from hybridjax.identify.series.linearization import each_part, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.parts import Parts
 
@@ -147,6 +148,39 @@ def test_process_noise_is_seen_in_the_residuals(small):
         fit = hj.fit_series(hj.Record(clean.u, y, n_sections=4), 2)
         hits += fit.contains(true).all()
     assert covered(hits, runs)
+
+
+def slopes_of(problem, found):
+    """The derivative of the residuals of one record and output in the only coefficient, (T, N)."""
+    slopes = {}
+
+    def section(_, part, n, fit, regression):
+        x = part.y[:, :, n, fit.outputs, None]
+        slopes[n] = fit.samples(found.c, regression, x)[1].ravel()
+
+    each_part(problem, found, section, lambda k, sections: None)
+    return np.stack([slopes[n] for n in sorted(slopes)], axis=1)
+
+
+def test_the_gradient_scatters_as_is_said_where_noise_drives_the_system():
+    """Though numerators take much of such errors, and blocks of cycles depend on each other."""
+    one, cycles, N, true = np.ones((1, 1)), 250, 2, 0.8
+    model = hj.LDTP.from_blocks([true * one, one], [one, one / 2], [one, one], [0 * one] * N)
+    rng = np.random.default_rng(0)
+
+    def noise():
+        return 0.1 * np.asarray(model.simulate(rng.normal(size=(N * cycles, 1))))
+
+    said, happened = 0.0, 0.0
+    for seed in range(20):
+        clean = record(model, N * cycles, seed)
+        data = hj.Record(clean.u, clean.y + noise(), n_sections=N)
+        problem = OutputErrorProblem.from_data(Parts(data), 1, 12, free_start=True)
+        found = linearize(problem, np.array([-true]))
+        draws = np.stack([noise() for _ in range(50)]).reshape(-1, cycles, N) / problem.scale
+        happened += np.mean(np.einsum("btn,tn->b", draws, slopes_of(problem, found)) ** 2) / 20
+        said += gradient_covariance(problem, found, 11).matrix[0, 0] / 20
+    assert said == pytest.approx(happened, rel=0.1)
 
 
 def test_standard_errors_of_short_records_are_not_too_large(small):
@@ -296,6 +330,18 @@ def test_distortion_of_second_order():
     assert 5 < errors[0.03, False] / errors[0.003, False] < 20
     assert errors[0.03, True] / errors[0.003, True] > 40
     assert hj.fit_series(data, 2).distortion
+
+
+def test_how_sure_where_products_are_taken():
+    """Neither many unknowns nor what distant cycles have in common make errors look small."""
+    found, said = [], []
+    for seed in range(10):
+        data, true = quadratic(seed, 0.03, cycles=120)
+        fit = hj.fit_series(data, 2, distortion=True, check=False)
+        assert fit.distortion
+        found.append(fit.compare(true).max_error)
+        said.append(fit.standard_errors[0])
+    assert 0.75 < np.sqrt(np.mean(np.square(said)) / np.mean(np.square(found))) < 1.4
 
 
 def test_drift_is_no_response(small):

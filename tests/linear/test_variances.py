@@ -1,5 +1,6 @@
 """Variances of HTFs: carried along, and what they say about an interval."""
 
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,12 +20,17 @@ def an_htf(**more):
 @pytest.fixture
 def htf():
     size = np.random.default_rng(1).uniform(1, 2, (3, len(F), 2, 1))
-    return an_htf(variance=2 * size, noise_variance=size, variance_freedom=np.full(len(F), 4.0))
+    scatter = hj.Scatter(np.full(len(F), 4.0), size)
+    return an_htf(variance=2 * size, noise_variance=size, scatter=scatter)
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
     expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
-    np.testing.assert_allclose(htf.confidence_radius(), expected, rtol=1e-12)
+    plain = an_htf(variance=htf.variance, scatter=hj.Scatter(htf.scatter.freedom))
+    np.testing.assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
+    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
+    expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
+    np.testing.assert_allclose(htf.confidence_radius(), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
     np.testing.assert_allclose(
         known, np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)), rtol=1e-12
@@ -35,14 +41,29 @@ def test_variances_go_along(htf):
     one = htf.select((0, 1))
     np.testing.assert_array_equal(one.variance, htf.variance[1:])
     np.testing.assert_array_equal(one.noise_variance, htf.noise_variance[1:])
-    np.testing.assert_array_equal(one.variance_freedom, htf.variance_freedom)
+    np.testing.assert_array_equal(one.scatter.freedom, htf.scatter.freedom)
+    np.testing.assert_array_equal(one.scatter.roundness, htf.scatter.roundness[1:])
     between = htf.interpolate([0.1, 0.125])
     np.testing.assert_allclose(between.variance[:, 0], htf.variance[:, 1])
     np.testing.assert_allclose(
         between.variance[:, 1], (htf.variance[:, 1] + htf.variance[:, 2]) / 2
     )
-    np.testing.assert_allclose(between.variance_freedom, 4.0)
+    np.testing.assert_allclose(between.scatter.freedom, 4.0)
+    np.testing.assert_allclose(between.scatter.roundness, between.noise_variance)
     assert an_htf().interpolate([0.1]).variance is None
+
+
+def test_scatter_is_kept(htf, tmp_path):
+    """In files, datasets, and by transformations of JAX."""
+    hj.save(tmp_path / "htf.npz", htf)
+    radius = htf.confidence_radius()
+    dataset = hj.convert.to_xarray(htf)
+    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    for other in (hj.load(tmp_path / "htf.npz"), hj.convert.from_xarray(dataset)):
+        assert jax.tree.structure(other) == jax.tree.structure(htf)
+        np.testing.assert_array_equal(other.confidence_radius(), radius)
+    np.testing.assert_allclose(jax.jit(lambda x: x.confidence_radius())(htf), radius)
+    assert "scatter.roundness" in hj.convert.to_pandas(htf).columns
 
 
 def test_some_frequencies(htf):
@@ -50,6 +71,7 @@ def test_some_frequencies(htf):
     np.testing.assert_array_equal(some.f, [0.3, 0.1])
     np.testing.assert_array_equal(some.H, htf.H[:, [5, 1]])
     np.testing.assert_array_equal(some.variance, htf.variance[:, [5, 1]])
+    np.testing.assert_array_equal(some.scatter.roundness, htf.scatter.roundness[:, [5, 1]])
     with pytest.raises(hj.DefinitionError, match="f = 0.12 was not excited .* nearest one is 0.1 "):
         htf.at(0.12)
 
@@ -59,5 +81,11 @@ def test_bad_variances(htf):
         an_htf().confidence_radius()
     with pytest.raises(hj.DefinitionError, match="`level` must be a number between 0 and 1"):
         htf.confidence_radius(1.0)
-    with pytest.raises(hj.DefinitionError, match="`variance_freedom` must have the shape"):
-        an_htf(variance_freedom=np.ones(3))
+    with pytest.raises(hj.DefinitionError, match="`scatter.freedom` must have the shape"):
+        an_htf(scatter=hj.Scatter(np.ones(3)))
+    with pytest.raises(hj.DefinitionError, match="`scatter.roundness` must have the shape"):
+        an_htf(scatter=hj.Scatter(np.ones(len(F)), np.ones((3, len(F), 1, 1))))
+    with pytest.raises(hj.DefinitionError, match="`roundness` must be at most 3"):
+        hj.Scatter(np.ones(1), np.full((1, 1, 1, 1), 4.0))
+    with pytest.raises(hj.DefinitionError, match="is of 2 frequencies, `roundness` of 1"):
+        hj.Scatter(np.ones(2), np.ones((1, 1, 1, 1)))

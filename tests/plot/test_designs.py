@@ -57,7 +57,9 @@ def test_what_strides_buy(plan, model, usual, goal):
     study = hj.designs.Study(usual, 1, 1e-9, goal=goal)
     data = hj.experiments.simulate_experiments(model, usual, start="periodic")
     studied = study.add(hj.experiments.add_noise(data, std=1e-3))
-    ax = hj.plot.strides(plan, {"here": [studied, studied]}).ax
+    # (More of them than there are colors.)
+    others = {f"there {k}": studied for k in range(8)}
+    ax = hj.plot.strides(plan, {"here": [studied, studied]} | others).ax
     lines = {line.get_label(): line for line in ax.get_lines()}
     assert lines["here"].get_xdata() == studied.strides
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)

@@ -1,14 +1,19 @@
 """Whether a store holds what is asked for; and how what users wrote is described there."""
 
 import dataclasses
+import dis
 import functools
 import hashlib
 import importlib.metadata
+import inspect
+import itertools
 import json
 import types
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from ... import __version__
@@ -52,63 +57,109 @@ def digest_of(*words: str) -> str:
 
 
 def function_digest(function: Callable) -> str:
-    """A digest of what a function does, as far as its code, its defaults and the numbers and words
-    that it holds show it: in variables around it, as a `functools.partial`, or as an object that
-    can be called. Of other objects that it holds, the class stands for all."""
-    return digest_of(*_words(function, 0))
+    """A digest of what a function does, as far as these show it: its code, its defaults, what it
+    holds (in variables around it, as a `functools.partial`, or as an object that can be called),
+    and the constants and functions of its module that it uses.
+
+    Numbers, words, arrays, containers, dataclasses, functions and objects that can be called are
+    looked into. Of all else, of classes and what other modules define, the name stands for all.
+    Lists and dictionaries that a module holds are left out: programs change them as they go.
+    """
+    return digest_of(*_Describer().words(function))
 
 
 def definition_digest(x: Any) -> str:
     """A digest of a definition, as families of sections and outputs are: of all that its fields
-    hold."""
-    return digest_of(*_definition(x))
+    hold, and as above of the functions among it."""
+    return digest_of(*_Describer().words(x))
 
 
 _DIGEST = "sha256:"
 # Functions and objects within others that are looked at.
-_DEPTH = 5
+_DEPTH = 8
 
 
-def _definition(x: Any) -> list[str]:
-    if dataclasses.is_dataclass(x) and not isinstance(x, type):
-        held = [(f.name, getattr(x, f.name)) for f in dataclasses.fields(x)]
-        return [_name(type(x)), *(word for name, y in held for word in (name, *_definition(y)))]
-    if isinstance(x, tuple | list):
-        return [type(x).__name__, str(len(x)), *(word for y in x for word in _definition(y))]
-    return _words(x, 0)
+class _Describer:
+    """Says what objects are in words that are the same in every process."""
 
+    def __init__(self):
+        self._known: dict[tuple[int, int], tuple[Any, str]] = {}
 
-def _words(x: Any, depth: int) -> list[str]:
-    inside = functools.partial(_words, depth=depth + 1)
-    if x is None or isinstance(x, bool | int | float | complex | str | bytes):
-        return [repr(x)]
-    if isinstance(x, types.CodeType):
-        constants = [word for y in x.co_consts for word in _words(y, depth)]
-        return [x.co_code.hex(), *x.co_names, *constants]
-    if isinstance(x, tuple | list | set | frozenset):
-        items = x if isinstance(x, tuple | list) else sorted(x, key=repr)
-        return [type(x).__name__, str(len(x)), *(word for y in items for word in _words(y, depth))]
-    if hasattr(x, "__array__"):
-        return [array_digest(x)]
-    parts = _parts(x) if depth < _DEPTH else ()
-    name = _name(x if hasattr(x, "__qualname__") else type(x))
-    return [type(x).__name__, name, *(word for y in parts for word in inside(y))]
+    def words(self, x: Any, depth: int = 0) -> list[str]:
+        if x is None or isinstance(x, bool | int | float | complex | str | bytes):
+            return [repr(x)]
+        if isinstance(x, types.CodeType):
+            return [x.co_code.hex(), *x.co_names, *self._all(x.co_consts, depth)]
+        if isinstance(x, tuple | list | set | frozenset):
+            items = x if isinstance(x, tuple | list) else sorted(x, key=repr)
+            return [type(x).__name__, str(len(x)), *self._all(items, depth)]
+        if hasattr(x, "__array__"):
+            if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+                x = jax.random.key_data(x)
+            array = np.asarray(x)
+            # (The bytes of an array of objects are their places in memory.)
+            return self.words(array.tolist()) if array.dtype.hasobject else [array_digest(array)]
+        name = [type(x).__name__, _name(x if hasattr(x, "__qualname__") else type(x))]
+        if depth == _DEPTH:
+            return name
+        # (Functions that call each other are met again and again. An object that is held keeps its
+        # number.)
+        key = id(x), depth
+        if key not in self._known:
+            self._known[key] = x, digest_of(*self._all(_parts(x), depth + 1))
+        return [*name, self._known[key][1]]
+
+    def _all(self, items: Iterable[Any], depth: int) -> list[str]:
+        return [word for x in items for word in self.words(x, depth)]
 
 
 def _parts(x: Any) -> Iterable[Any]:
     """What an object is made of that says what it does."""
     if isinstance(x, types.FunctionType):
         variables = map(_contents, x.__closure__ or ())
-        return x.__code__, *variables, x.__defaults__, x.__kwdefaults__
+        return x.__code__, *variables, x.__defaults__, x.__kwdefaults__, *_used_globals(x)
     if isinstance(x, types.MethodType):
         return x.__func__, *_held(x.__self__)
     if isinstance(x, functools.partial):
         return x.func, x.args, x.keywords
     if isinstance(x, Mapping):
         return tuple(x.items())
-    if callable(x) and not isinstance(x, type):
+    if isinstance(x, type):
+        return ()
+    if callable(x):
         return type(x).__call__, *_held(x)
-    return ()
+    return _held(x) if dataclasses.is_dataclass(x) else ()
+
+
+def _used_globals(function: types.FunctionType) -> Iterable[tuple[str, Any]]:
+    """Constants and functions of its module that a function uses, with their names."""
+    module = function.__module__
+    if function.__globals__.get("__name__", module) != module:  # a wrapper of another module
+        return
+    for name in sorted(_global_names(function.__code__)):
+        x = function.__globals__.get(name)
+        if _is_constant(x):
+            yield name, x
+        elif callable(x) and getattr(x, "__module__", None) == module:
+            plain = x if isinstance(x, types.FunctionType) else inspect.unwrap(x)
+            if isinstance(plain, types.FunctionType):
+                yield name, plain
+
+
+def _global_names(code: types.CodeType) -> set[str]:
+    """Also those in functions inside of it."""
+    names = {x.argval for x in dis.get_instructions(code) if x.opname == "LOAD_GLOBAL"}
+    inside = (_global_names(x) for x in code.co_consts if isinstance(x, types.CodeType))
+    return names.union(*inside)
+
+
+def _is_constant(x: Any) -> bool:
+    if isinstance(x, tuple):
+        return all(map(_is_constant, x))
+    if dataclasses.is_dataclass(x) and not isinstance(x, type | eqx.Module):
+        return x.__dataclass_params__.frozen
+    plain = bool, int, float, complex, str, bytes, np.ndarray, np.generic, jax.Array, eqx.Module
+    return isinstance(x, plain)
 
 
 def _contents(cell: types.CellType) -> Any:
@@ -118,9 +169,15 @@ def _contents(cell: types.CellType) -> Any:
         return None
 
 
-def _held(x: Any) -> Iterable[Any]:
+def _held(x: Any) -> Iterable[tuple[str, Any]]:
     """The attributes of an object, with their names."""
-    return tuple(getattr(x, "__dict__", {}).items())
+    if dataclasses.is_dataclass(x):
+        names = [f.name for f in dataclasses.fields(x)]
+    else:
+        slots = (getattr(kind, "__slots__", ()) for kind in type(x).__mro__)
+        each = [(one,) if isinstance(one, str) else one for one in slots]
+        names = [*getattr(x, "__dict__", {}), *itertools.chain(*each)]
+    return tuple((name, getattr(x, name, None)) for name in names)
 
 
 def _name(x: Any) -> str:

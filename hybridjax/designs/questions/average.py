@@ -24,7 +24,8 @@ class Average(AbstractQuestion):
         variances, sensitivities, criteria = map(
             np.array, zip(*(one.answer(power) for one in self.each), strict=True)
         )
-        criterion = np.mean(criteria**self.exponent) ** (1 / self.exponent)
+        top = criteria.max()
+        criterion = top * np.mean((criteria / top) ** self.exponent) ** (1 / self.exponent)
         share = (criteria / criterion) ** (self.exponent - 1) / len(criteria)
         return Answer(share @ variances / share.sum(), share @ sensitivities, float(criterion))
 

@@ -1,5 +1,7 @@
 """Floquet multipliers as functions of the coefficients of their polynomial."""
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -17,8 +19,11 @@ from .sensitivities import denominator_sensitivities
 # Multipliers whose polynomial has a smaller slope than that are not simple. Doubled: of two that
 # are twice as far apart no first-order variance is given.
 _SIMPLE = 1e-6
+# Relative distance up to which a multiplier of a minimal model is that of the whole one. Doubled:
+# of two that are twice as far apart the wrong one may be taken.
+_SAME = 1e-6
 # Harmonics of `fit_multipliers`, where the goal does not say.
-_FEW = (-2, -1, 0, 1, 2)
+FEW = (-2, -1, 0, 1, 2)
 
 
 def about_multipliers(
@@ -32,19 +37,38 @@ def about_multipliers(
     if goal.estimator == "fit_ldtp":
         unknowns = ldtp_unknowns(model, cosines, goal.harmonics, noise, power)
         c, slopes = unknowns.characteristic()
-        multipliers = np.roots([1.0, *c])
+        multipliers = np.roots([1.0, *c]).astype(complex)
         multipliers = multipliers[np.lexsort((-multipliers.imag, -np.abs(multipliers)))]
+        goal = _of_minimal(goal, np.asarray(model.multipliers), multipliers)
         wanted, names = wanted_parts(goal, multipliers, c)
         wanted, names = weighted(wanted @ slopes, names, goal.weights)
         return unknowns.question(wanted, names, goal.criterion)
     multipliers = np.asarray(model.multipliers)
     c = np.poly(multipliers).real[1:]
-    harmonics = _FEW if goal.harmonics is None else goal.harmonics
+    harmonics = FEW if goal.harmonics is None else goal.harmonics
     seen = list(measured(model, cosines, harmonics, noise))
     wanted, names = weighted(*wanted_parts(goal, multipliers, c), goal.weights)
     sensitivities = denominator_sensitivities(seen, c, goal.overhang)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return Question(sensitivities, wanted, names, unknowns, goal.criterion)
+
+
+def _of_minimal(
+    goal: Multipliers, known: Complex[np.ndarray, " n"], found: Complex[np.ndarray, " d"]
+) -> Multipliers:
+    """The goal with the number that its multiplier has in a minimal model.
+
+    **Raises:** `DefinitionError` if it is not there.
+    """
+    if goal.which is None or goal.which >= len(known):
+        return goal
+    apart = np.abs(found - known[goal.which])
+    if not apart.min() < _SAME * np.abs(known).max():
+        raise DefinitionError(
+            f"no input reaches, or no output that is measured shows, the multiplier "
+            f"{known[goal.which]:.4g}."
+        )
+    return dataclasses.replace(goal, which=int(np.argmin(apart)))
 
 
 def wanted_parts(

@@ -17,6 +17,7 @@ from ...identify.multipliers.variable_projection import HTFGroup, group_htf, mis
 from ...linear.frequency_response import check_harmonics
 from ...linear.htf import HTF
 from ..goals import Multipliers
+from ..questions.multipliers import FEW
 
 
 # Estimates of the noise, at most, each from the misfit of a fit weighted by the last one; and the
@@ -45,7 +46,7 @@ class Block(NamedTuple):
 
 def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
-    harmonics = (-2, -1, 0, 1, 2) if goal.harmonics is None else goal.harmonics
+    harmonics = FEW if goal.harmonics is None else goal.harmonics
     options = SumOptions(functools.partial(check_harmonics, harmonics), repeats=repeats)
     each = []
     for s in np.flatnonzero(data.ok):

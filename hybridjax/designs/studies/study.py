@@ -19,10 +19,11 @@ from ...experiments.design.design import Design
 from ...identify.multipliers.structured import StructuredFit
 from ..candidates import Candidates
 from ..goals import Multipliers
-from ..limits import Limit, Limits
+from ..limits import Limit, Limits, require_inputs, without_forbidden
 from ..optimal_design import OptimalDesign
 from ..optimize import optimal_design
 from .estimate import Block, Estimate, block_of, estimate
+from .transient import refuse_transient
 
 
 # A block has at most so many times the strides of all before it. Doubled: fewer blocks, and more
@@ -52,16 +53,17 @@ class Study(eqx.Module):
     ```python
     study = hj.designs.Study(hj.multisine(lines="odd").scaled(0.001), order=2, standard_error=1e-4)
     while not study.done:
-        data = hj.run_experiments(cycle, sections, study.design, outputs)    # or in a laboratory
-        study = study.add(data)
+        data = hj.run_experiments(cycle, sections, study.design, outputs, start="steady")
+        study = study.add(data)     # in a laboratory: hj.identify.remove_transient(data).data
     print(study)
     study.fit.contains(true)         # regions that hold at the time of stopping
     ```
 
-    The first block has equal amplitudes. Each one after it has the `optimal_design` for the model
-    that fits all before it, with the noise that these show, and as many experiments as are missing,
-    but at most twice the strides so far. Where the first blocks do not carry `order` multipliers,
-    they are repeated with new phases. Nothing is known beforehand but the number of multipliers.
+    The first block is applied as it is, whatever `limit` says. Each one after it has the
+    `optimal_design` for the model that fits all before it, with the noise that these show, and as
+    many experiments as are missing, but at most twice the strides so far. Where the first blocks do
+    not carry `order` multipliers, they are repeated with new phases. Nothing is known beforehand
+    but the number of multipliers.
 
     *Why intervals hold.* The estimate at the end is that of maximum likelihood from all blocks.
     Which inputs were applied, and when it was enough, was decided by earlier data only, and
@@ -113,18 +115,25 @@ class Study(eqx.Module):
             raise DefinitionError(
                 f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
             )
-        if goal is not None and (goal.weights is not None or goal.estimator == "fit_ldtp"):
+        goal = Multipliers() if goal is None else goal
+        if goal.weights is not None or goal.estimator == "fit_ldtp":
             raise DefinitionError(
                 "a study finds multipliers by fit_multipliers: `goal` may have no weights and no "
                 "other estimator."
+            )
+        if goal.which is not None and goal.which >= order:
+            raise DefinitionError(
+                f"`goal`: there is no multiplier {goal.which}, the order is {order}."
             )
         if isinstance(limit, Limits) and limit.strides is not None:
             raise DefinitionError(
                 "`limit` limits the strides, but a study ends at a precision: end it yourself."
             )
-        Candidates.of(first)
+        Candidates.of(without_forbidden(first, largest))
+        if isinstance(limit, Limits):
+            require_inputs(limit, first.input_names)
         self.first, self.order, self.standard_error = first, order, standard_error
-        self.goal = Multipliers() if goal is None else goal
+        self.goal = goal
         self.limit, self.largest, self.seed, self._found = limit, largest, seed, None
 
     @property
@@ -188,8 +197,9 @@ class Study(eqx.Module):
         recordings: `section_data(...).experiments(periods)`). `repeats`: how many of the last
         windows are averaged.
 
-        **Raises:** `DefinitionError` for data of other inputs, outputs or sections; as
-        `estimate_htf`, `fit_multipliers` and `optimal_design`.
+        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, and of which a
+        part larger than `standard_error` is a transient of the start (cycles before the window
+        show it); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
         if data.n_sections != self.first.n_sections or len(data.inputs) > 1:
             raise DefinitionError(
@@ -207,6 +217,9 @@ class Study(eqx.Module):
                     )
         blocks = (*blocks, new)
         best = estimate(blocks, self.order, self.goal)
+        if not best.doubt:
+            known = best.fit.multipliers, best.noise[-1], self.standard_error
+            refuse_transient(data, repeats, *known)
         errors = _asked(best.fit, self.goal)
         if best.doubt:
             errors = np.full_like(errors, np.nan)
@@ -288,10 +301,6 @@ class Study(eqx.Module):
 def _asked(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
     """Standard errors of the multipliers that are asked for, of a conjugate pair once."""
     found = fit.multipliers
-    if goal.which is not None and goal.which >= len(found):
-        raise DefinitionError(
-            f"`goal`: there is no multiplier {goal.which}, the order is {len(found)}."
-        )
     some = np.flatnonzero(found.imag >= 0) if goal.which is None else np.array([goal.which])
     covariance = fit.multiplier_covariances[some]
     if goal.part == "position":

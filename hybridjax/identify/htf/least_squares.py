@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...errors import DefinitionError
+from ...linear.scatter import Scatter
 from .realizations import Realizations
 from .spectral_sums import SpectralSums
 
@@ -19,7 +20,7 @@ class NoiseVariance(NamedTuple):
     """What repeated windows tell; None where there was one window."""
 
     variance: Float[np.ndarray, "M F ny nu"] | None
-    freedom: Float[np.ndarray, " F"] | None
+    scatter: Scatter | None
 
 
 class LineEstimates(NamedTuple):
@@ -28,7 +29,7 @@ class LineEstimates(NamedTuple):
     H: Complex[np.ndarray, "M F ny nu"]
     variance: Float[np.ndarray, "M F ny nu"] | None
     noise_variance: Float[np.ndarray, "M F ny nu"] | None
-    variance_freedom: Float[np.ndarray, " F"] | None
+    scatter: Scatter | None
     single: Realizations | None
     """What each experiment tells, where the variance is that of realizations."""
     noise: NoiseVariance
@@ -41,10 +42,8 @@ class LineEstimates(NamedTuple):
 
     def of_noise(self) -> "LineEstimates":
         """The same with the variance of noise alone."""
-        variance, freedom = self.noise
-        return self._replace(
-            variance=variance, noise_variance=None, variance_freedom=freedom, single=None
-        )
+        variance, scatter = self.noise
+        return self._replace(variance=variance, noise_variance=None, scatter=scatter, single=None)
 
     def require_total(self, f: Float[np.ndarray, " F"]) -> None:
         """**Raises:** `DefinitionError` if the scatter over realizations is not known."""
@@ -85,6 +84,8 @@ def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimate
         explained = np.einsum("kiml,kiml->kml", found.conj(), right).real
         left[here] = np.maximum(sums.energy[some] - explained, 0)
 
+    H = H.transpose(2, 0, 3, 1)
+
     def variance(residual):
         out = residual[:, None] * spread[:, :, None, None]
         return out.transpose(2, 0, 3, 1)
@@ -95,18 +96,18 @@ def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimate
     repeated = sums.repeats > 1
     if repeated:
         mean = sums.noise[rows] / count[:, None, None]
-        noise = NoiseVariance(variance(mean), count * (sums.repeats - 1.0))
+        noise = NoiseVariance(variance(mean), Scatter(count * (sums.repeats - 1.0)))
     why_not = _why_not(sums, rows)
-    total, of_noise, freedom, single = None, None, None, None
+    total, of_noise, scatter, single = None, None, None, None
     if (realizations > 0).any() and not why_not:
         residual = left / np.maximum(realizations, 1)[:, None, None]
         residual[realizations < 1] = np.inf
         total, of_noise = variance(residual), noise.variance
-        freedom = np.maximum(realizations, 1).astype(float)
         single = _single(sums, rows)
+        roundness = None if single is None else single.roundness(H)
+        scatter = Scatter(np.maximum(realizations, 1).astype(float), roundness)
     elif repeated:
-        total, freedom = noise
-    H = H.transpose(2, 0, 3, 1)
+        total, scatter = noise
     with np.errstate(divide="ignore", invalid="ignore"):
         lost = left / np.maximum(realizations, 0)[:, None, None]
         coherence = 1 - lost / (sums.energy[rows] / count[:, None, None])
@@ -116,7 +117,7 @@ def solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> LineEstimate
         H=H,
         variance=total,
         noise_variance=of_noise,
-        variance_freedom=freedom,
+        scatter=scatter,
         single=single,
         noise=noise,
         realizations=realizations,

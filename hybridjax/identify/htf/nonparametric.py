@@ -106,7 +106,7 @@ def estimate_htf(
         "estimate",
         variance=found.variance,
         noise_variance=found.noise_variance,
-        variance_freedom=found.variance_freedom,
+        scatter=found.scatter,
     )
 
 

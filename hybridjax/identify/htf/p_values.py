@@ -29,8 +29,8 @@ def htf_p_values(
 
     Values with p-values above 5 % are a confidence region of 95 %. It holds for errors of any
     distribution, if they are independent from one realization to the next and prefer no phase.
-    Discs (`HTF.confidence_radius`) count on normal errors: distortion of a few products of cosines
-    is of nearly constant size, and a disc of four such errors is a little too small. From four
+    Discs (`HTF.confidence_radius`) are exact for normal errors only, and those of two realizations
+    too small for errors of constant size, as a single product of two cosines makes them. From four
     realizations on the region is about as large as the disc; of two it is much wider.
 
     **Arguments:** `data`: experiments with 2 to 16 realizations of random phases. `true`: e.g. of a

@@ -25,6 +25,24 @@ class Realizations(NamedTuple):
     shares: Float[np.ndarray, "R F nu"]
     """The weights of the experiments, whose sum is one."""
 
+    def roundness(self, H: Complex[np.ndarray, "M F ny nu"]) -> Float[np.ndarray, "M F ny nu"]:
+        r"""That of `Scatter`, of the residuals of estimates; 1 where two realizations or fewer are.
+
+        Of n normal errors $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ is $(n - 2) / n$ in the mean:
+        it is Mauchly's criterion of their covariance in the plane, squared (Annals of Mathematical
+        Statistics 1940).
+        """
+        shares = self.shares[:, None, :, None]
+        scale = np.divide(1, np.sqrt(shares), out=np.zeros_like(shares), where=shares > 0)
+        residuals = scale * (self.parts - shares * H)
+        power = np.sum(np.abs(residuals) ** 2, axis=0)
+        along = np.abs(np.sum(residuals**2, axis=0))
+        count = np.sum(shares > 0, axis=0)
+        known = (count > 2) & (power > 0)
+        part = np.divide(along, power, out=np.zeros_like(power), where=known)
+        mean = np.where(count > 2, 1 - 2 / np.maximum(count, 1), 1)
+        return np.where(known, (1 - np.minimum(part, 1) ** 2) / mean, 1.0)
+
     def p_values(self, true: Complex[np.ndarray, "M F ny nu"]) -> Float[np.ndarray, "M F ny nu"]:
         r"""How likely errors are that add up to as much, if these are the true values.
 

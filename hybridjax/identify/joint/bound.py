@@ -46,5 +46,5 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
     direct = bool(np.asarray(model.D).any())
     coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
     c, slopes = characteristic_slopes(coordinates)
-    root = slopes @ problem.linearize(coordinates).covariance_root()
-    return MultiplierBound(multipliers_of(c), c, root @ root.T)
+    spread = problem.linearize(coordinates).spread()
+    return MultiplierBound(multipliers_of(c), c, spread.covariance(slopes))

@@ -60,9 +60,12 @@ def fit_ldtp(
       as for `fit_series`.
     - `guess`: the dimension of the state at each section or at all: the fit begins with what
       `hj.identify.realize` makes of HTFs, and with a subspace method for series. Or the model to
-      begin with, observable, which has these dimensions. Too few bias the multipliers.
-    - `noise`: of series, see above.
+      begin with, observable, which has these dimensions. Too few bias the multipliers: the misfit
+      shows it where variances are known (`cost` beside `freedom`), `hj.validate` for series. The
+      iteration finds the nearest minimum, which the same numbers show not to be the lowest.
+    - `noise`: of series, see above; "output" for HTFs.
     - `start`: of series. "free": the state at the start of each record is unknown; "cycle": zero.
+      "free" for HTFs, which have none.
     - `direct`: whether outputs may depend on the input at their own section; if not, D = 0.
     - `max_steps`: of the iteration.
 
@@ -74,5 +77,9 @@ def fit_ldtp(
     if isinstance(data, HTF):
         if noise == "innovations":
             raise DefinitionError("HTFs tell nothing of innovations: give the series.")
+        if start == "cycle":
+            raise DefinitionError(
+                "HTFs have no start, the response is periodic: leave `start` out."
+            )
         return fit_to_htf(data, guess, direct, max_steps)
     return fit_to_series(data, guess, noise == "innovations", start == "free", direct, max_steps)

@@ -103,7 +103,7 @@ class FrequencyProblem(NamedTuple):
                 gram[j] += columns @ columns.T
                 along[j] += columns @ target.ravel().view(float)
         try:
-            each = [NormalEquations(g, a).solution() for g, a in zip(gram, along, strict=True)]
+            each = [NormalEquations(g, a).solution()[0] for g, a in zip(gram, along, strict=True)]
         except np.linalg.LinAlgError:
             return model
         found = np.stack(each, axis=1)

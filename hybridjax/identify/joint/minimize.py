@@ -24,16 +24,17 @@ _LESS = 0.1
 _MORE = 4.0
 # Largest damping. Doubled: one attempt more before an iteration stalls.
 _MOST_DAMPING = 1e8
-# The last step is expected to lower the cost by less than this for each unknown, in units of the
-# errors' variance: at the minimum the errors of all unknowns add up to 1 for each. Doubled: rms
+# The minimum is expected to lie lower than the last cost by less than this for each unknown, in
+# units of the errors' variance: there the errors of all unknowns add up to 1 for each. Doubled: rms
 # errors grow by another 0.5 %.
 _SETTLED_GAIN = 1e-2
-# And to change the characteristic polynomial's coefficients by less than this part of their
+# And the characteristic polynomial's coefficients there to differ by less than this part of their
 # variance. Doubled: multipliers miss the minimum by 4.5 instead of 3.2 % of their standard errors.
 _SETTLED_SHIFT = 1e-3
-# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
-# rounding explains. Doubled: iterations that stall count as converged more often.
-_STALLED_GAIN, _STALLED_STEP = 1e-6, 1e-8
+# If no step lowers the cost: the gain that the minimum promises, relative to the cost, or the
+# largest entry of the step there, that rounding explains: that of numbers, made 1e6 times as large
+# by slow states. Doubled: iterations that stall count as converged more often.
+_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
 
 
 class Minimum(NamedTuple):
@@ -56,25 +57,28 @@ def minimize(
 
     After each step the problem takes the weights that its errors suggest, where these are unknown.
     The log determinant of their covariance is concave, so that a step that lowers the cost with the
-    weights of before raises the likelihood.
+    weights of before raises the likelihood, where no sample is missing. With gaps the covariance is
+    that of the pairs that are seen, which is nearly the likelihood's.
 
-    **Arguments:** `direct`: whether D is free. `settled_gain`: of the cost, for each unknown, that
-    is the last.
+    **Arguments:** `direct`: whether D is free. `settled_gain`: what the minimum may promise, of the
+    cost, for each unknown.
     """
     model = problem.refined(model, direct)
     cost, damping = problem.cost(model), _FIRST_DAMPING
     coordinates = local_coordinates(model, direct)
     equations = problem.linearize(coordinates)
     for _ in range(max_steps):
-        step, gain = equations.step(damping)
+        # (A damped step is small also where the minimum is far.)
+        whole, most = equations.solution()
         unit = min(1.0, cost / max(problem.residuals - coordinates.size, 1))
         enough = settled_gain * coordinates.size * unit
-        if gain <= enough and _shift(coordinates, equations, step) <= _SETTLED_SHIFT * unit:
+        if most <= enough and _shift(coordinates, equations, whole) <= _SETTLED_SHIFT * unit:
             return Minimum(coordinates, equations, cost, True, problem)
+        step, gain = equations.step(damping)
         model, more = problem.refined(coordinates.moved(step), direct), _MORE
         while (lower := problem.cost(model)) >= cost:
             if damping > _MOST_DAMPING:
-                small = gain <= _STALLED_GAIN * cost or np.abs(step).max() < _STALLED_STEP
+                small = most <= _STALLED_GAIN * cost or np.abs(whole).max() < _STALLED_STEP
                 return Minimum(coordinates, equations, cost, bool(small), problem)
             damping, more = damping * more, 2 * more
             step, gain = equations.step(damping)
@@ -94,5 +98,5 @@ def _shift(
     """The squared change of the characteristic polynomial's coefficients, in units of their
     covariance, for each of them."""
     _, slopes = characteristic_slopes(coordinates)
-    change = np.linalg.lstsq(slopes @ equations.covariance_root(), slopes @ step)[0]
+    change = np.linalg.lstsq(slopes @ equations.spread().root, slopes @ step)[0]
     return float(change @ change) / len(slopes)

@@ -61,7 +61,7 @@ def noise_spectrum(
     for n in range(N):
         after = np.tensordot(model.B[n].T, mu[(n + 1) % N], 1) / z[:, None]  # (inputs, F, ny)
         total += (np.abs(model.D[n].T[:, None] + after) ** 2).sum(axis=0)
-    return total.reshape(len(harmonics), len(f), -1) / N
+    return total.reshape(len(harmonics), len(f), len(noise.outputs)) / N
 
 
 def noise_model(

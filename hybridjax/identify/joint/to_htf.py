@@ -2,17 +2,14 @@
 
 import numpy as np
 
-from ..._core.results import Result
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.denominator import multipliers_of
 from ..multipliers.error_weights import ROUNDING, check_values, error_weights
 from ..series.realization import given_dims, realize
-from .characteristic import characteristic_slopes
 from .coordinates import local_coordinates
 from .frequency import FrequencyProblem
-from .ldtp_fit import LDTPFit
+from .ldtp_fit import LDTPFit, finished
 from .minimize import minimize
 from .periodic_model import PeriodicModel
 
@@ -56,24 +53,8 @@ def fit_to_htf(htf: HTF, guess, direct: bool, max_steps: int) -> LDTPFit:
         noise = np.maximum(np.sqrt(square / 2), ROUNDING)
         problem = problem._replace(weight=problem.weight / noise[:, None])
         found = minimize(problem, found.coordinates.model, direct, max_steps)
-    c, slopes = characteristic_slopes(found.coordinates)
-    unit = 1.0 if htf.variance is not None else found.cost / freedom
-    root = np.sqrt(unit) * found.equations.covariance_root()
-    return LDTPFit(
-        model=found.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs),
-        multipliers=multipliers_of(c),
-        coefficients=c,
-        covariance=slopes @ root @ (slopes @ root).T,
-        covariance_freedom=np.inf if htf.variance is not None else float(freedom),
-        cost=found.cost / unit,
-        freedom=freedom,
-        result=Result.OK if found.converged else Result.NOT_CONVERGED,
-        harmonics=htf.harmonics,
-        noise=None,
-        _coordinates=found.coordinates,
-        _root=root,
-        _scale=scale,
-    )
+    fitted = found.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)
+    return finished(found, fitted, scale, htf.harmonics, freedom, htf.variance is not None)
 
 
 def require_same_kind(model: LDTP, data) -> None:

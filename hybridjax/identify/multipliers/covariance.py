@@ -65,33 +65,23 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
     return int(min(needed, int(cycles * _LARGEST_SHARE)))
 
 
-class GradientCovariance(NamedTuple):
-    """The covariance of a gradient whose parts depend on their neighbors."""
-
-    matrix: Float[np.ndarray, "d d"]
-    weights: Float[np.ndarray, " lags"]
-    """Of products of parts that are 1, 2, ... cycles apart."""
-
-    def freedom(self, shares: Float[np.ndarray, "S T d"]) -> float:
-        """The degrees of freedom it was estimated with, from what each part is expected to add to
-        it (Satterthwaite 1946): products of different parts are independent terms, too."""
-        total = (shares**2).sum(axis=(0, 1))
-        for k, w in enumerate(self.weights, 1):
-            total += 2 * w**2 * (shares[:, k:] * shares[:, :-k]).sum(axis=(0, 1))
-        return float(1 / total.mean())
+def fading(c: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """Coefficients of chi, with responses that fade where those of c do not."""
+    slowest = np.abs(np.roots([1.0, *c])).max(initial=_FASTEST)
+    return c * min(1.0, _SLOWEST / slowest) ** np.arange(1, len(c) + 1)
 
 
-def serial_covariance(score: Float[np.ndarray, "S T d"], lags: int) -> GradientCovariance:
-    """The covariance of a sum over cycles (T, in S records) that depend on so many neighbors.
+def block_freedom(
+    score: Float[np.ndarray, "blocks d"], share: Float[np.ndarray, "blocks d d"]
+) -> float:
+    """Degrees of freedom of the covariance that the scores of independent blocks add up to.
 
-    With Parzen's weights (Gallant, *Nonlinear Statistical Models*, 1987), which leave the first
-    half of the lags nearly as they are, and never make a variance negative.
+    By how they scatter (Pan and Wall 2002), at most those of normal errors (Satterthwaite 1946).
+
+    **Arguments:** `share`: what each is expected to add, in units in which they add up to one.
     """
-    gradient = np.einsum("sti,stj->ij", score, score)
-    lag = np.arange(1, 2 * lags + 2) / (2 * lags + 2)
-    weights = np.where(lag < 0.5, 1 - 6 * lag**2 + 6 * lag**3, 2 * (1 - lag) ** 3)
-    weights = weights[: score.shape[1] - 1]
-    for k, w in enumerate(weights, 1):
-        product = np.einsum("sti,stj->ij", score[:, k:], score[:, :-k])
-        gradient += w * (product + product.T)
-    return GradientCovariance(gradient, weights)
+    d = score.shape[1]
+    part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(score.T @ score), score) / d
+    normal = np.trace(share, axis1=1, axis2=2) / d
+    scatter = max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum())
+    return float(1 / scatter)

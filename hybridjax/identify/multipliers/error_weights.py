@@ -52,10 +52,23 @@ def error_weights(htf: HTF, rms: Float[np.ndarray, " ny"]) -> Float[np.ndarray, 
     if htf.variance is None:
         return np.broadcast_to(1 / rms[:, None], htf.H.shape)
     variance = np.asarray(htf.variance)
-    if htf.variance_freedom is not None:
+    if htf.scatter is not None:
         variance = _product_of_factors(
-            variance, np.asarray(htf.harmonics), np.asarray(htf.variance_freedom)
+            variance, np.asarray(htf.harmonics), np.asarray(htf.scatter.freedom)
         )
+    return _roots(variance, rms)
+
+
+def spectral_weights(
+    htf: HTF, rms: Float[np.ndarray, " ny"], variance: Float[np.ndarray, "F ny"]
+) -> Float[np.ndarray, "M F ny nu"]:
+    """The same where errors of all harmonics and inputs have these variances."""
+    return np.broadcast_to(_roots(variance[..., None], rms), htf.H.shape)
+
+
+def _roots(
+    variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, "... ny _"]:
     return np.sqrt(2 / np.maximum(variance, (ROUNDING * rms[:, None]) ** 2))
 
 

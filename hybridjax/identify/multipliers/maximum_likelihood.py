@@ -17,6 +17,9 @@ _SETTLED_START = 1e-3
 # The leading coefficient relative to the largest one, below which its solution is no start (c would
 # be infinite) and the last one is kept. Doubled: nothing changes but in such degenerate cases.
 _NO_LEADING_COEFFICIENT = 1e-8
+# Smallest share of its errors that a fit leaves to a line, so that dividing by it stays finite.
+# Doubled: lines that alone decide c count at most 0.7 times as much.
+_SMALLEST_REMAINDER = 0.1
 
 
 def maximum_likelihood(
@@ -101,5 +104,22 @@ def summarize(
     if errors == "variance":
         covariance = sandwich(square - noise, square)
     else:
+        score = _without_own_share(score, shares)
         covariance = sandwich(square - noise, score.T @ score, shares)
     return Summary(covariance, cost, freedom)
+
+
+def _without_own_share(
+    score: Float[np.ndarray, "lines d"], shares: Float[np.ndarray, "lines d d"]
+) -> Float[np.ndarray, "lines d"]:
+    """Each line's part of the gradient as large as it is on average before c takes its share of it
+    (Bell and McCaffrey 2002)."""
+    try:
+        root = np.linalg.cholesky(shares.sum(axis=0))
+    except np.linalg.LinAlgError:  # nothing is known of some direction
+        return score
+    half = np.linalg.inv(root)
+    taken, axes = np.linalg.eigh(half @ shares @ half.T)
+    left = np.maximum(1 - taken, _SMALLEST_REMAINDER)
+    along = np.einsum("lij,li->lj", axes, score @ half.T) / np.sqrt(left)
+    return np.einsum("lij,lj->li", axes, along) @ root.T

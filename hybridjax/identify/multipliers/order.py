@@ -203,9 +203,9 @@ def estimated_noise(htf: HTF, misfit: float) -> NoiseLevel:
 
     **Arguments:** `misfit`: cost of the fit relative to what is expected.
     """
-    if htf.variance_freedom is None:
+    if htf.scatter is None:
         return NoiseLevel(1.0, 1.0)
-    freedom = float(np.median(htf.variance_freedom))
+    freedom = float(np.median(htf.scatter.freedom))
     most = freedom / (freedom - 1) if freedom > 1 else np.inf
     level = float(np.clip(misfit, 1.0, most))
     return NoiseLevel(level, np.sqrt(level / (2 - level)) if level < 2 else np.inf)

@@ -15,11 +15,17 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .denominator import chi, multipliers_of
-from .error_weights import ROUNDING, check_values, error_weights, require_frequencies
-from .maximum_likelihood import maximum_likelihood, noise_levels, summarize
+from .error_spectrum import error_spectrum
+from .error_weights import check_values, error_weights, require_frequencies, spectral_weights
+from .maximum_likelihood import maximum_likelihood, summarize
 from .multiplier_estimate import MultiplierEstimate
 from .order import estimated_noise, noise_ratios, refuse_invented
 from .variable_projection import group_htf, numerators_of
+
+
+# How often HTFs without variances are fitted with weights that the last misfit suggests. Doubled:
+# multipliers move by a tenth of their standard errors at most.
+_REWEIGHTINGS = 2
 
 
 class StructuredFit(MultiplierEstimate):
@@ -122,7 +128,8 @@ def fit_multipliers(
 
     **Arguments:**
 
-    - `htf`: exact or estimated. Without variances each output counts relative to its misfit.
+    - `htf`: exact or estimated. Without variances each output counts relative to its misfit, which
+      is taken for white noise and noise that has passed the system.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
       `select_order` helps to find it.
     - `harmonics`: those to use; None means all of `htf`.
@@ -155,10 +162,11 @@ def fit_multipliers(
     groups = group_htf(htf, error_weights(htf, rms), size)
     c, converged = maximum_likelihood(groups, order, max_steps)
     if htf.variance is None:
-        # Once more with the outputs weighted by what their misfit says.
-        noise = np.maximum(noise_levels(groups, c, len(rms)), ROUNDING)
-        groups = group_htf(htf, error_weights(htf, rms * noise), size)
-        c, converged = maximum_likelihood(groups, order, max_steps, c)
+        f = np.asarray(htf.f)
+        for _ in range(_REWEIGHTINGS):
+            variance = error_spectrum(groups, c, f, len(rms))
+            groups = group_htf(htf, spectral_weights(htf, rms, variance), size)
+            c, converged = maximum_likelihood(groups, order, max_steps, c)
     summary = summarize(groups, c, errors)
     if check:
         level, tails = estimated_noise(htf, summary.cost / summary.freedom)

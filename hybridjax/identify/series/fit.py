@@ -238,9 +238,10 @@ def _covariance(
     """Of c, by blocks of cycles, which may depend on their neighbors."""
     price = efficiency(problem, found, loss)
 
-    def probes(k: int, part: Part):
-        draws = np.random.default_rng((0, k)).standard_normal((*part.y.shape, _PROBES))
-        return draws * (part.weight > 0)[..., None] * price.noise[:, None]
+    def probes(k: int, part: Part, n: int):
+        sampled = part.weight[:, :, n, :, None] > 0
+        draws = np.random.default_rng((k, n)).standard_normal((*sampled.shape[:3], _PROBES))
+        return draws * sampled * price.noise[:, None]
 
     noise = linearize(problem, found.c, probes).curvature / _PROBES
     curvature = np.einsum("aij,a->ij", found.curvature - noise, price.curvature)

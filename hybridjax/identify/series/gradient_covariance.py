@@ -3,9 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance
-from .linearization import Linearization, each_part
-from .output_error import OutputErrorProblem
+from ..multipliers.covariance import Covariance, block_freedom, fading
+from ..multipliers.error_spectrum import amounts
+from .cycle_filters import divide_by_chi
+from .linearization import Linearization, each_part, linearize
+from .output_error import OutputErrorProblem, Part
 
 
 # Smallest share of its errors that a fit to all leaves to a block, so that dividing by it stays
@@ -14,6 +16,9 @@ _SMALLEST_REMAINDER = 0.1
 # Largest correction of a covariance for the freedom that the minimum takes: to 1 / 0.5. Doubled:
 # none.
 _SMALLEST_FREEDOM = 0.5
+# Draws of noise that passes the system, from which its share is estimated. Doubled: standard errors
+# scatter by 2 instead of 3 % with the draws.
+_PROBES = 16
 
 
 def gradient_covariance(
@@ -25,15 +30,24 @@ def gradient_covariance(
     do. Numerators take what these cycles have in common, and no correction of single residuals puts
     that back. Each block's errors are those of a prediction by a fit to the others (the jackknife
     that deletes blocks: Künsch 1989; Bell and McCaffrey 2002), which are larger than the true ones.
-    The sum of the squares is therefore taken relative to what it is on average for white noise. Its
-    freedom is that by which the blocks scatter (Pan and Wall 2002), at most that of normal errors
-    (Satterthwaite 1946).
+    The sum of the squares is therefore taken relative to what it is on average for noise like that
+    of the data: part of it white, part of it filtered by 1 / chi, as is noise that drives the
+    system. Numerators take more of the latter, and blocks depend on each other there. How much
+    there is of both follows from two sums of squares of the residuals (Rao 1971).
     """
     d = len(found.c)
-    scores: dict[int, Float[np.ndarray, "B d"]] = {}
+    memory = fading(found.c)
+    scores: dict[int, Float[np.ndarray, "B C d"]] = {}
     expectations: dict[int, Float[np.ndarray, "B d d"]] = {}
+    squares, passed = np.zeros((2, 1 + _PROBES)), np.zeros((d, d))
 
-    def section(part, n, fit, regression):
+    def outputs(k: int, part: Part, n: int):
+        """Those of the data, and noise that has passed the system."""
+        y = part.y[:, :, n, :, None]
+        draws = np.random.default_rng((k, n)).standard_normal((*y.shape[:3], _PROBES))
+        return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
+
+    def section(k, part, n, fit, regression):
         T = part.y.shape[1]
         count = max(1, T // cycles)
         length = -(-T // count)
@@ -42,40 +56,58 @@ def gradient_covariance(
             padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * (x.ndim - 2)
             return np.pad(x, padding).reshape(len(x) * count, length, *x.shape[2:])
 
+        weight = part.weight[:, :, n, fit.outputs, None]
+
+        def through_system(x):  # the products with noise that has passed it, of those with white
+            return divide_by_chi(memory, (weight * x)[:, ::-1])
+
         inputs, starts = blocks(regression.input_basis(fit.root)), blocks(regression.basis)
         left, axes = np.linalg.eigh(np.eye(length) - inputs @ inputs.swapaxes(1, 2))
         left = np.maximum(left, _SMALLEST_REMAINDER)[:, None]
-        error, slopes = fit.samples(found.c, regression, part.y[:, :, n, fit.outputs, None])
-        rows = part.y.shape[:2]
-        slopes = blocks(np.moveaxis(slopes[..., 0], 1, -1).reshape(*rows, -1, d))
-        slopes = np.einsum("bkl,blid->bkid", axes / left @ axes.swapaxes(1, 2), slopes)
-        score = np.einsum("bkid,bki->bd", slopes, blocks(error[..., 0].reshape(*rows, -1)))
+        x = outputs(k, part, n)[:, :, fit.outputs]
+        error = fit.errors(regression, x).reshape(x.shape)
+        _, slopes = fit.first.samples(found.c, regression, x[..., :1])
+        slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], d)
+        square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, through_system(error))]
+        filtered = through_system(slopes)
+        filtered = np.einsum("stid,stie->de", filtered, filtered)
+        slopes = np.einsum("bkl,blid->bkid", axes / left @ axes.swapaxes(1, 2), blocks(slopes))
+        score = np.einsum("bkid,bkic->bcd", slopes, blocks(error))
         expected = np.einsum("bkid,bkie->bde", slopes, slopes)
         for basis in (inputs, starts):
             along = np.einsum("bkr,bkid->brid", basis, slopes)
             expected -= np.einsum("brid,brie->bde", along, along)
-        return score, expected
+        return score, expected, square, filtered
 
     def collect(k, sections):
-        for score, expected in (one for each in sections for one in each):
+        for score, expected, square, filtered in (one for each in sections for one in each):
             scores[k] = scores.get(k, 0.0) + score
             expectations[k] = expectations.get(k, 0.0) + expected
+            squares[:] += square
+            passed[:] += filtered
 
-    each_part(problem, found, section, collect)
+    fits = linearize(problem, found.c, outputs).fits
+    each_part(problem, found._replace(fits=fits), section, collect)
+    # Noise that has passed the system adds to the first sum what white noise adds to the second.
+    first, second = squares[:, 1:].mean(axis=1)
+    white = np.array([[found.freedom.sum(), first], [first, second]])
+    share_white, share_passed = amounts(white, squares[:, 0])
     score = np.concatenate(list(scores.values()))
-    expected = np.concatenate(list(expectations.values()))
-    # In units in which white noise makes the sum one.
+    by_white = np.concatenate(list(expectations.values()))
+    by_passed = np.einsum("bcd,bce->de", score[:, 1:], score[:, 1:]) / _PROBES
+    score = score[:, 0]
+    expected = share_white * by_white.sum(axis=0) + share_passed * by_passed
+    true = share_white * found.curvature.sum(axis=0) + share_passed * passed
+    # In units in which noise like that of the data makes the sum one.
     try:
-        half = np.linalg.inv(np.linalg.cholesky(expected.sum(axis=0)))
+        half = np.linalg.inv(np.linalg.cholesky(expected))
+        true = np.linalg.cholesky(true)
+        share = np.linalg.inv(np.linalg.cholesky(by_white.sum(axis=0)))
     except np.linalg.LinAlgError:  # nothing is left of any block
         return Covariance.unknown(d)
-    score, share = score @ half.T, half @ expected @ half.T
+    score, share = score @ half.T, share @ by_white @ share.T
     sum_of_squares = score.T @ score
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
-    white = np.linalg.cholesky(found.curvature.sum(axis=0))
-    matrix = white @ sum_of_squares @ white.T / max(1 - taken, _SMALLEST_FREEDOM)
-    part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(sum_of_squares), score) / d
-    normal = np.trace(share, axis1=1, axis2=2) / d
-    scatter = max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum())
-    return Covariance(matrix, float(1 / scatter))
+    matrix = true @ sum_of_squares @ true.T / max(1 - taken, _SMALLEST_FREEDOM)
+    return Covariance(matrix, block_freedom(score, share))

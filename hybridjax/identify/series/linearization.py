@@ -30,12 +30,23 @@ class SectionFit(NamedTuple):
         coefficients, slopes = self.coefficients / unit, self.slopes / unit
         return self._replace(coefficients=coefficients, slopes=slopes)
 
+    @property
+    def first(self) -> "SectionFit":
+        """That of the first column."""
+        return self._replace(coefficients=self.coefficients[..., :1], slopes=self.slopes[..., :1])
+
+    def errors(
+        self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]
+    ) -> Float[np.ndarray, "rows m C"]:
+        """Residuals, weighted."""
+        return _left(self.coefficients, regression, x)
+
     def samples(
         self, c: Coefficients, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]
     ) -> tuple[Float[np.ndarray, "rows m C"], Float[np.ndarray, "rows d m C"]]:
-        """Residuals, weighted, and their derivatives in c, which omit what vanishes with the
+        """Errors and their derivatives in c, which omit what vanishes with the
         residuals (Kaufman 1975): q^-jN / chi of what was fitted, less what fits that."""
-        left = _left(self.coefficients, regression, x)
+        left = self.errors(regression, x)
         slopes = _reduced(regression, _fitted(self.coefficients, c, regression, x))
         slopes = slopes - np.tensordot(regression.remainder, self.slopes, 1)
         return left, slopes
@@ -87,11 +98,12 @@ class Linearization(NamedTuple):
 def linearize(
     problem: OutputErrorProblem,
     c: Coefficients,
-    outputs: Callable[[int, Part], Float[np.ndarray, "S T N ny C"]] | None = None,
+    outputs: Callable[[int, Part, int], Float[np.ndarray, "S T ny C"]] | None = None,
 ) -> Linearization:
     """All residuals and their derivatives in c, in three passes.
 
-    **Arguments:** `outputs` of a part and its number, other ones than those measured, C of each.
+    **Arguments:** `outputs`: other ones than those measured, C of each, of the number and the data
+    of a part and a section.
     """
     N, nu, ny = problem.shape
     d, columns = len(c), problem.lags * nu
@@ -99,7 +111,7 @@ def linearize(
 
     def of(work):
         def section(k, part, n, regressions):
-            y = part.y[:, :, n, :, None] if outputs is None else outputs(k, part)[:, :, n]
+            y = part.y[:, :, n, :, None] if outputs is None else outputs(k, part, n)
             for one, regression in zip(sums[n], regressions, strict=True):
                 work(one, regression, y[:, :, one.outputs])
 
@@ -145,15 +157,15 @@ def regressions_at(problem: OutputErrorProblem, c: Coefficients):
 def each_part(
     problem: OutputErrorProblem,
     found: Linearization,
-    work: Callable[[Part, int, SectionFit, SectionRegression], Any],
+    work: Callable[[int, Part, int, SectionFit, SectionRegression], Any],
     collect: Callable[[int, list[list[Any]]], None],
 ) -> None:
-    """One more pass, with what was found: `work` for each part, section and list of outputs, and
-    `collect` for each part with its number and what came out."""
+    """One more pass, with what was found: `work` for each part (its number first), section and list
+    of outputs, and `collect` for each part with its number and what came out."""
 
     def section(k, part, n, regressions):
         pairs = zip(found.fits[n], regressions, strict=True)
-        return [work(part, n, fit, regression) for fit, regression in pairs]
+        return [work(k, part, n, fit, regression) for fit, regression in pairs]
 
     in_passes(problem, [section], *regressions_at(problem, found.c), collect)
 

@@ -83,7 +83,7 @@ def misfit(problem: OutputErrorProblem, found: Linearization) -> Samples:
     """Unweighted, and without the share that the fit takes of it."""
     errors = [np.zeros(part.y.shape) for part in problem.parts()]
 
-    def section(part: Part, n: int, fit: SectionFit, regression: SectionRegression):
+    def section(_, part: Part, n: int, fit: SectionFit, regression: SectionRegression):
         x = part.y[:, :, n, fit.outputs, None]
         error, _ = fit.samples(found.c, regression, x)
         error = error.reshape(x.shape[:3])

@@ -5,17 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...._core.results import Result
 from ....errors import DefinitionError
 from ....experiments.record import RecordedData
 from ....linear.frequency_response import all_harmonics
 from ....linear.ldtp import LDTP
-from ...multipliers.denominator import multipliers_of
 from ...series.parts import Parts
 from ...series.realization import given_dims
-from ..characteristic import characteristic_slopes
 from ..coordinates import local_coordinates
-from ..ldtp_fit import LDTPFit
+from ..ldtp_fit import LDTPFit, finished
 from ..minimize import minimize
 from ..noise import noise_model
 from ..periodic_model import PeriodicModel
@@ -61,24 +58,10 @@ def fit_to_series(
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     found = minimize(problem.reweighted(model), model, direct, max_steps)
-    c, slopes = characteristic_slopes(found.coordinates)
-    root = np.sqrt(found.cost / freedom) * found.equations.covariance_root()
     model = found.coordinates.model
-    return LDTPFit(
-        model=model.to_ldtp(series.scale, parts.inputs, parts.outputs),
-        multipliers=multipliers_of(c),
-        coefficients=c,
-        covariance=slopes @ root @ (slopes @ root).T,
-        covariance_freedom=float(freedom),
-        cost=float(freedom),
-        freedom=freedom,
-        result=Result.OK if found.converged else Result.NOT_CONVERGED,
-        harmonics=all_harmonics(N),
-        noise=noise_model(model, found.problem.S, series.scale, parts.outputs),
-        _coordinates=found.coordinates,
-        _root=root,
-        _scale=series.scale,
-    )
+    fitted = model.to_ldtp(series.scale, parts.inputs, parts.outputs)
+    sources = noise_model(model, found.problem.S, series.scale, parts.outputs)
+    return finished(found, fitted, series.scale, all_harmonics(N), freedom, False, sources)
 
 
 def _with_gain(

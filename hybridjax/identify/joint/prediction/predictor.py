@@ -14,8 +14,9 @@ from .problem import SeriesProblem
 from .series_part import SeriesPart
 
 
-# Periods after which the gain of a filter that still changes is refused, and the change, relative
-# to the covariance, that is the last. Doubled: noise that is seen half as well; a digit less.
+# Periods after which the gain of a filter that still changes is refused, and the change of a
+# covariance, relative to the standard deviations, that is the last. Doubled: noise that is seen
+# half as well; a digit less.
 _MOST_PERIODS, _SETTLED = 10_000, 1e-12
 
 
@@ -80,10 +81,15 @@ def _diagonal(a, b):
 
 def _innovations(noise: PeriodicModel):
     """Kalman's gain and the covariance of the innovations, section by section, in the steady
-    state: the periodic Riccati equation, iterated (Bittanti and Colaneri 2009)."""
-    P = np.eye(noise.dims[0])
+    state: the periodic Riccati equation, iterated (Bittanti and Colaneri 2009).
+
+    From the covariance of states that nobody observes, so that all numbers are in the units of
+    states and outputs, whatever these are.
+    """
+    P = _unobserved(noise)
+    unit, S = np.sqrt(np.diag(P)), np.zeros((noise.n_sections, *noise.D[0].shape[:1] * 2))
     for _ in range(_MOST_PERIODS):
-        before, K, S = P, [], []
+        before, known, K, S = P, S, [], []
         for A, B, C, D in zip(noise.A, noise.B, noise.C, noise.D, strict=True):
             S.append(C @ P @ C.T + D @ D.T)
             if not np.linalg.eigvalsh(S[-1])[0] > 0:
@@ -95,6 +101,24 @@ def _innovations(noise: PeriodicModel):
             left = A - K[-1] @ C
             entering = B - K[-1] @ D
             P = left @ P @ left.T + entering @ entering.T
-        if np.abs(P - before).max() <= _SETTLED * np.trace(S[0]):
-            return K, np.stack(S)
+        S = np.stack(S)
+        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+        if _settled(P, before, unit) and _settled(S, known, sizes):
+            return K, S
     raise DefinitionError("the noise has no steady state: give a stable model of it.")
+
+
+def _unobserved(noise: PeriodicModel) -> Float[np.ndarray, "d d"]:
+    """Covariance of a state that was zero, after as many periods as it has coordinates: what noise
+    ever reaches, it has reached by then."""
+    P = np.zeros((noise.dims[0], noise.dims[0]))
+    for _ in range(noise.dims[0]):
+        for A, B in zip(noise.A, noise.B, strict=True):
+            P = A @ P @ A.T + B @ B.T
+    return P
+
+
+def _settled(now, before, unit) -> bool:
+    """Whether covariances are what they were before, in units of standard deviations."""
+    limit = _SETTLED * unit[..., :, None] * unit[..., None, :]
+    return bool((np.abs(now - before) <= limit).all())

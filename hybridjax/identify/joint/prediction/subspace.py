@@ -15,7 +15,8 @@ from .series_part import SeriesPart
 _ROWS, _PERIODS = 3, 2
 # Sections that a state is seen through, at least. Doubled: more averaging.
 _SHORTEST_HORIZON = 8
-# Part of the rms that every regressor is shrunk by. Doubled: twice the bias, next to nothing.
+# Part by which the squared length of every regressor is made larger. Doubled: twice the bias, next
+# to nothing.
 _SHRINKAGE = 1e-6
 # Largest modulus of a multiplier of a start, and of its predictor. Doubled (1.98): predictions from
 # it would overflow.
@@ -31,7 +32,8 @@ def subspace_model(
 
     Each output is regressed on its own past and that of the inputs, section by section. What the
     past of a section adds to the outputs from there on is a matrix whose rank is the dimension of
-    the state (Chiuso 2007, "PBSID", for each section of the period).
+    the state (Chiuso 2007, "PBSID", for each section of the period). What came before a record
+    counts as zero: many short records that begin anywhere make a worse model to begin with.
 
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
@@ -120,10 +122,10 @@ def _later(rule, rows: int):
 
 def _regress(rows, target):
     """Least squares, shrunk a little, so that what is not excited has no part."""
-    gram = rows.T @ rows
-    return np.linalg.solve(
-        gram + _SHRINKAGE * np.diag(np.diag(gram) + gram.trace() / len(gram)), rows.T @ target
-    )
+    size = np.sqrt(np.square(rows).sum(axis=0))
+    rows = rows / np.where(size > 0, size, 1.0)
+    found = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
+    return found / np.where(size > 0, size, 1.0)[:, None]
 
 
 def _from_states(every, to_state, past: int, innovations: bool) -> PeriodicModel:

@@ -5,9 +5,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...multipliers.covariance import Covariance, correlated_cycles, serial_covariance
+from ...multipliers.covariance import Covariance
 from ...multipliers.denominator import Denominator
-from .channels import Columns, channel_misfits, misfit_of
+from .channels import misfit_of
+from .jackknife import jackknife
 from .shared_state import SharedStateModel, SharedStateProblem, simulate_state
 
 
@@ -28,11 +29,6 @@ _SETTLED_GAIN = 1e-2
 # If no halved step lowers the cost: the gain, relative to the cost, or the largest entry of the
 # step, that rounding explains. Doubled: iterations that stall count as converged more often.
 _STALLED_GAIN, _STALLED_STEP = 1e-6, 1e-8
-# Smallest share of its own error that the fit leaves to a sample, so that dividing by it stays
-# finite. Doubled: samples that the fit all but passes through weigh half as much.
-_SMALLEST_REMAINDER = 1e-3
-# By how much a cycle's own share is kept from one, for the same reason and with the same effect.
-_CYCLE_REMAINDER = 1e-6
 
 
 class SharedStateFit(NamedTuple):
@@ -143,42 +139,20 @@ def _pseudo_inverse(hessian: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P
 def denominator_of(fit: SharedStateFit, errors: Literal["residuals", "white"]) -> Denominator:
     """The characteristic polynomial of A, and the covariance of its coefficients.
 
-    By cycles, which may depend on their neighbors.
+    By blocks of cycles, whose errors may depend on each other and on the inputs.
     """
     problem, model, converged = fit
-    d = len(model.A)
-    hessian = misfit_of(problem, model).hessian
     c, slope = _characteristic_polynomial(model.A)
-    inverse = _pseudo_inverse(hessian)
-    to_c = np.zeros((d, len(inverse)))
-    to_c[:, : d * d] = slope
-    to_c = to_c @ inverse
-    white = to_c @ hessian @ to_c.T
-    if not np.linalg.eigvalsh(white)[0] > 0:
-        return Denominator(c, Covariance.unknown(d), converged)
-    if errors == "white":
-        return Denominator(c, Covariance(white, np.inf), converged)
-    # In units in which white noise makes the covariance of c one.
-    half = np.linalg.cholesky(white)
-    to_c = np.linalg.solve(half, to_c)
-    values, vectors = np.linalg.eigh(inverse)
+    values, vectors = np.linalg.eigh(_pseudo_inverse(misfit_of(problem, model).hessian))
     root = vectors * np.sqrt(np.maximum(values, 0))
-    S, T, N, ny = problem.y.shape
-    error, slopes = np.zeros((S, T, N, ny)), np.zeros((S, T, N, ny, len(inverse)), np.float32)
-    columns = Columns.of(problem, model)
-    for n, i, rows, e, found, leverage in channel_misfits(problem, model):
-        error[rows, n, i] = e / np.maximum(1 - leverage, _SMALLEST_REMAINDER)
-        slopes[rows, n, i] = found.dense(columns, rows) @ root
-    error, slopes = error.reshape(S, T, -1), slopes.reshape(S, T, N * ny, -1)
-    # What each cycle would miss a fit to the others by: errors that are large where inputs are, as
-    # those of distortion, draw the fit to themselves (MacKinnon and White 1985, HC3).
-    own = np.eye(N * ny) * (1 + _CYCLE_REMAINDER) - slopes @ slopes.swapaxes(2, 3)
-    error = np.linalg.solve(own, error[..., None])[..., 0]
-    mine = slopes @ (to_c @ hessian @ root).T
-    score = np.einsum("stad,sta->std", mine, error)
-    shares = (mine**2).sum(axis=2)
-    gradient = serial_covariance(score, correlated_cycles(np.linalg.eigvals(model.A), T))
-    covariance = Covariance(half @ gradient.matrix @ half.T, gradient.freedom(shares))
+    to_c = slope @ root[: slope.shape[1]]
+    white = to_c @ to_c.T
+    if not np.linalg.eigvalsh(white)[0] > 0:
+        covariance = Covariance.unknown(len(c))
+    elif errors == "white":
+        covariance = Covariance(white, np.inf)
+    else:
+        covariance = jackknife(problem, model, root, to_c)
     return Denominator(c, covariance, converged)
 
 
