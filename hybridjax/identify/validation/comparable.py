@@ -5,15 +5,15 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ....errors import DefinitionError
-from ....experiments.data import ExperimentData
-from ....experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
-from ....linear.ldtp import LDTP
-from ...joint.prediction.predictor import Predictor
-from ..parts import in_groups
-from ..series_fit import SeriesFit
-from ..simulation import can_be_compared
+from ...errors import DefinitionError
+from ...experiments.data import ExperimentData
+from ...experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
+from ...linear.ldtp import LDTP
+from ..joint.prediction.predictor import Predictor
+from ..series.parts import in_groups
+from ..series.series_fit import SeriesFit
 from .residual_tests import sections_of
+from .simulation import can_be_compared
 
 
 class Comparable:

@@ -17,10 +17,10 @@ from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
 from ..joint.ldtp_fit import LDTPFit
 from ..joint.prediction.predictor import Predictor
-from .checks.comparable import Comparable
-from .checks.power import smallest_visible
-from .checks.residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
-from .series_fit import SeriesFit
+from ..series.series_fit import SeriesFit
+from .comparable import Comparable
+from .power import smallest_visible
+from .residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
 from .simulation import simulate_record
 
 

@@ -14,7 +14,7 @@ from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
-from .checks.comparable import require_same_kind
+from .comparable import require_same_kind
 from .simulation import simulate_record
 
 
