@@ -152,7 +152,7 @@ def test_bad_data(model, first):
     study = hj.designs.Study(first, 2, 1e-4)
     data = measured(model, first)
     other = hj.ExperimentData(data.u, data.y, n_sections=8, periods=32, outputs=("a", "b"))
-    with pytest.raises(hj.DefinitionError, match="different outputs do not belong together"):
+    with pytest.raises(hj.DefinitionError, match="blocks of one study have different outputs"):
         study.add(data).add(other)
     failed = hj.ExperimentData(data.u, data.y, n_sections=8, periods=32, result=[3] * len(data.u))
     with pytest.raises(hj.DefinitionError, match="nothing was learnt: 0/8 ok"):

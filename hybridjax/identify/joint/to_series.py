@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..._core.arguments import require_same
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import all_harmonics
@@ -19,7 +20,6 @@ from .periodic_model import PeriodicModel
 from .prediction.problem import SeriesProblem
 from .prediction.series_part import SeriesPart
 from .prediction.subspace import subspace_model
-from .to_htf import require_same_kind
 
 
 def fit_to_series(
@@ -39,7 +39,7 @@ def fit_to_series(
     if not isinstance(guess, LDTP):
         model = subspace_model(series, given_dims(guess, N, "guess"), innovations)
     else:
-        require_same_kind(guess, parts)
+        require_same("guess and data", guess, parts)
         model = PeriodicModel.of(guess, series.scale)
         if innovations:
             model = _with_gain(model, problem, series)
