@@ -172,7 +172,7 @@ def validate(
     belong to the model, or leaves an output without any of its own.
     """
     free_start = start == "free"
-    model = _as_predicted(model, noise)
+    model = _with_noise(model, noise)
     records = Comparable(model, data, free_start, lags)
     N, outputs, ny = records.n_sections, records.outputs, len(records.outputs)
     counts = records.counts
@@ -232,9 +232,10 @@ def validate(
     )
 
 
-def _as_predicted(
+def _with_noise(
     model: LDTP | SeriesFit | LDTPFit, noise: LDTP | None
 ) -> LDTP | SeriesFit | Predictor:
+    """A predictor where noise is known, of a fit or beside a model; otherwise the model."""
     if noise is not None and not isinstance(model, LDTP):
         raise DefinitionError(
             f"`noise` belongs to an LDTP, but `model` is a {type(model).__name__}: give an LDTP, "
