@@ -170,9 +170,7 @@ def from_the_cycle(model, first):
 
 def test_what_is_left_of_the_start_is_refused(model, first, from_the_cycle):
     study = hj.designs.Study(first, 2, 1e-3)
-    with pytest.raises(
-        hj.DefinitionError, match="of the start's transient is left"
-    ):
+    with pytest.raises(hj.DefinitionError, match="of the start's transient is left"):
         study.add(from_the_cycle)
     found = study.add(hj.identify.remove_transient(from_the_cycle, 2).data)
     assert found.fit.contains(model.multipliers, 0.999).all()
