@@ -52,7 +52,7 @@ from .identify.multipliers.order import select_order as select_order
 from .identify.multipliers.structured import fit_multipliers as fit_multipliers
 from .identify.rational.fit import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
-from .identify.series.validation import validate as validate
+from .identify.validation.validate import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF
 from .linear.ldtp import LDTP as LDTP

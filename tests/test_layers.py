@@ -1,6 +1,8 @@
 """Imports flow one way, files and signatures stay small, and importing the package is cheap."""
 
 import ast
+import functools
+import graphlib
 import importlib
 import pathlib
 import subprocess
@@ -39,32 +41,49 @@ LAYERS = [
 ]
 
 
+@functools.cache
 def imported(file):
-    """Parts of hybridjax that a file imports, at its top or inside of functions."""
-    package = file.relative_to(ROOT).parts[:-1]
+    """What a file imports of hybridjax, at its top or inside of functions, as paths."""
+    package, found = file.relative_to(ROOT).parts[:-1], []
     for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            base = package[: len(package) - (node.level - 1)]
-            parts = (*base, *(node.module or "").split(".")) if node.module else base
-            yield from [parts[0]] if parts else [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hybridjax"):
-            parts = node.module.split(".")[1:]
-            yield from parts[:1] or [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
+            module = tuple(node.module.split(".")) if node.module else ()
+            if node.level:
+                module = package[: len(package) - (node.level - 1)] + module
+            elif module[:1] == ("hybridjax",):
+                module = module[1:]
+            else:
+                continue
+            found += [(*module, alias.name) for alias in node.names]
         elif isinstance(node, ast.Import):
-            names = [alias.name.split(".") for alias in node.names]
-            yield from [name[1] for name in names if name[0] == "hybridjax" and len(name) > 1]
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+            found += [name[1:] for name in names if name[0] == "hybridjax" and len(name) > 1]
+    return found
 
 
 FILES = sorted(f for f in ROOT.rglob("*.py") if f.name != "__init__.py")
+FOLDERS = sorted({f.parent for f in ROOT.rglob("*.py")})
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
 def test_imports_flow_one_way(file):
     own = file.relative_to(ROOT).parts[0].removesuffix(".py")
     assert own in LAYERS, f"{own} has no place in the layers yet"
-    for other in imported(file):
+    for other, *_ in imported(file):
         if other in LAYERS:
             assert LAYERS.index(other) <= LAYERS.index(own), f"{own} imports from {other}"
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
+def test_imports_flow_one_way_inside_of_folders(folder):
+    """Between its files and folders, each with all that is in it."""
+    where = folder.relative_to(ROOT).parts
+    depth, needs = len(where), {}
+    for file in folder.rglob("*.py"):
+        own = file.relative_to(folder).with_suffix("").parts[0]
+        others = {path[depth] for path in imported(file) if path[:depth] == where and path[depth:]}
+        needs.setdefault(own, set()).update(others - {own})
+    tuple(graphlib.TopologicalSorter(needs).static_order())
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
@@ -77,9 +96,6 @@ def test_files_and_signatures_stay_small(file):
             names = [x.arg for x in all_of_them]
             own = len(names) - (names[:1] in (["self"], ["cls"]))
             assert own <= 10, f"{node.name} has {own} parameters"
-
-
-FOLDERS = sorted({f.parent for f in FILES} | {ROOT})
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))

@@ -1,6 +1,7 @@
-"""Numbers and names, as users give them."""
+"""Numbers and names, as users give them, and whether things belong together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy.typing as npt
 
@@ -24,3 +25,14 @@ def names(kind: str, given: tuple[str, ...] | None, count: int) -> tuple[str, ..
     if len(given) != count:
         raise DefinitionError(f"{count} {kind} need {count} names, but `{kind}` is {given}.")
     return given
+
+
+def require_same(
+    what: str, a: Any, b: Any, fields: Iterable[str] = ("n_sections", "inputs", "outputs")
+) -> None:
+    """**Raises:** `DefinitionError` if two things ("model and data") differ in a field."""
+    for name in fields:
+        if getattr(a, name) != getattr(b, name):
+            raise DefinitionError(
+                f"{what} have different {name}: {getattr(a, name)} and {getattr(b, name)}."
+            )

@@ -39,11 +39,6 @@ class Memory:
             return values[key]
         return values.setdefault(key, make())
 
-    def is_new(self, owner: Any, key: Hashable) -> bool:
-        """Whether the key is met for the first time: of several threads, by one."""
-        mark = object()
-        return self._of(owner).setdefault(key, mark) is mark
-
     def _of(self, owner: Any) -> dict[Hashable, Any]:
         name = id(owner)
         with self._lock:

@@ -94,6 +94,7 @@ def choose_window(
     goal = Multipliers() if goal is None else goal
     N = model.n_sections
     tried: dict[tuple[int, int], OptimalDesign] = {}
+    acts = np.any(model.B, axis=(1, 2)) | np.any(model.D, axis=(1, 2))
 
     def attempt(first: int, length: int) -> float:
         key = first % N, length
@@ -109,7 +110,8 @@ def choose_window(
         step = max(length // 2, 1)
         around = N if best[1] == N else best[1] + length
         begin = 0 if best[1] == N else best[0] - step
-        arcs = [(begin + k, length) for k in range(0, around - (best[1] < N) * length + 1, step)]
+        starts = range(begin, begin + around - (best[1] < N) * length + 1, step)
+        arcs = [(n, length) for n in starts if acts[(n + np.arange(length)) % N].any()]
         arc = min(arcs, key=lambda one: attempt(*one))
         if attempt(*arc) * _BETTER > attempt(*best):
             break

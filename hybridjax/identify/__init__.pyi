@@ -17,7 +17,10 @@ from .multipliers.order import OrderSelection as OrderSelection
 from .multipliers.structured import StructuredFit as StructuredFit
 from .rational.aaa import AAAFit as AAAFit, fit_aaa as fit_aaa
 from .rational.fit import RationalFit as RationalFit
-from .series.amplitude import AmplitudeSweep as AmplitudeSweep, amplitude_sweep as amplitude_sweep
 from .series.realization import realize as realize
 from .series.series_fit import SeriesFit as SeriesFit
-from .series.validation import Validation as Validation
+from .validation.amplitude import (
+    AmplitudeSweep as AmplitudeSweep,
+    amplitude_sweep as amplitude_sweep,
+)
+from .validation.validate import Validation as Validation

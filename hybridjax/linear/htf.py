@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._core.arguments import Numbers, names
+from .._core.arguments import Numbers, names, require_same
 from .._core.boundary.arrays import Complexes, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
@@ -316,12 +316,8 @@ class HTF(eqx.Module):
         or outputs, or have no `H_0`.
         """
         require_x64()
-        for name in ("n_sections", "harmonics", "inputs", "outputs"):
-            mine, its = getattr(self, name), getattr(other, name)
-            if mine != its:
-                raise DefinitionError(
-                    f"Two HTFs with different {name} cannot be compared: {mine} and {its}."
-                )
+        fields = "n_sections", "harmonics", "inputs", "outputs"
+        require_same("HTFs to be compared", self, other, fields)
         if self.f.shape != other.f.shape or not (
             is_traced(self.f, other.f) or np.allclose(self.f, other.f, rtol=0, atol=_SAME_FREQUENCY)
         ):

@@ -20,7 +20,7 @@ from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.parts import Parts
 from ..identify.series.series_fit import SeriesFit
-from ..identify.series.validation import Validation
+from ..identify.validation.validate import Validation
 from .beats.response import PhaseResponse
 from .data import SectionData
 from .inspection.finding import Finding

@@ -15,8 +15,8 @@ from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.parts import Parts
 from ..identify.series.series_fit import SeriesFit
-from ..identify.series.simulation import can_be_compared, simulate_record
-from ..identify.series.validation import Validation, validate
+from ..identify.validation.simulation import can_be_compared, simulate_record
+from ..identify.validation.validate import Validation, validate
 from .data import SectionData
 
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
 from .._core.boundary.scalars import Number
@@ -84,12 +85,7 @@ def impulse_responses(
 
     **Raises:** `DefinitionError` if fit and data have different sections or names.
     """
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(fit, name) != getattr(data, name):
-            raise DefinitionError(
-                f"fit and data have different {name}: {getattr(fit, name)} and "
-                f"{getattr(data, name)}."
-            )
+    require_same("fit and data", fit, data)
     N, R = fit.numerators.shape[:2]
     if width is None:
         edge = min(input_band(data))

@@ -42,7 +42,8 @@ def check_system(system: HybridSystem) -> None:
         system.check()
 
 
-# Systems that were found to be well formed, but for their numbers.
+# Systems that were found to be well formed, but for their numbers. (A `Memory` forgets with its
+# object, and whoever tries values of a parameter makes a new one for each.)
 _checked: set[Hashable] = set()
 # So many of them. Doubled: twice as many kinds of systems can be taken turns with.
 _KEPT = 256

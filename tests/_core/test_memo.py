@@ -78,12 +78,3 @@ def test_objects_that_come_and_go_in_threads():
         list(pool.map(work, range(0, 80_000, 10_000)))
     gc.collect()
     assert len(memory) == 0
-
-
-def test_a_key_is_new_once_for_each_object():
-    class Thing:
-        pass
-
-    memory, one, other = Memory(), Thing(), Thing()
-    assert memory.is_new(one, "a") and not memory.is_new(one, "a")
-    assert memory.is_new(one, "b") and memory.is_new(other, "a")

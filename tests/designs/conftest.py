@@ -12,3 +12,13 @@ def model():
     B = np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, :, None]
     C = np.stack([np.ones((8, 2)), np.stack([np.sin(turn), np.cos(turn)], axis=1)], axis=1)
     return hj.LDTP(np.broadcast_to(A, (8, 2, 2)), B, C, inputs="u", outputs=("x", "v"))
+
+
+def expected_htf(model, design, noise, harmonics=None):
+    """The exact HTFs at the lines of a design, with the variance that they are measured with."""
+    htf = model.htf(design.frequencies, harmonics)
+    variance = design.expected_variance()[:, None, :] * np.square(list(noise.values()))[:, None]
+    return hj.HTF(
+        htf.f, htf.H, htf.harmonics, htf.n_sections, model.inputs, model.outputs,
+        variance=np.broadcast_to(variance, htf.H.shape),
+    )  # fmt: skip

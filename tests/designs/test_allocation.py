@@ -6,9 +6,11 @@ from scipy.optimize import minimize
 
 import hybridjax as hj
 from hybridjax.designs.allocation import allocate, certify
+from hybridjax.designs.candidates import Candidates
 from hybridjax.designs.limits import PowerLimits
 from hybridjax.designs.questions.question import Question
 from hybridjax.designs.questions.sensitivities import DirectSensitivities
+from hybridjax.experiments.design.partition import line_class
 
 
 def question(slopes, criterion="A"):
@@ -60,6 +62,22 @@ def test_several_limits(criterion, largest):
     assert found.certificate.excess < 1.021
     assert other.fun * (1 - 1e-6) < found.answer.criterion < other.fun * found.certificate.excess
     assert value(found.power) == pytest.approx(found.answer.criterion)
+
+
+def test_amplitudes_leave_place_for_one_cosine_of_each_class():
+    """In every experiment. Where all are as large as they may be, nothing is left."""
+    largest = [0.1, 0.2]
+    design = hj.Design.from_lines(
+        [[1 / 8, 2 / 8], [9 / 8, 6 / 8], [7 / 8, 2 / 8]],
+        [largest] * 3,
+        0.0,
+        n_sections=4,
+        periods=8,
+    )
+    cosines = Candidates.of(design)
+    most = np.where(line_class(cosines.line, 8) == 1, *largest)
+    both = limits(np.zeros(len(most))).and_of_amplitudes(most, cosines)
+    np.testing.assert_allclose(both.use(cosines.power_of(design)), [0, 1, 1])
 
 
 def test_the_certificate_bounds_every_other_choice():

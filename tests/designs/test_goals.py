@@ -6,6 +6,8 @@ from scipy.optimize import minimize
 
 import hybridjax as hj
 
+from .conftest import expected_htf
+
 
 N, NOISE = 4, {"y": 0.02}
 
@@ -23,16 +25,6 @@ def usual():
     return hj.multisine(N, 16, band=(0, 2), amplitude=0.1)
 
 
-def expected(model, design, harmonics=None):
-    """The exact HTFs at the lines of a design, with the variance that they are measured with."""
-    htf = model.htf(design.frequencies, harmonics)
-    variance = design.expected_variance(NOISE["y"])[:, None, :]
-    return hj.HTF(
-        htf.f, htf.H, htf.harmonics, N, model.inputs, model.outputs,
-        variance=np.broadcast_to(variance, htf.H.shape),
-    )  # fmt: skip
-
-
 def test_transfer_functions_in_a_band(model, usual):
     """Their mean variance is that which `fit_ldtp` says."""
     goal = hj.designs.FrequencyResponse((0.2, 0.8), wanted=(0, 1))
@@ -42,7 +34,7 @@ def test_transfer_functions_in_a_band(model, usual):
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
     size = (np.abs(model.htf(f, (0, 1)).H) ** 2).mean(axis=1).sum()
     for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
-        fit = hj.fit_ldtp(expected(model, design), model, direct=False)
+        fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model, direct=False)
         variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
         np.testing.assert_allclose(said, variance, rtol=0.02)
     near = hj.optimal_design(
@@ -69,7 +61,7 @@ def test_an_impulse_response_is_its_spectrum(model, usual):
 
 def misfit(model, design, fewer, harmonics):
     """Of the best model with fewer multipliers, as `fit_multipliers` finds it."""
-    fit = hj.fit_multipliers(expected(model, design, harmonics), fewer, check=False)
+    fit = hj.fit_multipliers(expected_htf(model, design, NOISE, harmonics), fewer, check=False)
     return fit.cost
 
 
@@ -117,7 +109,7 @@ def test_a_sum_with_weights(model, usual):
     harmonics = (-1, 0, 1)
     goal = hj.designs.Multipliers(weights=(1.0, -2.0), harmonics=harmonics)
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    bound = hj.identify.multiplier_bound(model, expected(model, plan.usual, harmonics))
+    bound = hj.identify.multiplier_bound(model, expected_htf(model, plan.usual, NOISE, harmonics))
     one, other = bound.multipliers.real
     gradient = -np.vander([one, other], 2) / np.array([[one - other], [other - one]])
     w = np.array([1.0, -2.0]) @ gradient

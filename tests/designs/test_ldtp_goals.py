@@ -5,29 +5,8 @@ import pytest
 
 import hybridjax as hj
 
-
-NOISE = {"y0": 0.01, "y1": 0.02}
-
-
-@pytest.fixture(scope="module")
-def model():
-    return hj.testing.synthetic_ldtp()
-
-
-@pytest.fixture(scope="module")
-def usual(model):
-    return hj.multisine(6, 32, band=(0, 3), inputs=model.inputs)
-
-
-def expected(model, design, harmonics=None):
-    """The exact HTFs at the lines of a design, with the variance that they are measured with."""
-    htf = model.htf(design.frequencies, harmonics)
-    std = np.array(list(NOISE.values()))
-    variance = design.expected_variance()[:, None, :] * std[:, None] ** 2
-    return hj.HTF(
-        htf.f, htf.H, htf.harmonics, 6, model.inputs, model.outputs,
-        variance=np.broadcast_to(variance, htf.H.shape),
-    )  # fmt: skip
+from .conftest import expected_htf
+from .two_inputs import NOISE, model as model, usual as usual
 
 
 @pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
@@ -37,7 +16,7 @@ def test_standard_errors_are_the_bound_of_the_ldtp(model, usual, harmonics):
     goal = hj.designs.Multipliers(estimator="fit_ldtp", harmonics=harmonics)
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
     assert plan.certificate < 1.03
-    bound = hj.identify.ldtp_bound(model, expected(model, plan.usual, harmonics))
+    bound = hj.identify.ldtp_bound(model, expected_htf(model, plan.usual, NOISE, harmonics))
     np.testing.assert_allclose(np.sum(plan.usual_variances), _total(bound), rtol=1e-5)
     free = hj.optimal_design(
         model, usual, goal=hj.designs.Multipliers(harmonics=(-1, 0, 1)), noise=NOISE
@@ -66,7 +45,7 @@ def test_no_other_design_is_better_than_the_certificate_allows(model, usual):
             inputs=model.inputs,
             amplitude=lambda f: rng.exponential(size=f.shape),
         ).scaled(0.1)
-        bound = hj.identify.ldtp_bound(model, expected(model, other))
+        bound = hj.identify.ldtp_bound(model, expected_htf(model, other, NOISE))
         assert _total(bound) > plan.criterion / plan.certificate
 
 
@@ -93,6 +72,6 @@ def test_multipliers_are_counted_as_the_model_has_them():
 
 
 def test_a_model_without_matrices_is_refused(model, usual):
-    fit = hj.fit_multipliers(expected(model, usual, (-1, 0, 1)), 2, check=False)
+    fit = hj.fit_multipliers(expected_htf(model, usual, NOISE, (-1, 0, 1)), 2, check=False)
     with pytest.raises(hj.DefinitionError, match="needs a model with matrices"):
         hj.optimal_design(fit, usual, goal=hj.designs.Multipliers(estimator="fit_ldtp"))

@@ -5,20 +5,11 @@ import pytest
 
 import hybridjax as hj
 
+from .two_inputs import NOISE, model as model, usual as usual
 
-NOISE = {"y0": 0.01, "y1": 0.02}
+
 GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 Limits = hj.designs.Limits
-
-
-@pytest.fixture(scope="module")
-def model():
-    return hj.testing.synthetic_ldtp()
-
-
-@pytest.fixture(scope="module")
-def usual(model):
-    return hj.multisine(6, 32, band=(0, 3), inputs=model.inputs)
 
 
 def optimal(model, usual, **options):

@@ -1,13 +1,18 @@
 """Designs for a question: what they are worth, and that this is true."""
 
+import functools
+
 import numpy as np
 import pytest
 
 import hybridjax as hj
 
+from .conftest import expected_htf
+
 
 NOISE = {"yM": 1e-4, "vM": 3e-4}
 HARMONICS = (-2, -1, 0, 1, 2)
+with_variance = functools.partial(expected_htf, noise=NOISE, harmonics=HARMONICS)
 
 
 @pytest.fixture(scope="module")
@@ -19,17 +24,6 @@ def usual():
 @pytest.fixture(scope="module")
 def plan(isochron_ldtp, usual):
     return hj.optimal_design(isochron_ldtp, usual, noise=NOISE)
-
-
-def with_variance(model, design):
-    """The model's HTFs at the lines of a design, with the variance that they are measured with."""
-    htf = model.htf(design.frequencies, HARMONICS)
-    std = np.array(list(NOISE.values()))
-    variance = design.expected_variance()[:, None, :] * std[:, None] ** 2
-    return hj.HTF(
-        htf.f, htf.H, HARMONICS, 32, "u", ("yM", "vM"),
-        variance=np.broadcast_to(variance, htf.H.shape),
-    )  # fmt: skip
 
 
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):

@@ -5,6 +5,8 @@ import pytest
 
 import hybridjax as hj
 
+from .conftest import expected_htf
+
 
 N, NOISE = 4, {"y": 0.02}
 GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
@@ -29,9 +31,7 @@ def plan(models, usual):
 
 def variance(model, design):
     """Of the multipliers, as `multiplier_bound` has it."""
-    htf = model.htf(design.frequencies, (-1, 0, 1))
-    v = np.broadcast_to(design.expected_variance(NOISE["y"])[:, None], htf.H.shape)
-    htf = hj.HTF(htf.f, htf.H, (-1, 0, 1), N, "u", "y", variance=v)
+    htf = expected_htf(model, design, NOISE, (-1, 0, 1))
     return np.trace(hj.identify.multiplier_bound(model, htf).multiplier_covariances[0])
 
 
@@ -99,10 +99,7 @@ def test_models_that_differ_are_refused(usual):
 
 def test_draws_have_the_covariance_of_the_fit():
     model, design = of(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
-    htf = model.htf(design.frequencies)
-    v = np.broadcast_to(design.expected_variance(NOISE["y"])[:, None], htf.H.shape)
-    htf = hj.HTF(htf.f, htf.H, htf.harmonics, N, "u", "y", variance=v)
-    fit = hj.fit_ldtp(htf, model)
+    fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
     drawn = hj.designs.draws(fit, 400)
     c = np.array([np.poly(one.multipliers).real[1:] for one in drawn])
     np.testing.assert_allclose(

@@ -6,19 +6,13 @@ import pytest
 import hybridjax as hj
 from hybridjax.designs.sequences import random_sequence
 
-
-NOISE = {"y0": 0.01, "y1": 0.02}
-
-
-@pytest.fixture(scope="module")
-def model():
-    return hj.testing.synthetic_ldtp()
+from .two_inputs import NOISE, model as model, usual as usual
 
 
 @pytest.fixture(scope="module")
-def plan(model):
+def plan(model, usual):
     return hj.optimal_design(
-        model, hj.multisine(6, 32, band=(0, 3), inputs=model.inputs), noise=NOISE,
+        model, usual, noise=NOISE,
         goal=hj.designs.Multipliers(harmonics=(-2, -1, 0, 1, 2)), limit={"u0": 0.1, "u1": 0.1},
     )  # fmt: skip
 

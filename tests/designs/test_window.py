@@ -5,19 +5,10 @@ import pytest
 
 import hybridjax as hj
 
+from .two_inputs import NOISE, model as model, usual as usual
 
-NOISE = {"y0": 0.01, "y1": 0.02}
+
 GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
-
-
-@pytest.fixture(scope="module")
-def model():
-    return hj.testing.synthetic_ldtp()
-
-
-@pytest.fixture(scope="module")
-def usual(model):
-    return hj.multisine(6, 32, band=(0, 3), inputs=model.inputs)
 
 
 def test_estimates_are_those_of_the_system_from_the_signal(model, usual):
@@ -47,6 +38,22 @@ def test_the_best_window_is_the_best_of_all_arcs(model, usual):
     assert choice.saved == pytest.approx(plan(model).criterion / min(every)) and choice.saved > 1
     assert choice.certificate.max() < 1.03
     assert "does the work of" in repr(choice)
+
+
+def test_windows_are_halved_more_than_once():
+    """Of one slow state, what counts is the sum of B in the window, by the root of its length: the
+    best half is that from 4 on, and the best two sections lie half before it. (In arcs where a push
+    does nothing there is nothing to design.)"""
+    push = np.array([0, 0, 0, 0.9, 1, 0.5, 0.5, 0.5])[:, None, None]
+    slow = hj.LDTP(np.full((8, 1, 1), 0.99), push, np.ones((8, 1, 1)))
+    choice = hj.designs.choose_window(
+        slow, hj.multisine(8, 16, band=(0, 2)), noise={"y": 0.01}, limit={"u": 0.1},
+        goal=hj.designs.Multipliers(harmonics=0, overhang=0),
+    )  # fmt: skip
+    assert np.flatnonzero(choice.window.weights).tolist() == [3, 4]
+    share = np.array([3.4**2 / 8, 2.5**2 / 4, 1.9**2 / 2, 1.0])
+    found = [choice.criterion[choice.length == length].min() for length in (8, 4, 2, 1)]
+    np.testing.assert_allclose(found[0] / found, share / share[0], rtol=0.1)
 
 
 def test_nothing_gained_is_said():

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.identify.joint.characteristic import characteristic_slopes
 from hybridjax.identify.joint.coordinates import local_coordinates
 from hybridjax.identify.joint.periodic_model import PeriodicModel
 from hybridjax.identify.joint.prediction.predictor import Predictor
@@ -142,8 +143,12 @@ def test_a_drift_is_found_where_samples_are_missing(small):
 
 def test_errors_of_short_records_are_as_large_as_said(small):
     """Twelve records of five cycles, with starts and drifts of their own: each takes degrees of
-    freedom, without which the distances would be a third too large."""
-    square, runs = 0.0, 40
+    freedom, without which errors would seem a third too small. Beside the covariance that white
+    noise of the true size makes at the truth."""
+    coordinates = local_coordinates(PeriodicModel.of(small, ONE), True)
+    _, slopes = characteristic_slopes(coordinates)
+    variance = np.tile(0.1**2 * np.eye(2), (4, 1, 1))
+    square, ratio, runs = 0.0, 0.0, 8
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         records = []
@@ -153,7 +158,12 @@ def test_errors_of_short_records_are_as_large_as_said(small):
             records.append(hj.Record(one.u, y, n_sections=4, drift=np.inf))
         fit = hj.fit_ldtp(records, small)
         assert fit.freedom == 12 * (40 - 8 - 2) - fit.unknowns
+        part = SeriesPart.of(CycleGrid.from_records(records), ONE)
+        equations = SeriesProblem([part], variance, False, True, 0).linearize(coordinates)
+        true = equations.spread().covariance(slopes)
+        ratio += np.trace(np.linalg.solve(true, fit.covariance)) / 2 / runs
         square += fit.distance(small.multipliers)[0]
+    assert ratio == pytest.approx(1, abs=0.15)
     assert 1e-3 < stats.chi2(2 * runs).cdf(square) < 1 - 1e-3
 
 

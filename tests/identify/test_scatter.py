@@ -1,5 +1,7 @@
 """Variances of estimates: noise, distortion, degrees of freedom, and when they cannot be had."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -113,6 +115,19 @@ def test_p_values_of_a_model(model):
     np.testing.assert_allclose(hj.identify.htf_p_values(parts, truth), p[0], atol=1e-12)
     other = hj.HTF(truth.f, truth.H + 2, (-1, 0, 1), N, truth.inputs, truth.outputs)
     assert hj.identify.htf_p_values(data[0], other).max() < 0.05
+
+
+def test_p_values_of_experiments_of_different_strength(model):
+    """The weaker ones have larger errors, and a smaller part of the estimate."""
+    truth, design = model.htf(LINES.frequencies[::3], 0), LINES.realizations(4)
+    strength = np.repeat([0.2, 1.0, 1.0, 3.0], 4)[design.experiment]
+    design = dataclasses.replace(design, amplitude=strength * design.amplitude)
+    clean = hj.experiments.simulate_experiments(model, design, start="periodic")
+    data = [hj.experiments.add_noise(clean, std=0.1, seed=seed) for seed in range(40)]
+    p = np.stack([hj.identify.htf_p_values(one, truth) for one in data])
+    assert stats.kstest(p.ravel(), "uniform").pvalue > 1e-3
+    # The estimate, of which no errors are left, is as likely as can be.
+    assert hj.identify.htf_p_values(data[0], hj.estimate_htf(data[0], 0)).min() > 0.99
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,9 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.identify.multipliers.error_spectrum import error_spectrum
+from hybridjax.identify.multipliers.error_weights import spectral_weights
+from hybridjax.identify.multipliers.variable_projection import group_htf
 
 from ..linear.conftest import blocks_at_random
 
@@ -113,6 +116,22 @@ def test_errors_with_the_poles_of_the_system_are_weighted_without_variances(smal
         square += [fit.compare(true).error[0] ** 2 for fit in (told, blind)]
     assert covered(held, runs)
     assert square[1] < 1.05 * square[0]
+
+
+def test_the_spectrum_of_errors_is_found(small):
+    """On average, of each output and at each frequency, whatever it was supposed to be."""
+    model, htf = small
+    f = np.asarray(htf.f)
+    c = np.poly(model.multipliers).real[1:]
+    chi = np.polyval(np.append(1, c)[::-1], np.exp(-2j * np.pi * f))
+    true = np.array([3e-3, 1e-2]) + np.array([1e-2, 2e-3]) / np.abs(chi[:, None]) ** 2
+    supposed = spectral_weights(htf, np.ones(2), np.linspace(1e-3, 4e-3, 160).reshape(80, 2))
+    variance = np.broadcast_to(true[..., None], htf.H.shape)
+    found = []
+    for seed in range(100):
+        groups = group_htf(noisy(htf, variance, np.random.default_rng(seed)), supposed, 13)
+        found.append(error_spectrum(groups, c, f, 2))
+    np.testing.assert_allclose(np.mean(found, axis=0), true, rtol=0.04)
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..progress import counted, say
+from .job import Job
 from .layout import Store
-from .run import Job
 from .worker import Setup, method_of, nothing, work
 
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from ...errors import DefinitionError
 from ..progress import say
+from .job import Job
 from .layout import Layout, Store
 from .memory import MemoryStore
-from .run import Job, run_pieces
+from .run import run_pieces
 from .zarr_store import ZarrStore, make_store, open_store
 
 

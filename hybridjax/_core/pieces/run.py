@@ -2,10 +2,9 @@
 
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
 from ..packages import package
 from ..progress import counted
+from .job import Job
 from .layout import Store
 
 
@@ -16,16 +15,6 @@ class DaskClient(Protocol):
     def submit(self, function: Any, *arguments: Any, **options: Any) -> Any: ...
 
     def register_plugin(self, plugin: Any, name: str) -> Any: ...
-
-
-@runtime_checkable
-class Job(Protocol):
-    """Work in pieces, which does not depend on who does which, and in which order. It is pickled
-    where workers do it."""
-
-    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
-        """Piece k, by so many threads (by default all cores)."""
-        ...
 
 
 def run_pieces(

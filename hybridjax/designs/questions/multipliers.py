@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ...errors import DefinitionError
+from ...identify.multipliers.denominator import multipliers_of
 from ..candidates import Candidates
 from ..goals import Multipliers
 from ..noise import Noise
@@ -37,8 +38,7 @@ def about_multipliers(
     if goal.estimator == "fit_ldtp":
         unknowns = ldtp_unknowns(model, cosines, goal.harmonics, noise, power)
         c, slopes = unknowns.characteristic()
-        multipliers = np.roots([1.0, *c]).astype(complex)
-        multipliers = multipliers[np.lexsort((-multipliers.imag, -np.abs(multipliers)))]
+        multipliers = multipliers_of(c)
         goal = _of_minimal(goal, np.asarray(model.multipliers), multipliers)
         wanted, names = wanted_parts(goal, multipliers, c)
         wanted, names = weighted(wanted @ slopes, names, goal.weights)

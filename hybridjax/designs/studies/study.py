@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.arguments import require_same
 from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Order, Positive, Seed
@@ -209,12 +210,7 @@ class Study(eqx.Module):
         blocks = () if self._found is None else self._found.blocks
         new = block_of(data, self.goal, repeats)
         for known in blocks[:1]:
-            for name in ("inputs", "outputs"):
-                if getattr(new, name) != getattr(known, name):
-                    raise DefinitionError(
-                        f"blocks with different {name} do not belong together: "
-                        f"{getattr(known, name)} and {getattr(new, name)}."
-                    )
+            require_same("blocks of one study", known, new, ("inputs", "outputs"))
         blocks = (*blocks, new)
         best = estimate(blocks, self.order, self.goal)
         if not best.doubt:

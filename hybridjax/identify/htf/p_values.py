@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.arguments import require_same
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Index, Probability
 from ..._core.precision import require_x64
@@ -41,12 +42,7 @@ def htf_p_values(
     """
     require_x64()
     sums = spectral_sums(data, SumOptions(lambda N: true.harmonics, threshold, highest, repeats))
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(sums.setup, name) != getattr(true, name):
-            raise DefinitionError(
-                f"experiments and HTFs have different {name}: {getattr(sums.setup, name)} and "
-                f"{getattr(true, name)}."
-            )
+    require_same("experiments and HTFs", sums.setup, true)
     rows = np.flatnonzero(sums.solvable(sums.ran))
     apart = np.abs(np.asarray(true.f)[:, None] * sums.setup.periods - sums.line[rows])
     if not len(rows) or (apart.min(axis=1) > _SAME_LINE).any():

@@ -23,6 +23,7 @@ from ..._core.boundary.kinds import Index, Order
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData, Simulated
 from ...experiments.design.partition import line_class
+from ..multipliers.denominator import multipliers_of
 
 
 # The largest number of multipliers that is tried. Doubled: longer, and records must have 8 more
@@ -139,13 +140,11 @@ def remove_transient(
         transient = transient.reshape(-1, ny) * size
         clean[s] -= transient
         removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
-    roots = np.roots(np.r_[1.0, known])
-    roots = roots[np.lexsort((-roots.imag, -np.abs(roots)))].astype(complex)
     failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
     # Events, some of which lie in the cycles that were cut off, are left out.
     simulated = None if data.simulated is None else Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
-    return TransientFit(data, roots, removed)
+    return TransientFit(data, multipliers_of(known), removed)
 
 
 def _require_periodic(data: ExperimentData) -> None:

@@ -12,8 +12,8 @@ from ...experiments.record import RecordedData
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .ldtp_fit import LDTPFit
-from .prediction.fit import fit_to_series
 from .to_htf import fit_to_htf
+from .to_series import fit_to_series
 
 
 @checked

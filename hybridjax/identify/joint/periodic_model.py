@@ -55,8 +55,8 @@ class PeriodicModel(NamedTuple):
             product = self.A[(first + k) % self.n_sections] @ product
         return product
 
-    def predictor(self) -> "PeriodicModel":
-        """With the A that carries errors of predictions on."""
+    def error_model(self) -> "PeriodicModel":
+        """With the A - K C that carries errors of predictions on, in place of A."""
         return self._replace(A=[A - K @ C for A, K, C in zip(self.A, self.K, self.C, strict=True)])
 
     def to_ldtp(

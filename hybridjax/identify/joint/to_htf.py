@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..._core.arguments import require_same
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
@@ -29,7 +30,7 @@ def fit_to_htf(htf: HTF, guess, direct: bool, max_steps: int) -> LDTPFit:
     start = guess
     if not isinstance(guess, LDTP):
         start = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
-    require_same_kind(start, htf)
+    require_same("guess and data", start, htf)
     problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
     model = PeriodicModel.of(start, scale)
     if not direct:
@@ -55,13 +56,3 @@ def fit_to_htf(htf: HTF, guess, direct: bool, max_steps: int) -> LDTPFit:
         found = minimize(problem, found.coordinates.model, direct, max_steps)
     fitted = found.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)
     return finished(found, fitted, scale, htf.harmonics, freedom, htf.variance is not None)
-
-
-def require_same_kind(model: LDTP, data) -> None:
-    """**Raises:** `DefinitionError` if a guess and data have different N, inputs or outputs."""
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(model, name) != getattr(data, name):
-            raise DefinitionError(
-                f"guess and data have different {name}: {getattr(model, name)} and "
-                f"{getattr(data, name)}."
-            )

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..._core.arguments import require_same
 from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index
@@ -38,12 +39,7 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
 
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
-    for name in ("n_sections", "inputs", "outputs"):
-        if getattr(model, name) != getattr(htf, name):
-            raise DefinitionError(
-                f"model and HTFs have different {name}: {getattr(model, name)} and "
-                f"{getattr(htf, name)}."
-            )
+    require_same("model and HTFs", model, htf)
     if htf.variance is None:
         raise DefinitionError("a bound needs the variances of the HTFs, and these have none.")
     H = model.htf(htf.f, htf.harmonics).H

@@ -18,6 +18,9 @@ _SLOWEST = 0.99
 _FASTEST = 1e-3
 # Share of a record that lags may take. Doubled: sums over fewer pairs, which scatter more.
 _LARGEST_SHARE = 0.25
+# Smallest share of its errors that a fit to all leaves to a block, so that dividing by it stays
+# finite. Doubled: blocks that the others hardly predict weigh half as much.
+_SMALLEST_REMAINDER = 0.1
 
 
 class Covariance(NamedTuple):
@@ -69,6 +72,20 @@ def fading(c: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
     """Coefficients of chi, with responses that fade where those of c do not."""
     slowest = np.abs(np.roots([1.0, *c])).max(initial=_FASTEST)
     return c * min(1.0, _SLOWEST / slowest) ** np.arange(1, len(c) + 1)
+
+
+def in_blocks(x: Float[np.ndarray, "S T *rest"], count: int) -> Float[np.ndarray, "B length *rest"]:
+    """The T cycles of each record in so many blocks, the last one filled up with zeros."""
+    S, T, *rest = x.shape
+    length = -(-T // count)
+    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(rest)
+    return np.pad(x, padding).reshape(S * count, length, *rest)
+
+
+def inverse_of_remainder(taken: Float[np.ndarray, "B k k"]) -> Float[np.ndarray, "B k k"]:
+    """That of 1 less the share of a block's errors that a fit to all takes."""
+    values, vectors = np.linalg.eigh(np.eye(taken.shape[1]) - taken)
+    return vectors / np.maximum(values, _SMALLEST_REMAINDER)[:, None] @ vectors.swapaxes(1, 2)
 
 
 def block_freedom(

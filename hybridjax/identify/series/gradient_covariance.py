@@ -3,16 +3,19 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import Covariance, block_freedom, fading
+from ..multipliers.covariance import (
+    Covariance,
+    block_freedom,
+    fading,
+    in_blocks,
+    inverse_of_remainder,
+)
 from ..multipliers.error_spectrum import amounts
 from .cycle_filters import divide_by_chi
 from .linearization import Linearization, each_part, linearize
 from .output_error import OutputErrorProblem, Part
 
 
-# Smallest share of its errors that a fit to all leaves to a block, so that dividing by it stays
-# finite. Doubled: blocks that the others hardly predict weigh half as much.
-_SMALLEST_REMAINDER = 0.1
 # Largest correction of a covariance for the freedom that the minimum takes: to 1 / 0.5. Doubled:
 # none.
 _SMALLEST_FREEDOM = 0.5
@@ -48,22 +51,15 @@ def gradient_covariance(
         return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
 
     def section(k, part, n, fit, regression):
-        T = part.y.shape[1]
-        count = max(1, T // cycles)
-        length = -(-T // count)
-
-        def blocks(x):  # (S, T, ...) -> (S count, length, ...)
-            padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * (x.ndim - 2)
-            return np.pad(x, padding).reshape(len(x) * count, length, *x.shape[2:])
-
+        count = max(1, part.y.shape[1] // cycles)
         weight = part.weight[:, :, n, fit.outputs, None]
 
         def through_system(x):  # the products with noise that has passed it, of those with white
             return divide_by_chi(memory, (weight * x)[:, ::-1])
 
-        inputs, starts = blocks(regression.input_basis(fit.root)), blocks(regression.basis)
-        left, axes = np.linalg.eigh(np.eye(length) - inputs @ inputs.swapaxes(1, 2))
-        left = np.maximum(left, _SMALLEST_REMAINDER)[:, None]
+        bases = regression.input_basis(fit.root), regression.basis
+        inputs, starts = (in_blocks(basis, count) for basis in bases)
+        weights = inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
         x = outputs(k, part, n)[:, :, fit.outputs]
         error = fit.errors(regression, x).reshape(x.shape)
         _, slopes = fit.first.samples(found.c, regression, x[..., :1])
@@ -71,8 +67,8 @@ def gradient_covariance(
         square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, through_system(error))]
         filtered = through_system(slopes)
         filtered = np.einsum("stid,stie->de", filtered, filtered)
-        slopes = np.einsum("bkl,blid->bkid", axes / left @ axes.swapaxes(1, 2), blocks(slopes))
-        score = np.einsum("bkid,bkic->bcd", slopes, blocks(error))
+        slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))
+        score = np.einsum("bkid,bkic->bcd", slopes, in_blocks(error, count))
         expected = np.einsum("bkid,bkie->bde", slopes, slopes)
         for basis in (inputs, starts):
             along = np.einsum("bkr,bkid->brid", basis, slopes)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ...._core.arguments import require_same
 from ....errors import DefinitionError
 from ....experiments.record import Record
 from ....linear.ldtp import LDTP
@@ -44,12 +45,7 @@ class Predictor(NamedTuple):
         **Raises:** `DefinitionError` if these do not fit together, or an output has no noise of its
         own.
         """
-        for name in ("n_sections", "outputs"):
-            if getattr(model, name) != getattr(noise, name):
-                raise DefinitionError(
-                    f"model and noise have different {name}: {getattr(model, name)} and "
-                    f"{getattr(noise, name)}."
-                )
+        require_same("model and noise", model, noise, ("n_sections", "outputs"))
         ones = np.ones(len(model.outputs))
         own, other = PeriodicModel.of(model, ones), PeriodicModel.of(noise, ones)
         K, S = _innovations(other)

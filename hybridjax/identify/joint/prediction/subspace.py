@@ -18,8 +18,8 @@ _SHORTEST_HORIZON = 8
 # Part by which the squared length of every regressor is made larger. Doubled: twice the bias, next
 # to nothing.
 _SHRINKAGE = 1e-6
-# Largest modulus of a multiplier of a start, and of its predictor. Doubled (1.98): predictions from
-# it would overflow.
+# Largest modulus of a multiplier of a start, and of the errors of its predictions. Doubled
+# (1.98): predictions from it would overflow.
 _LARGEST_MODULUS = 0.99
 # Samples that are looked at, of data that are read part by part. Doubled: twice the memory.
 _SAMPLES = 200_000
@@ -148,6 +148,6 @@ def _from_states(every, to_state, past: int, innovations: bool) -> PeriodicModel
     model = model._replace(A=[a * shrunk for a in A])
     if not innovations:
         return model._replace(K=[k[:, :0] for k in K])
-    while np.abs(np.linalg.eigvals(model.predictor().monodromy())).max() > _LARGEST_MODULUS:
+    while np.abs(np.linalg.eigvals(model.error_model().monodromy())).max() > _LARGEST_MODULUS:
         model = model._replace(K=[k / 2 for k in model.K])
     return model

@@ -3,7 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
-from ...multipliers.covariance import Covariance, block_freedom, correlated_cycles
+from ...multipliers.covariance import (
+    Covariance,
+    block_freedom,
+    correlated_cycles,
+    in_blocks,
+    inverse_of_remainder,
+)
 from .channels import Columns, channel_misfits
 from .shared_state import SharedStateModel, SharedStateProblem
 
@@ -12,9 +18,6 @@ from .shared_state import SharedStateModel, SharedStateProblem
 # other. Doubled: more is missed of what distant cycles have in common, and the covariance scatters
 # 0.7 times as much.
 _BLOCKS = 10
-# Smallest share of its errors that a fit to all leaves to a block, so that dividing by it stays
-# finite. Doubled: blocks that the others hardly predict weigh half as much.
-_SMALLEST_REMAINDER = 0.1
 
 
 def jackknife(
@@ -38,26 +41,20 @@ def jackknife(
     S, T = problem.y.shape[:2]
     lags = correlated_cycles(np.linalg.eigvals(model.A), T)
     count = max(1, T // max(lags + 1, S * T // _BLOCKS))
-    length = -(-T // count)
     columns, P = Columns.of(problem, model), root.shape[1]
-
-    def blocks(x):  # (S, T, ...) -> (S count, length, ...)
-        padded = np.pad(x, [(0, 0), (0, count * length - T), (0, 0)])
-        return padded.reshape(S * count, length, -1)
-
     own, along = np.zeros((S * count, P, P)), np.zeros((S * count, P, 1))
     for n, i, rows, e, found, _ in channel_misfits(problem, model):
         error, slopes = np.zeros((S, T, 1)), np.zeros((S, T, P))
         error[rows, 0], slopes[rows] = e, found.dense(columns, rows) @ root
         basis = np.concatenate([found.basis, problem.direct[n][i].drift], axis=2)
-        error, slopes, basis = blocks(error), blocks(slopes), blocks(basis)
+        error, slopes, basis = (in_blocks(x, count) for x in (error, slopes, basis))
         across = basis.swapaxes(1, 2)
-        inverse = _inverse_of_remainder(across @ basis)
+        inverse = inverse_of_remainder(across @ basis)
         # (1 - Q Q')^-1 = 1 + Q (1 - Q' Q)^-1 Q' for the basis Q of what is linear in this output.
         outer = slopes.swapaxes(1, 2) @ basis @ inverse
         own += slopes.swapaxes(1, 2) @ slopes + outer @ (across @ slopes)
         along += slopes.swapaxes(1, 2) @ error + outer @ (across @ error)
-    inverse = _inverse_of_remainder(own)
+    inverse = inverse_of_remainder(own)
     half = np.linalg.cholesky(to_c @ to_c.T)
     to_c = np.linalg.solve(half, to_c)  # in units in which white noise makes the covariance one
     score = (to_c @ inverse @ along)[..., 0]
@@ -65,9 +62,3 @@ def jackknife(
     unit = np.linalg.inv(np.linalg.cholesky(share.sum(axis=0)))
     freedom = block_freedom(score @ unit.T, unit @ share @ unit.T)
     return Covariance(half @ score.T @ score @ half.T, freedom)
-
-
-def _inverse_of_remainder(taken: Float[np.ndarray, "B k k"]) -> Float[np.ndarray, "B k k"]:
-    """That of 1 less a block's share."""
-    values, vectors = np.linalg.eigh(np.eye(taken.shape[1]) - taken)
-    return vectors / np.maximum(values, _SMALLEST_REMAINDER)[:, None] @ vectors.swapaxes(1, 2)

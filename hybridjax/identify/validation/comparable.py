@@ -5,15 +5,15 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ....errors import DefinitionError
-from ....experiments.data import ExperimentData
-from ....experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
-from ....linear.ldtp import LDTP
-from ...joint.prediction.predictor import Predictor
-from ..parts import in_groups
-from ..series_fit import SeriesFit
-from ..simulation import can_be_compared
+from ..._core.arguments import require_same
+from ...errors import DefinitionError
+from ...experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
+from ...linear.ldtp import LDTP
+from ..joint.prediction.predictor import Predictor
+from ..series.parts import in_groups
+from ..series.series_fit import SeriesFit
 from .residual_tests import sections_of
+from .simulation import can_be_compared
 
 
 class Comparable:
@@ -41,7 +41,7 @@ class Comparable:
         first = None
         for record in each_uninterrupted_record(self._data):
             if first is None:
-                require_same_kind(model, record)
+                require_same("model and data", model, record)
                 first, N = record, record.n_sections
                 self.counts = Counts(lags or N, N, record.y.shape[1])
             longest = max(longest, len(record.u))
@@ -100,11 +100,3 @@ class Counts:
     def spread(self) -> Float[np.ndarray, " ny"]:
         """Standard deviation of each output."""
         return np.sqrt(self._square / np.maximum(self._count, 1))
-
-
-def require_same_kind(model: LDTP | SeriesFit | Predictor, data: Record | ExperimentData) -> None:
-    """**Raises:** `DefinitionError` if model and data have different N, inputs or outputs."""
-    for name in ("n_sections", "inputs", "outputs"):
-        its, of_data = getattr(model, name), getattr(data, name)
-        if its != of_data:
-            raise DefinitionError(f"model and data have different {name}: {its} and {of_data}.")

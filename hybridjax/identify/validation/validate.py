@@ -17,10 +17,10 @@ from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
 from ..joint.ldtp_fit import LDTPFit
 from ..joint.prediction.predictor import Predictor
-from .checks.comparable import Comparable
-from .checks.power import smallest_visible
-from .checks.residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
-from .series_fit import SeriesFit
+from ..series.series_fit import SeriesFit
+from .comparable import Comparable
+from .power import smallest_visible
+from .residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
 from .simulation import simulate_record
 
 
@@ -172,7 +172,7 @@ def validate(
     belong to the model, or leaves an output without any of its own.
     """
     free_start = start == "free"
-    model = _as_predicted(model, noise)
+    model = _with_noise(model, noise)
     records = Comparable(model, data, free_start, lags)
     N, outputs, ny = records.n_sections, records.outputs, len(records.outputs)
     counts = records.counts
@@ -232,9 +232,10 @@ def validate(
     )
 
 
-def _as_predicted(
+def _with_noise(
     model: LDTP | SeriesFit | LDTPFit, noise: LDTP | None
 ) -> LDTP | SeriesFit | Predictor:
+    """A predictor where noise is known, of a fit or beside a model; otherwise the model."""
     if noise is not None and not isinstance(model, LDTP):
         raise DefinitionError(
             f"`noise` belongs to an LDTP, but `model` is a {type(model).__name__}: give an LDTP, "

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from ...experiments.record import Record
 from ...linear.ldtp import LDTP
 from ..joint.prediction.predictor import Predictor
-from .cycle_filters import divide_by_chi, lagged_inputs, start_responses
-from .cycle_grid import count_cycles, drift_waves
-from .series_fit import SeriesFit
+from ..series.cycle_filters import divide_by_chi, lagged_inputs, start_responses
+from ..series.cycle_grid import count_cycles, drift_waves
+from ..series.series_fit import SeriesFit
 
 
 # Samples for each unknown of its start and drift, which a record must have more of to say anything

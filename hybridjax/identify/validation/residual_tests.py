@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from ....experiments.record import Record
+from ...experiments.record import Record
 
 
 # Samples of a section, below which a correlation says nothing. Doubled: more records are refused.

@@ -5,21 +5,21 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
-from ....errors import DefinitionError
-from ....experiments.record import RecordedData
-from ....linear.frequency_response import all_harmonics
-from ....linear.ldtp import LDTP
-from ...series.parts import Parts
-from ...series.realization import given_dims
-from ..coordinates import local_coordinates
-from ..ldtp_fit import LDTPFit, finished
-from ..minimize import minimize
-from ..noise import noise_model
-from ..periodic_model import PeriodicModel
-from ..to_htf import require_same_kind
-from .problem import SeriesProblem
-from .series_part import SeriesPart
-from .subspace import subspace_model
+from ..._core.arguments import require_same
+from ...errors import DefinitionError
+from ...experiments.record import RecordedData
+from ...linear.frequency_response import all_harmonics
+from ...linear.ldtp import LDTP
+from ..series.parts import Parts
+from ..series.realization import given_dims
+from .coordinates import local_coordinates
+from .ldtp_fit import LDTPFit, finished
+from .minimize import minimize
+from .noise import noise_model
+from .periodic_model import PeriodicModel
+from .prediction.problem import SeriesProblem
+from .prediction.series_part import SeriesPart
+from .prediction.subspace import subspace_model
 
 
 def fit_to_series(
@@ -39,7 +39,7 @@ def fit_to_series(
     if not isinstance(guess, LDTP):
         model = subspace_model(series, given_dims(guess, N, "guess"), innovations)
     else:
-        require_same_kind(guess, parts)
+        require_same("guess and data", guess, parts)
         model = PeriodicModel.of(guess, series.scale)
         if innovations:
             model = _with_gain(model, problem, series)

@@ -7,14 +7,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.arguments import Numbers
+from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP
-from .checks.comparable import require_same_kind
 from .simulation import simulate_record
 
 
@@ -99,7 +98,7 @@ def amplitude_sweep(
             raise DefinitionError(
                 f"`run` must return ExperimentData, but returned a {type(data).__name__}."
             )
-        require_same_kind(model, data)
+        require_same("model and data", model, data)
         failed.append(float((~data.ok).sum()))
         rms.append(np.sqrt(np.mean(data.u**2, axis=(0, 1))))
         square = np.zeros((2, len(data.outputs)))
