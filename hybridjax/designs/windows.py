@@ -91,6 +91,8 @@ def choose_window(
 
     **Raises:** `DefinitionError` as `optimal_design`.
     """
+    if isinstance(limit, Limits) and limit.distortion is not None:
+        raise DefinitionError("`limit` limits a distortion, which is that of pushes at all sections.")
     goal = Multipliers() if goal is None else goal
     N = model.n_sections
     tried: dict[tuple[int, int], OptimalDesign] = {}
