@@ -37,12 +37,10 @@ class Quadratic(NamedTuple):
     def second_order(self, u: Float[np.ndarray, "S time nu"]) -> Float[np.ndarray, "S time ny"]:
         """What inputs that repeat after their whole number of periods cause in second order."""
         N, n, _ = self.step.shape
-        S, steps, nu = u.shape
-        if not n:
-            return _bent(self.show_bend[np.arange(steps) % N], u) / 2
+        S, steps, _ = u.shape
         A, folded = self._states, (S, steps // N, N, -1)
         first = np.asarray(periodic_states(A, self.step[:, :, n:], u.reshape(folded)))
-        w = np.concatenate([self._run(first, u @ np.zeros((nu, n)), u), u], axis=2)
+        w = np.concatenate([self._run(first, np.zeros((S, steps, n)), u), u], axis=2)
         section = np.arange(steps) % N
         forcing = _bent(self.bend[section], w) / 2
         unit = np.tile(np.eye(n), (N, 1, 1))
@@ -65,7 +63,8 @@ class Quadratic(NamedTuple):
     ) -> Complex[np.ndarray, "N m K"]:
         """Linear responses to $e^{2 \\pi i f n/N}$ at an input, divided by it, with that input."""
         N, n, m = self.step.shape
-        u = np.broadcast_to((np.arange(m - n)[:, None] == channel).astype(complex), (N, m - n, len(f)))
+        own = (np.arange(m - n)[:, None] == channel).astype(complex)
+        u = np.broadcast_to(own, (N, *own.shape))
         return np.concatenate([self._steady(self.step[:, :, n:] @ u, f), u], axis=1)
 
     def _steady(
