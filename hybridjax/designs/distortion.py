@@ -7,13 +7,12 @@ $Q \succeq 0$ and $Q \succeq G$, and then made as large as the distortion of the
 allows.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
@@ -82,14 +81,24 @@ class Products(NamedTuple):
         """Of the distortion in a design: expected with random phases, or with its own `phases`."""
         if phases:
             return np.sqrt(np.mean(self.quadratic.second_order(design.inputs()) ** 2, axis=(0, 1)))
-        power = np.zeros((design.experiments, self.expected.shape[-1]))
-        for e, here in enumerate(power):
-            kept = design.experiment == e
-            parts = {n: getattr(design, n)[kept] for n in ("line", "channel", "amplitude", "phase")}
-            one = dataclasses.replace(design, experiment=0 * parts["line"], experiments=1, **parts)
-            here[:] = self.cosines.power_of(one)
+        power = self.powers(design)
         squares = np.einsum("ek,okl,el->o", power, self.expected, power, optimize=True)
-        return np.sqrt(squares / design.experiments)
+        return np.sqrt(np.maximum(squares, 0) / design.experiments)
+
+    def powers(self, design: Design) -> Float[np.ndarray, "E K"]:
+        """Of each cosine in each experiment."""
+        power = np.zeros((design.experiments, len(self.cosines.line)))
+        square = np.asarray(design.amplitude) ** 2 / 2
+        np.add.at(power, (design.experiment, self.cosines.places(design)), square)
+        return power
+
+    def divided(
+        self, kept: Int[np.ndarray, " k"], share: Float[np.ndarray, "E k"]
+    ) -> Float[np.ndarray, "O k k"]:
+        """Expected mean square, in units of what is allowed, as a form of the mean powers of some
+        cosines, whose power in each experiment is a `share` of it."""
+        some = self.expected[:, kept][:, :, kept] / (self.level**2)[:, None, None]
+        return some * (share.T @ share) / len(share)
 
 
 def products(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
@@ -149,14 +149,14 @@ def optimal_design(
     counts = places(cosines.only(kept), best.power * share, best.power / one[kept], count)
     if np.isfinite(most).any():
         # What each may have where it stands.
-        sums = sums.only(kept).and_of_powers(counts * one[kept])
-        best = allocate(question.only(kept), sums, best.power, max_steps)
+        room = sums.only(kept).and_of_powers(counts * one[kept])
+        best = allocate(question.only(kept), room, best.power, max_steps)
     made = to_design(
         cosines.only(kept), best.power, best.power * share, counts, most[kept], count, usual,
         seed,
     )  # fmt: skip
     if distorted is not None:
-        made = fit(made)
+        made = fit(_less_distorted(question, sums, distorted, most, made, max_steps))
     after = free = question.only(kept).answer(cosines.power_of(made)[kept])
     if peak:
         made = _below_peaks(made, distorted, peak, seed)
@@ -224,6 +224,32 @@ def _as_large_as_allowed(
         design = dataclasses.replace(design, amplitude=design.amplitude * root)
         design = without_forbidden(design, largest)
     return design
+
+
+def _less_distorted(
+    question: AbstractQuestion,
+    limits: PowerLimits,
+    distorted: Products,
+    most: Float[np.ndarray, " K"],
+    design: Design,
+    max_steps: int,
+) -> Design:
+    """The same cosines in the same experiments, with the best powers for the distortion of just
+    these, from those that they have. (That form is not convex, so that better ones may exist.)
+
+    **Arguments:** `limits`, without those of amplitudes, which are `most`.
+    """
+    each = distorted.powers(design)
+    power = each.mean(axis=0)
+    kept = np.flatnonzero(power)
+    power, share = power[kept], each[:, kept] / power[kept]
+    own = limits.only(kept)._replace(curved=distorted.divided(kept, share))
+    if np.isfinite(most).any():
+        own = own.and_of_powers(most[kept] ** 2 / (2 * share.max(axis=0)))
+    factor = np.ones(len(most))
+    factor[kept] = np.sqrt(allocate(question.only(kept), own, power, max_steps).power / power)
+    amplitude = design.amplitude * factor[distorted.cosines.places(design)]
+    return dataclasses.replace(design, amplitude=amplitude)
 
 
 def _below_peaks(
