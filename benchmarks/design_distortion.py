@@ -28,22 +28,29 @@ def distortion(family, draws: int) -> None:
         for signal in ("u", *OUTPUTS):
             family.show(f"{row}.rms.{signal}", plan.rms[signal])
             family.show(f"{row}.rms.{signal}.usual", plan.usual_rms[signal])
-        simulated = even_part(family, plan.design)
-        for output, found in zip(OUTPUTS, simulated, strict=True):
+        for output, found, odd in zip(OUTPUTS, *not_linear(family, plan.design), strict=True):
             said = plan.rms[f"distortion of {output}"]
             family.show(f"{row}.predicted.{output}", said)
             family.show(f"{row}.simulated_to_predicted.{output}", found / said)
+            family.show(f"{row}.odd_part.{output}", odd / found)
         # The design for a limited input, as strong as its distortion allows.
         other = hj.optimal_design(family.model, usual, noise=NOISE).design
         scaled = hj.optimal_design(family.model, other, limit=kept, noise=NOISE)
         family.show(f"{row}.saved_beside_input", scaled.usual_criterion / plan.criterion)
 
 
-def even_part(family, design: hj.Design) -> np.ndarray:
-    """rms of what is even in the response of the nonlinear hopper, one draw of the phases."""
-    u = design.inputs()
+def not_linear(family, design: hj.Design) -> tuple[np.ndarray, np.ndarray]:
+    """rms of what is not linear in the response of the hopper, one draw of the phases, and of what
+    is odd in it."""
+    u, model = design.inputs(), family.model
+    starts = model.periodic_states(u, design.periods)
+    linear = np.stack([model.simulate(one, x0) for one, x0 in zip(u, starts, strict=True)])
     up, down = (
-        hj.run_experiments(family.cycle, family.placed, one, OUTPUTS, start="steady").y
+        hj.run_experiments(
+            family.cycle, family.placed, one, OUTPUTS, start="steady", accuracy=1e-11
+        ).y
         for one in (u, -u)
     )
-    return np.sqrt(np.mean(((up + down) / 2) ** 2, axis=(0, 1)))
+    return tuple(
+        np.sqrt(np.mean(x**2, axis=(0, 1))) for x in (up - linear, (up - down) / 2 - linear)
+    )
