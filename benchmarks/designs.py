@@ -21,6 +21,9 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 - `parameters`: stiffness and damping of the spring by `fit_model`, input limited.
 - `deviation`: deviations of both outputs limited: all lines and `fit_multipliers` against a design
   for `fit_ldtp` and that fit. Beside it bounds of the multiplier by `fit_model`.
+- `distortion`: the part of second order of both outputs limited, to a tenth of the noise: what is
+  saved over equal amplitudes, and over the design for a limited input, as large as it allows; what
+  is not linear in a simulation, relative to the prediction, and the part of it that is odd in u.
 - `walkers`: the compass gait's leading pair and the rimless wheel, pushed by phase, input limited;
   `all`: the bound where all multipliers are wanted; `usual.quiet.ratio`: rms error to bound with a
   tenth of the noise.
@@ -36,6 +39,7 @@ import functools
 import time
 
 import numpy as np
+from design_distortion import distortion
 from design_questions import HARMONICS, deviation, goals, measured, parameters
 from design_walkers import walkers
 from scipy import stats
@@ -186,6 +190,7 @@ STEPS = {
     "goals": goals,
     "parameters": parameters,
     "deviation": deviation,
+    "distortion": distortion,
 }
 ALL = [*STEPS, "walkers"]
 

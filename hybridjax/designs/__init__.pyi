@@ -1,3 +1,4 @@
+from .distortion import Distortion as Distortion
 from .goals import (
     FrequencyResponse as FrequencyResponse,
     ImpulseResponse as ImpulseResponse,

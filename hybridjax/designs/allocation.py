@@ -53,13 +53,21 @@ class Certificate(NamedTuple):
     e at most. NaN where no limit that is reached holds for a cosine."""
 
 
-def certify(found: Answer, power: Float[np.ndarray, " K"], limits: PowerLimits) -> Certificate:
-    """**Arguments:** `found`, the answer with these powers."""
+def certify(
+    found: Answer,
+    power: Float[np.ndarray, " K"],
+    limits: PowerLimits,
+    level: Float[np.ndarray, " O"] | float = 1.0,
+) -> Certificate:
+    """**Arguments:** `found`, the answer with these powers; `level`, as of `PowerLimits.at`."""
     # In units of the power that each cosine may have alone, since the solver's tolerances are
     # absolute.
-    alone = 1 / limits.cost.max(axis=0)
+    limits = limits.at(power, level)
+    alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * found.sensitivity / (power @ found.sensitivity)
     best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
+    if best.x is None:  # a quadratic form may let some powers grow as far as it knows here
+        return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
     relative = gain / gain.max() / np.where(price > 0, price, np.nan)
     return Certificate(float(-best.fun * gain.max()), -best.fun * relative)
@@ -80,15 +88,16 @@ def allocate(
 
     **Raises:** `DefinitionError` as `question.answer`.
     """
-    prices, longer = np.full(len(limits.cost), 1 / len(limits.cost)), _LONGER
     power = limits.within(np.maximum(start, _FLOOR * start.max()))
+    shares = len(limits.use(power))
+    prices, longer = np.full(shares, 1 / shares), _LONGER
     now = question.answer(power)
     for step in range(max_steps + 1):
         if step % _LOOK == 0 or step == max_steps:
             certificate = certify(now, power, limits)
             if certificate.excess <= 1 + _ENOUGH or step == max_steps:
                 break
-        short, prices = _cheapest(power * np.sqrt(now.sensitivity), limits, prices)
+        short, prices = _cheapest(power * np.sqrt(now.sensitivity), limits.at(power), prices)
         trial = _along(power, short, longer, limits)
         found = question.answer(trial)
         if found.criterion > now.criterion:
@@ -119,6 +128,6 @@ def _cheapest(
     r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
     prices $\mu$ of the limits, which rise where a limit is exceeded."""
     for _ in range(_PRICES):
-        power = a / np.sqrt(prices @ limits.cost)
+        power = a / np.sqrt(limits.price(prices))
         prices = prices * limits.use(power) ** 2
     return limits.within(power), prices

@@ -49,11 +49,14 @@ class Candidates(NamedTuple):
     def only(self, some: Int[np.ndarray, " k"]) -> "Candidates":
         return self._replace(line=self.line[some], channel=self.channel[some])
 
-    def power_of(self, design: Design) -> Float[np.ndarray, " K"]:
-        """Mean square of each cosine in a design, over all of its experiments."""
+    def places(self, design: Design) -> Int[np.ndarray, " L"]:
+        """Which of these each line of a design is."""
         key = self.line * (self.channel.max() + 1) + self.channel
         order = np.argsort(key)
         wanted = design.line * (self.channel.max() + 1) + design.channel
-        place = order[np.searchsorted(key, wanted, sorter=order)]
-        power = np.bincount(place, np.asarray(design.amplitude) ** 2 / 2, len(key))
-        return power / design.experiments
+        return order[np.searchsorted(key, wanted, sorter=order)]
+
+    def power_of(self, design: Design) -> Float[np.ndarray, " K"]:
+        """Mean square of each cosine in a design, over all of its experiments."""
+        square = np.asarray(design.amplitude) ** 2 / 2
+        return np.bincount(self.places(design), square, len(self.line)) / design.experiments

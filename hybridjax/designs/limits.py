@@ -1,4 +1,4 @@
-r"""What an experiment may cost: powers p of the cosines with $W p \le 1$."""
+r"""What an experiment may cost: powers p of the cosines with $W p \le 1$ and $p^T Q p \le 1$."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -14,7 +14,13 @@ from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.partition import line_class
 from .candidates import Candidates
+from .distortion import Distortion
 from .signals import Squares, rate_of
+
+
+# Price of a cosine, relative to what it would be if nothing in it were negative, that is none. Ten
+# times more: as little happens.
+_LEAST = 1e-3
 
 
 @checked
@@ -30,12 +36,14 @@ class Limits(eqx.Module):
       still exceeds it is made smaller. (Such phases are not random: realizations of them do not
       show the distortion.)
     - `strides`: cycles of all experiments together, without those that are discarded.
+    - `distortion`: what is not linear in outputs.
     """
 
     rms: Mapping[str, Positive] = eqx.field(default_factory=dict)
     rate: Mapping[str, Positive] = eqx.field(default_factory=dict)
     peak: Mapping[str, Positive] = eqx.field(default_factory=dict)
     strides: Count | None = eqx.field(static=True, default=None)
+    distortion: Distortion | None = None
 
 
 Limit = Literal["input", "output"] | Mapping[str, Positive] | Limits
@@ -56,24 +64,59 @@ def peak_of(name: str) -> str:
 
 
 class PowerLimits(NamedTuple):
-    """L limits of sums over cosines."""
+    """L limits of sums over cosines, and O of quadratic forms."""
 
     names: tuple[str, ...]
     """What is limited: rms values of signals by their names, rates and peaks."""
     cost: Float[np.ndarray, "L K"]
     """W: share of each limit that a unit of a cosine's power takes."""
+    curved: Float[np.ndarray, "O K K"]
+    """Q, positive semidefinite: of each the root of $p^T Q p$ is the share that is used."""
 
-    def use(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " L"]:
-        """Share of each limit that is used."""
-        return self.cost @ power
+    def use(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " shares"]:
+        """Share of each limit that is used, those of quadratic forms last."""
+        return np.append(self.cost @ power, self.bent(power))
+
+    def at(
+        self, power: Float[np.ndarray, " K"], level: Float[np.ndarray, " O"] | float = 1.0
+    ) -> "PowerLimits":
+        r"""Linear limits, $p^T Q q \le \sqrt{p^T Q p}$, which all q within these keep (Cauchy and
+        Schwarz): those at other powers p are used alike by p itself.
+
+        **Arguments:** `level`, how much more than allowed the quadratic forms may be.
+        """
+        slope, use = self.curved @ power, self.bent(power)
+        slope = slope / np.where(use > 0, use * level, 1.0)[:, None]
+        return PowerLimits(self.names, np.concatenate([self.cost, slope]), self.curved[:0])
+
+    def bent(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " O"]:
+        """Share of the quadratic forms that is used."""
+        return np.sqrt(np.maximum(self.curved @ power @ power, 0))
 
     def within(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
         """The same proportions, as large as the limits allow."""
         return power / self.use(power).max()
 
+    def price(self, prices: Float[np.ndarray, " L"]) -> Float[np.ndarray, " K"]:
+        """What a unit of each cosine's power costs; never nothing, though linear limits of a
+        quadratic form may say so of a few."""
+        least = _LEAST * (prices @ np.abs(self.cost))
+        return np.maximum(prices @ self.cost, least)
+
+    def share(self, power: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+        """What a unit of each cosine's power takes of the limits, on the average."""
+        flat = self.at(power)
+        return flat.price(np.full(len(flat.cost), 1 / len(flat.cost)))
+
     def only(self, some: Int[np.ndarray, " k"]) -> "PowerLimits":
         """Where only these cosines are applied."""
-        return self._replace(cost=self.cost[:, some])
+        return self._replace(cost=self.cost[:, some], curved=self.curved[:, some][:, :, some])
+
+    def and_of_distortion(
+        self, names: tuple[str, ...], curved: Float[np.ndarray, "O K K"]
+    ) -> "PowerLimits":
+        """These, and limits of quadratic forms."""
+        return PowerLimits((*self.names, *names), self.cost, curved)
 
     def and_of_amplitudes(
         self, largest: Float[np.ndarray, " K"], cosines: Candidates
@@ -94,11 +137,12 @@ class PowerLimits(NamedTuple):
 
     def require_limits(self) -> None:
         """**Raises:** `DefinitionError` if some cosine is not limited."""
-        free = self.cost.max(axis=0) == 0
+        alone = np.diagonal(self.curved, axis1=1, axis2=2)
+        free = np.concatenate([self.cost, alone]).max(axis=0) == 0
         if free.any():
             raise DefinitionError(
-                f"no limit reaches cosine {int(np.argmax(free))} of the design: limit the input, "
-                "too."
+                f"no limit reaches cosine {int(np.argmax(free))} of the design (of a distortion, "
+                "where nothing is distorted): limit the input, too."
             )
 
 
@@ -126,21 +170,21 @@ def power_limits(
     silent = [n for level in levels for n, rms in level.items() if rms == 0]
     if silent:
         raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
-    cost = np.stack(
-        [
-            one[n.removeprefix(peak_of(""))] / rms**2
-            for one, level in zip(squares, levels, strict=True)
-            for n, rms in level.items()
-        ]
-    )
-    return PowerLimits(tuple(levels[0]), np.unique(cost, axis=0))
+    rows = [
+        one[n.removeprefix(peak_of(""))] / rms**2
+        for one, level in zip(squares, levels, strict=True)
+        for n, rms in level.items()
+    ]
+    K = len(usual)
+    cost = np.unique(np.reshape(rows, (-1, K)), axis=0)
+    return PowerLimits(tuple(levels[0]), cost, np.zeros((0, K, K)))
 
 
 def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[str, float]:
     """The rms values that are allowed, by the names of `squares`."""
     rates = {rate_of(n) for n in inputs}
     unknown = [n for n in limit.rms if n not in squares or n in rates]
-    if unknown or not (limit.rms or limit.rate or limit.peak):
+    if unknown or not (limit.rms or limit.rate or limit.peak or limit.distortion):
         what = f"limits '{unknown[0]}'" if unknown else "limits nothing"
         known = ", ".join(n for n in squares if n not in rates)
         raise DefinitionError(f"`limit` {what}; what can be limited is the rms value of {known}.")

@@ -36,7 +36,8 @@ class OptimalDesign(eqx.Module):
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
       to that of this one; with one limit the largest sensitivity of a line per unit of what is
       limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum, but for
-      peaks, which are taken as no larger than rms values.
+      peaks, which are taken as no larger than rms values. Where distortion is limited, it compares
+      with designs whose convex bound of the distortion is no larger than the limit, or this one's.
     - `for_peaks`: how many times the strides limits of peaks cost, beside the same limits of the
       rms; 1 where no peak is limited.
     - `frequencies` (K,) and `channels` (K,) of all cosines that were allowed; `power` and
@@ -44,7 +45,8 @@ class OptimalDesign(eqx.Module):
       which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
       power belongs, less elsewhere.
     - `limited`: names of signals whose rms is limited, and of rates and peaks.
-    - `rms`, `usual_rms`: of all signals, by name, as the model predicts them.
+    - `rms`, `usual_rms`: of all signals, by name, as the model predicts them; of `distortion of y`
+      where it is limited, expected for random phases (of the phases that were chosen for a peak).
     """
 
     design: Design
@@ -119,7 +121,7 @@ class OptimalDesign(eqx.Module):
     @property
     def advice(self) -> str:
         """Which case this is, in a sentence."""
-        rest = [n for n in self.limited if n.startswith(("rate of ", "peak of "))]
+        rest = [n for n in self.limited if n.startswith(("rate of ", "peak of ", "distortion of "))]
         rms = " and ".join(n for n in self.limited if n not in rest)
         what = " and ".join([f"rms of {rms}"] * bool(rms) + rest)
         if self.saved > _WORTH_IT:
@@ -139,8 +141,10 @@ class OptimalDesign(eqx.Module):
         rows.append(f"  {'standard error':>{width + 2}}  usual     optimal")
         rows += [f"    {name:<{width}}  {a:.2e}  {b:.2e}" for name, a, b in errors]
         rows.append(f"  {self.advice}")
+        bounded = any(n.startswith("distortion of ") for n in self.limited)
         rows.append(
             f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
+            f"{'(the convex bound of distortions) ' * bounded}"
             f"needs less than {1 / self.certificate:.1%} of these strides"
         )
         if self.for_peaks > 1:

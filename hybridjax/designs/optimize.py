@@ -1,11 +1,12 @@
 """The design that answers a question in the fewest strides."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
@@ -15,8 +16,9 @@ from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import Allocation, allocate
+from .allocation import Allocation, allocate, certify
 from .candidates import Candidates
+from .distortion import Products, products
 from .goals import Goal, Multipliers
 from .grouping import places, to_design, worthwhile
 from .limits import (
@@ -119,15 +121,22 @@ def optimal_design(
     cosines, limits, most = cosines.only(allowed), limits.only(allowed), most[allowed]
     squares = [{name: square[allowed] for name, square in one.items()} for one in squares]
     count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
-    usual = _as_large_as_allowed(usual, limits, cosines, largest)
+    distorted = None
+    if isinstance(limit, Limits) and limit.distortion is not None:
+        power = cosines.power_of(usual)
+        distorted = products(limit.distortion, cosines, models[0].inputs, power)
+        limits = limits.and_of_distortion(distorted.limited, distorted.curved)
     sums, limits = limits, limits.and_of_amplitudes(most, cosines)
     limits.require_limits()
+    fit = functools.partial(_as_large_as_allowed, sums, distorted, cosines, largest)
+    usual = fit(usual)
     if peak:
-        usual = below_peaks(usual, peak, seed)
+        usual = _below_peaks(usual, distorted, peak, seed)
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
     shown += [name for name in limits.names if name in squares[0] and name not in shown]
     usual_rms = rms_of(squares, shown, usual_power)
+    distorted_rms = functools.partial(_distorted_rms, distorted, bool(peak))
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
     question = question_of(goal, models, cosines, errors, usual_power, robust)
@@ -136,22 +145,27 @@ def optimal_design(
     ideal = allocate(question, limits, usual_power, max_steps)
     kept, best = _with_fewer(question, limits, cosines, ideal, count, max_steps)
     one = most**2 / (2 * count)
-    share = limits.cost.mean(axis=0)
-    counts = places(cosines.only(kept), best.power * share[kept], best.power / one[kept], count)
+    share = limits.only(kept).share(best.power)
+    counts = places(cosines.only(kept), best.power * share, best.power / one[kept], count)
     if np.isfinite(most).any():
         # What each may have where it stands.
-        sums = sums.only(kept).and_of_powers(counts * one[kept])
-        best = allocate(question.only(kept), sums, best.power, max_steps)
+        room = sums.only(kept).and_of_powers(counts * one[kept])
+        best = allocate(question.only(kept), room, best.power, max_steps)
     made = to_design(
-        cosines.only(kept), best.power, best.power * share[kept], counts, most[kept], count, usual,
+        cosines.only(kept), best.power, best.power * share, counts, most[kept], count, usual,
         seed,
     )  # fmt: skip
+    if distorted is not None:
+        made = fit(_less_distorted(question, sums, distorted, most, made, max_steps))
     after = free = question.only(kept).answer(cosines.power_of(made)[kept])
     if peak:
-        made = below_peaks(made, peak, seed)
+        made = _below_peaks(made, distorted, peak, seed)
         after = question.only(kept).answer(cosines.power_of(made)[kept])
     power = cosines.power_of(made)
     shorter = usual.experiments / count
+    # Compared with all designs whose distortion is bounded as this one's is.
+    level = np.maximum(limits.bent(power), 1)
+    excess = certify(ideal.answer, ideal.power, limits, level).excess
     return OptimalDesign(
         design=made,
         usual=usual,
@@ -160,7 +174,7 @@ def optimal_design(
         usual_variances=before.variances,
         criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
-        certificate=ideal.certificate.excess * after.criterion / ideal.answer.criterion,
+        certificate=excess * after.criterion / ideal.answer.criterion,
         for_peaks=after.criterion / free.criterion,
         frequencies=cosines.f,
         channels=cosines.channel,
@@ -168,8 +182,8 @@ def optimal_design(
         usual_power=usual_power,
         sensitivity=ideal.certificate.relative,
         limited=limits.names,
-        rms=rms_of(squares, shown, power),
-        usual_rms=usual_rms,
+        rms=rms_of(squares, shown, power) | distorted_rms(made),
+        usual_rms=usual_rms | distorted_rms(usual),
     )
 
 
@@ -195,14 +209,64 @@ def _with_fewer(
 
 
 def _as_large_as_allowed(
-    design: Design, limits: PowerLimits, cosines: Candidates, largest: Largest
+    limits: PowerLimits,
+    distorted: Products | None,
+    cosines: Candidates,
+    largest: Largest,
+    design: Design,
 ) -> Design:
     """The same proportions, but where a cosine has its largest amplitude."""
     for _ in range(_SCALINGS):
-        root = np.sqrt(1 / limits.use(cosines.power_of(design)).max())
+        use = limits.cost @ cosines.power_of(design)
+        if distorted is not None:
+            use = np.append(use, distorted.rms(design) / distorted.level)
+        root = np.sqrt(1 / max(use.max(), np.finfo(float).tiny))
         design = dataclasses.replace(design, amplitude=design.amplitude * root)
         design = without_forbidden(design, largest)
     return design
+
+
+def _less_distorted(
+    question: AbstractQuestion,
+    limits: PowerLimits,
+    distorted: Products,
+    most: Float[np.ndarray, " K"],
+    design: Design,
+    max_steps: int,
+) -> Design:
+    """The same cosines in the same experiments, with the best powers for the distortion of just
+    these, from those that they have. (That form is not convex, so that better ones may exist.)
+
+    **Arguments:** `limits`, without those of amplitudes, which are `most`.
+    """
+    each = distorted.powers(design)
+    power = each.mean(axis=0)
+    kept = np.flatnonzero(power)
+    power, share = power[kept], each[:, kept] / power[kept]
+    own = limits.only(kept)._replace(curved=distorted.divided(kept, share))
+    if np.isfinite(most).any():
+        own = own.and_of_powers(most[kept] ** 2 / (2 * share.max(axis=0)))
+    factor = np.ones(len(most))
+    factor[kept] = np.sqrt(allocate(question.only(kept), own, power, max_steps).power / power)
+    amplitude = design.amplitude * factor[distorted.cosines.places(design)]
+    return dataclasses.replace(design, amplitude=amplitude)
+
+
+def _below_peaks(
+    design: Design, distorted: Products | None, peak: dict[str, float], seed: int
+) -> Design:
+    """Within the peaks, and with the phases for that also within a distortion."""
+    design = below_peaks(design, peak, seed)
+    if distorted is None:
+        return design
+    use = (distorted.rms(design, phases=True) / distorted.level).max()
+    return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(max(use, 1.0)))
+
+
+def _distorted_rms(distorted: Products | None, phases: bool, design: Design) -> dict[str, float]:
+    if distorted is None:
+        return {}
+    return dict(zip(distorted.limited, distorted.rms(design, phases).tolist(), strict=True))
 
 
 def _check_alike(models: list[Model], design: Design) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Positive
 from .._core.progress import working
+from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..linear.ldtp import LDTP
 from .goals import Multipliers, Order
@@ -91,6 +92,10 @@ def choose_window(
 
     **Raises:** `DefinitionError` as `optimal_design`.
     """
+    if isinstance(limit, Limits) and limit.distortion is not None:
+        raise DefinitionError(
+            "`limit` limits a distortion, which is known of pushes at all sections only."
+        )
     goal = Multipliers() if goal is None else goal
     N = model.n_sections
     tried: dict[tuple[int, int], OptimalDesign] = {}

@@ -54,7 +54,7 @@ def linearize(
     z = s.resolve_outputs(_states_everywhere(s) if outputs is None else outputs)
     for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
-    names, columns = _inputs(s, inputs)
+    names, columns = inputs_of(s, inputs)
     if traced or is_inside_program():
         A, B = _section_jacobians(placed)
     else:
@@ -78,7 +78,7 @@ def _states_everywhere(s: Structure) -> list[str]:
     return [n for n in s.state_names() if all(s.state_function(n, a) is not None for a in charts)]
 
 
-def _inputs(
+def inputs_of(
     s: Structure, inputs: tuple[str, ...] | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs, all by default, and their indices."""

@@ -22,7 +22,7 @@ def question(slopes, criterion="A"):
 
 def limits(cost):
     cost = np.atleast_2d(cost)
-    return PowerLimits(tuple("abc"[: len(cost)]), cost)
+    return PowerLimits(tuple("abc"[: len(cost)]), cost, np.zeros((0, cost.shape[1], cost.shape[1])))
 
 
 @pytest.mark.parametrize("criterion", ["A", "D"])

@@ -251,6 +251,7 @@ def designs(t):
         {"u0": "1"},
         Other(),
     ]
+    distorted = hj.designs.Limits(distortion=hj.designs.Distortion(t.cycle, PHASE, {"x": 1.0}))
     noise = [3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]
     noise += [{"y0": lambda f: "x"}, {"y0": lambda f: f * NAN}, {"y0": lambda f: f - 1}]
     yield "optimal_design", hj.optimal_design, dict(
@@ -258,7 +259,7 @@ def designs(t):
     ), {
         "model": instance(t.design), "design": [3, t.model, t.one_input, np.zeros((1, 9, 2))],
         "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
-        "limit": limits, "noise": optional(noise),
+        "limit": [*limits, distorted], "noise": optional(noise),
         "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
         "max_steps": COUNT, "robust": WORD,
     }  # fmt: skip
@@ -286,6 +287,13 @@ def designs(t):
     named = [None, 3, "nope", ["u0"], {"u0": 0.0}, {"u0": NAN}, {"u0": "1"}, Other()]
     yield "Limits", hj.designs.Limits, dict(rms={"u0": 1.0}), {
         "rms": named, "rate": named, "peak": named, "strides": optional(COUNT),
+        "distortion": optional([3, "nope", {"y0": 1.0}, Other()]),
+    }  # fmt: skip
+    yield "Distortion", hj.designs.Distortion, dict(
+        cycle=t.cycle, sections=PHASE, rms={"x": 1.0}
+    ), {
+        "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],
+        "rms": [*named, {}],
     }  # fmt: skip
     yield "Window", hj.designs.Window, dict(weights=np.ones(6)), {
         "weights": [*array(np.ones(6)), np.zeros(6)],

@@ -1,0 +1,272 @@
+"""Distortion as a limit: what is predicted, against closed forms and the nonlinear hopper."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import hybridjax as hj
+from hybridjax.designs.allocation import allocate, certify
+from hybridjax.designs.candidates import Candidates
+from hybridjax.designs.distortion import products
+from hybridjax.maps.second_order import second_order
+
+from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS
+from ..toys import Field
+from .test_allocation import limits, question
+
+
+Limits, Distortion = hj.designs.Limits, hj.designs.Distortion
+FAMILIES = {"isochrons": ISOCHRONS, "kinematic": KINEMATIC}
+LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
+NOISE = {"yM": 6e-6, "vM": 1.2e-5}
+EXPERIMENTS = hj.multisine(periods=8, band=(0.0, 3.0), experiments=6)
+GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+
+
+class Quadratic(hj.HybridSystem):
+    """x[p+1] = 0.6 x[p] + u + b x[p]^2 once a period, at t = p, and constant in between.
+
+    In other units: `size` of the state, `force` of the input.
+    """
+
+    b: hj.Parameter = hj.parameter(0.7)
+    size: hj.Parameter = hj.parameter(1.0)
+    force: hj.Parameter = hj.parameter(1.0)
+
+    def charts(self):
+        return {"rest": Field(("x",), lambda t, q, u: (0.0 * q[0],))}
+
+    def transitions(self):
+        def reset(t, q, u):
+            x = q[0] / self.size
+            return (self.size * (0.6 * x + u[0] / self.force + self.b * x**2),)
+
+        return (hj.Transition("tick", "rest", "rest", hj.Scheduled(1.0), reset=reset),)
+
+    def outputs(self):
+        shown = lambda t, q, u: q[0] / self.size + (u[0] / self.force) ** 2  # noqa: E731
+        return (hj.Output("z", shown),)
+
+    def period(self):
+        return 1.0
+
+
+def about(system):
+    guess = hj.Guess("rest", (0.0,), time=0.5)
+    cycle = hj.find_limit_cycle(system, guess, scale={"x": float(system.size)})
+    sections = hj.ClockPhase(4)
+    return cycle, sections, hj.linearize(cycle, sections, "x")
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return about(Quadratic())
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_even_part_of_the_hopper(name, hopper_cycle):
+    """(y(u) + y(-u)) / 2 of the nonlinear system; what is left is of fourth order."""
+    sections = FAMILIES[name]
+    quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
+    left = []
+    for rms in (0.02, 0.04):
+        u = EXPERIMENTS.scaled(rms=rms).inputs()
+        predicted = quadratic.second_order(u)
+        up, down = (
+            hj.run_experiments(hopper_cycle, sections, one, OUTPUTS, start="steady", accuracy=1e-11)
+            for one in (u, -u)
+        )
+        even = (up.y + down.y) / 2
+        left.append(np.sqrt(np.mean((even - predicted) ** 2) / np.mean(even**2)))
+    assert left[0] < 2e-3
+    assert left[1] / left[0] == pytest.approx(4, rel=0.3)
+
+
+def test_without_a_clock(vanderpol_cycle):
+    """Sections on which no time is kept, and the direction of the flow means nothing."""
+    sections = hj.KinematicPhase(8, "x", "v", anchor=hj.Crossing("v", "falling"))
+    quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
+    u = hj.multisine(8, periods=8, band=(0.0, 2.0)).scaled(rms=1e-3).inputs()
+    up, down = (
+        hj.run_experiments(
+            vanderpol_cycle, sections, one, ("x", "v"), start="steady", accuracy=1e-11
+        )
+        for one in (u, -u)
+    )
+    even = (up.y + down.y) / 2
+    assert np.abs(even - quadratic.second_order(u)).max() < 1e-4 * np.abs(even).max()
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_its_expected_size(name, hopper_cycle):
+    """Over draws of the phases."""
+    design, cosines = EXPERIMENTS.scaled(rms=0.01), Candidates.of(EXPERIMENTS)
+    limit = Distortion(hopper_cycle, FAMILIES[name], LEVEL)
+    found = products(limit, cosines, ("u",), cosines.power_of(design))
+    drawn = [found.rms(design.realizations(1, seed=k), phases=True) ** 2 for k in range(60)]
+    error = np.std(drawn, axis=0) / np.sqrt(60)
+    assert (np.abs(np.mean(drawn, axis=0) - found.rms(design) ** 2) < 3.5 * error).all()
+    assert (error < 0.05 * found.rms(design) ** 2).all()
+
+
+@pytest.mark.parametrize("f", [0.125, 0.375])
+def test_one_cosine_in_closed_form(toy, f):
+    """x2[p+1] = 0.6 x2[p] + 0.7 x1[p]^2, of which the mean and twice the frequency are seen; z has
+    the square of the input, too."""
+    a, z = 0.01, np.exp(2j * np.pi * f)
+    design = hj.Design(
+        experiment=[0], line=[round(8 * f)], channel=[0], amplitude=[a], phase=[0.4], n_sections=4,
+        periods=8, experiments=1, input_names=("u",),
+    )  # fmt: skip
+    cosines = Candidates.of(design)
+    limit = Distortion(toy[0], toy[1], {"x": 1.0, "z": 1.0})
+    found = products(limit, cosines, ("u",), cosines.power_of(design))
+    x1 = a / np.abs(z - 0.6)
+    mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
+    x = np.sqrt(mean**2 + twice**2 / 2)
+    assert found.rms(design)[0] == pytest.approx(x, rel=1e-9)
+    np.testing.assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
+    u2 = design.inputs()[0, :, 0] ** 2
+    both = found.quadratic.second_order(design.inputs())[0]
+    np.testing.assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
+
+
+def test_designs_within_a_distortion(hopper_cycle, isochron_ldtp):
+    """The limit holds for the experiments that are made, and those of equal amplitudes."""
+    usual = hj.multisine(periods=32)
+    limit = Limits(distortion=Distortion(hopper_cycle, ISOCHRONS, LEVEL))
+    plan = hj.optimal_design(isochron_ldtp, usual, limit=limit, noise=NOISE)
+    assert plan.limited == ("distortion of yM", "distortion of vM")
+    for rms in (plan.rms, plan.usual_rms):
+        assert max(rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL) == pytest.approx(1)
+    assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
+    assert "With the distortion of yM and distortion of vM limited it matters" in plan.advice
+    assert "convex bound of distortions" in repr(plan)
+    # Twice what is allowed: twice the power, half of the strides.
+    twice = Distortion(hopper_cycle, ISOCHRONS, {n: 2 * x for n, x in LEVEL.items()})
+    more = hj.optimal_design(isochron_ldtp, usual, limit=Limits(distortion=twice), noise=NOISE)
+    assert more.criterion == pytest.approx(plan.criterion / 2, rel=0.02)
+    # The nonlinear hopper, with one draw of the phases.
+    u = plan.design.inputs()
+    up, down = (
+        hj.run_experiments(hopper_cycle, ISOCHRONS, one, OUTPUTS, start="steady") for one in (u, -u)
+    )
+    seen = np.sqrt(np.mean(((up.y + down.y) / 2) ** 2, axis=(0, 1)))
+    said = [plan.rms[f"distortion of {n}"] for n in OUTPUTS]
+    np.testing.assert_allclose(seen, said, rtol=0.1)
+
+
+@pytest.mark.filterwarnings("ignore:Values in x were outside bounds")  # SLSQP of older SciPy
+@pytest.mark.parametrize("linear", [False, True])
+def test_quadratic_limits(linear):
+    """Against sequential quadratic programming, which knows of no linear limits around them."""
+    rng = np.random.default_rng(3)
+    slopes, factors = rng.normal(size=(3, 14)), rng.uniform(0, 1, (2, 14, 14))
+    curved = np.einsum("oik,oil->okl", factors, factors)
+    cost = rng.uniform(0.2, 2, (1, 14)) if linear else np.zeros((0, 14))
+    allowed = limits(cost)._replace(curved=curved)
+
+    def value(p):
+        return np.trace(np.linalg.inv(slopes * p @ slopes.T))
+
+    def within(p):
+        return 1 - np.append(cost @ p, curved @ p @ p)
+
+    other = minimize(
+        value, np.full(14, 0.01), method="SLSQP", bounds=[(1e-9, 9)] * 14,
+        constraints=[{"type": "ineq", "fun": within}], options={"maxiter": 500, "ftol": 1e-10},
+    )  # fmt: skip
+    found = allocate(question(slopes), allowed, np.ones(14), 2000)
+    assert allowed.use(found.power).max() == pytest.approx(1)
+    assert 1 - 1e-9 < found.certificate.excess < 1.021
+    assert found.answer.criterion / 1.021 < other.fun < found.answer.criterion * (1 + 1e-6)
+    # Powers that are far from the best ones know how far.
+    poor = allowed.within(np.ones(14))
+    excess = certify(question(slopes).answer(poor), poor, allowed).excess
+    assert excess > value(poor) / other.fun
+
+
+def test_units(toy):
+    """Other units of states and inputs change nothing but numbers."""
+    usual = hj.multisine(4, periods=16).scaled(0.01)
+    one = hj.optimal_design(
+        toy[2], usual, limit=Limits(distortion=Distortion(*toy[:2], {"x": 1e-4})),
+        noise={"x": 1e-4}, goal=GOAL,
+    )  # fmt: skip
+    system = dataclasses.replace(Quadratic(), size=jnp.array(1e6), force=jnp.array(1e-5))
+    cycle, sections, model = about(system)
+    other = hj.optimal_design(
+        model, usual.scaled(1e-7), limit=Limits(distortion=Distortion(cycle, sections, {"x": 1e2})),
+        noise={"x": 1e2}, goal=GOAL,
+    )  # fmt: skip
+    assert other.saved == pytest.approx(one.saved, rel=1e-6)
+    assert other.certificate == pytest.approx(one.certificate, rel=1e-6)
+    np.testing.assert_allclose(other.power * 1e10, one.power, rtol=1e-5, atol=1e-12)
+
+
+def test_beside_other_limits(toy):
+    """Peaks, with the distortion of the phases that these get; amplitudes; several models."""
+    cycle, sections, model = toy
+    usual = hj.multisine(4, periods=16).scaled(0.01)
+    distortion = Distortion(cycle, sections, {"x": 1e-3})
+    options = dict(noise={"x": 1e-4}, goal=GOAL)
+    peaked = hj.optimal_design(
+        model, usual, limit=Limits(peak={"u": 0.05}, distortion=distortion), **options
+    )
+    assert np.abs(peaked.design.inputs()).max() <= 0.05 * (1 + 1e-9)
+    assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
+    assert peaked.certificate >= 1
+    low = hj.optimal_design(
+        model, usual, limit=Limits(distortion=distortion), largest=0.02, **options
+    )
+    assert np.max(low.design.amplitude) <= 0.02 * (1 + 1e-9)
+    assert low.rms["distortion of x"] <= 1e-3 * (1 + 1e-9) and low.certificate >= 1
+    both = hj.optimal_design(
+        [model, model], usual, limit=Limits(rms={"u": 0.01}, distortion=distortion),
+        robust="worst", **options,
+    )  # fmt: skip
+    assert both.limited == ("u", "distortion of x")
+    assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
+
+
+def test_without_distortion(toy):
+    """Nothing limits a linear system's."""
+    cycle, sections, model = about(Quadratic(b=0.0))
+    usual = hj.multisine(4, periods=16).scaled(0.01)
+    linear = Distortion(cycle, sections, {"x": 1e-3})
+    options = dict(noise={"x": 1e-4}, goal=GOAL)
+    with pytest.raises(hj.DefinitionError, match="where nothing is distorted.: limit the input"):
+        hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
+    both = Limits(rms={"u": 0.01}, distortion=linear)
+    plan = hj.optimal_design(model, usual, limit=both, **options)
+    alone = hj.optimal_design(model, usual, limit={"u": 0.01}, **options)
+    assert plan.rms["distortion of x"] == 0
+    assert plan.criterion == pytest.approx(alone.criterion, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "rms, family, message",
+    [
+        ({"y": 1.0}, hj.ClockPhase(4), "there is no output 'y'"),
+        ({"x": 1.0}, hj.ClockPhase(8), "between 8 sections, the model has 4"),
+    ],
+)
+def test_bad_distortions(toy, rms, family, message):
+    usual = hj.multisine(4, periods=16)
+    limit = Limits(distortion=Distortion(toy[0], family, rms))
+    with pytest.raises(hj.DefinitionError, match=message):
+        hj.optimal_design(toy[2], usual, limit=limit)
+
+
+def test_bad_uses(toy):
+    with pytest.raises(hj.DefinitionError, match="limits nothing: name an output"):
+        Distortion(*toy[:2], {})
+    other = hj.LDTP(toy[2].A, toy[2].B, toy[2].C, inputs="push", outputs="x")
+    limit = Limits(distortion=Distortion(*toy[:2], {"x": 1.0}))
+    with pytest.raises(hj.DefinitionError, match="there is no input 'push'"):
+        hj.optimal_design(other, hj.multisine(4, periods=16, inputs="push"), limit=limit)
+    with pytest.raises(hj.DefinitionError, match="known of pushes at all sections only"):
+        hj.designs.choose_window(toy[2], hj.multisine(4, periods=16), noise={"x": 1.0}, limit=limit)
