@@ -53,6 +53,14 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
         assert ldtp.rank(i) == 2
 
 
+def test_resets_that_depend_on_time():
+    """The velocity of the paddle at the impact is told by the time of the impact."""
+    cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
+    *_, exact = hj.models.PaddleJuggler().exact()
+    found = hj.linearize(cycle, hj.ClockPhase(8)).multipliers
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(exact), atol=1e-9)
+
+
 def angles(apex, count):
     """Kinematic sections of the scipy hopper, the first of them through its apex."""
     position, velocity = hopper_scipy.plane(apex)
