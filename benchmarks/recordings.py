@@ -154,7 +154,7 @@ def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases
 
 def products(draws=200):
     """Where next to no noise is left, and products of second order are taken."""
-    coverage(draws, noise=0.0, n_sections=N_SECTIONS, phases=("apex",))
+    coverage(draws, noise=0.0, n_sections=N_SECTIONS, phases=PHASES)
     walks("van der Pol", *oscillator(0.02), draws, 100, 5, 1e-4)
 
 
