@@ -1,4 +1,3 @@
-from .distortion import Distortion as Distortion
 from .goals import (
     FrequencyResponse as FrequencyResponse,
     ImpulseResponse as ImpulseResponse,
@@ -7,7 +6,8 @@ from .goals import (
     Parameters as Parameters,
 )
 from .information import InformationMap as InformationMap, information_map as information_map
-from .limits import Limits as Limits
+from .limits.distortion import Distortion as Distortion
+from .limits.limits import Limits as Limits
 from .model_draws import draws as draws
 from .optimal_design import OptimalDesign as OptimalDesign
 from .sequences import RandomInput as RandomInput

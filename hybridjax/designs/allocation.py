@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linprog
 
-from .limits import PowerLimits
+from .limits.limits import PowerLimits
 from .questions.question import AbstractQuestion, Answer
 
 

@@ -18,10 +18,10 @@ from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
 from .allocation import Allocation, allocate, certify
 from .candidates import Candidates
-from .distortion import Products, products
 from .goals import Goal, Multipliers
 from .grouping import places, to_design, worthwhile
-from .limits import (
+from .limits.distortion import Products, products
+from .limits.limits import (
     Largest,
     Limit,
     Limits,
@@ -31,9 +31,9 @@ from .limits import (
     power_limits,
     without_forbidden,
 )
+from .limits.peaks import below_peaks
 from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
-from .peaks import below_peaks
 from .questions.question import AbstractQuestion
 from .questions.question_of import question_of
 from .signals import Model, mean_squares, rms_of

@@ -13,7 +13,7 @@ from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..linear.ldtp import LDTP
 from .goals import Multipliers, Order
-from .limits import Limits
+from .limits.limits import Limits
 from .noise import NoiseLike
 from .optimal_design import OptimalDesign
 from .optimize import optimal_design

@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 import hybridjax as hj
 from hybridjax.designs.allocation import allocate, certify
 from hybridjax.designs.candidates import Candidates
-from hybridjax.designs.limits import PowerLimits
+from hybridjax.designs.limits.limits import PowerLimits
 from hybridjax.designs.questions.question import Question
 from hybridjax.designs.questions.sensitivities import DirectSensitivities
 from hybridjax.experiments.design.partition import line_class

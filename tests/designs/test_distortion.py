@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 import hybridjax as hj
 from hybridjax.designs.allocation import allocate, certify
 from hybridjax.designs.candidates import Candidates
-from hybridjax.designs.distortion import products
+from hybridjax.designs.limits.distortion import products
 from hybridjax.maps.second_order import second_order
 
 from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS

@@ -20,7 +20,7 @@ from ...experiments.design.design import Design
 from ...identify.multipliers.structured import StructuredFit
 from ..candidates import Candidates
 from ..goals import Multipliers
-from ..limits import Limit, Limits, require_inputs, without_forbidden
+from ..limits.limits import Limit, Limits, require_inputs, without_forbidden
 from ..optimal_design import OptimalDesign
 from ..optimize import optimal_design
 from .estimate import Block, Estimate, block_of, estimate

@@ -8,14 +8,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Positive
-from ..errors import DefinitionError
-from ..experiments.design.design import Design
-from ..experiments.design.partition import line_class
-from .candidates import Candidates
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Count, Positive
+from ...errors import DefinitionError
+from ...experiments.design.design import Design
+from ...experiments.design.partition import line_class
+from ..candidates import Candidates
+from ..signals import Squares, rate_of
 from .distortion import Distortion
-from .signals import Squares, rate_of
 
 
 # Price of a cosine, relative to what it would be if nothing in it were negative, that is none. Ten

@@ -14,15 +14,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Positive
-from ..errors import DefinitionError
-from ..experiments.design.design import Design
-from ..linear.quadratic import Quadratic
-from ..maps.second_order import second_order
-from ..orbits.cycle import LimitCycle
-from ..sections.section_list import FamilyLike, as_family
-from .candidates import Candidates
+from ..._core.boundary.checked import checked
+from ..._core.boundary.kinds import Positive
+from ...errors import DefinitionError
+from ...experiments.design.design import Design
+from ...linear.quadratic import Quadratic
+from ...maps.second_order import second_order
+from ...orbits.cycle import LimitCycle
+from ...sections.section_list import FamilyLike, as_family
+from ..candidates import Candidates
 
 
 @checked
