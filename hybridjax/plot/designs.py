@@ -143,7 +143,8 @@ def strides(
             color = CYCLE[k % len(CYCLE)]
             for number, one in enumerate(several):
                 reached += _steps(panel, one, label if number == 0 else None, color)
-        low, high = min(reached) / 1.5, max(reached) * 1.5
+        around = 1.5 if studies else 10.0
+        low, high = min(reached) / around, max(reached) * around
         for errors, cycles, color, label in (
             (plan.usual_standard_errors, plan.usual.cycles(0), COLORS["gray"], "equal amplitudes"),
             (plan.standard_errors, plan.strides, COLORS["black"], "optimal, model known"),
