@@ -44,7 +44,8 @@ class OptimalDesign(eqx.Module):
       `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
       which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
       power belongs, less elsewhere.
-    - `limited`: names of signals whose rms is limited, and of rates and peaks.
+    - `limited`: names of the limits that are reached: of rms values by their signals, of rates,
+      peaks and distortions.
     - `rms`, `usual_rms`: of all signals, by name, as the model predicts them; of `distortion of y`
       where it is limited, expected for random phases (of the phases that were chosen for a peak).
     """
@@ -141,7 +142,7 @@ class OptimalDesign(eqx.Module):
         rows.append(f"  {'standard error':>{width + 2}}  usual     optimal")
         rows += [f"    {name:<{width}}  {a:.2e}  {b:.2e}" for name, a, b in errors]
         rows.append(f"  {self.advice}")
-        bounded = any(n.startswith("distortion of ") for n in self.limited)
+        bounded = any(n.startswith("distortion of ") for n in self.rms)
         rows.append(
             f"  certificate {self.certificate:.3f} (1 at the optimum): no design within the limits "
             f"{'(the convex bound of distortions) ' * bounded}"

@@ -28,6 +28,7 @@ from .limits.limits import (
     PowerLimits,
     experiments_within,
     largest_amplitudes,
+    peak_of,
     power_limits,
     without_forbidden,
 )
@@ -47,6 +48,9 @@ _AS_GOOD = 1.01
 # Times that the usual design is scaled to the limits, since cosines at their largest amplitude do
 # not grow with the others. Doubled: nothing, unless nearly all are at theirs.
 _SCALINGS = 10
+# Share of a limit from which on it is said to be reached. Lower: limits that do not matter are
+# named.
+_REACHED = 0.99
 
 
 @checked
@@ -125,6 +129,7 @@ def optimal_design(
     if isinstance(limit, Limits) and limit.distortion is not None:
         power = cosines.power_of(usual)
         distorted = products(limit.distortion, cosines, models[0].inputs, power)
+        distorted.require_those_of(models[0])
         limits = limits.and_of_distortion(distorted.limited, distorted.curved)
     sums, limits = limits, limits.and_of_amplitudes(most, cosines)
     limits.require_limits()
@@ -181,7 +186,7 @@ def optimal_design(
         power=power,
         usual_power=usual_power,
         sensitivity=ideal.certificate.relative,
-        limited=limits.names,
+        limited=_reached(sums, distorted, power, distorted_rms(made)),
         rms=rms_of(squares, shown, power) | distorted_rms(made),
         usual_rms=usual_rms | distorted_rms(usual),
     )
@@ -261,6 +266,25 @@ def _below_peaks(
         return design
     use = (distorted.rms(design, phases=True) / distorted.level).max()
     return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(max(use, 1.0)))
+
+
+def _reached(
+    limits: PowerLimits,
+    distorted: Products | None,
+    power: Float[np.ndarray, " K"],
+    distortion: dict[str, float],
+) -> tuple[str, ...]:
+    """Names of the limits that end here, or all if only those of amplitudes do; peaks always.
+
+    **Arguments:** `limits`, without those of amplitudes.
+    """
+    use = {}
+    for name, share in zip(limits.names, limits.cost @ power, strict=False):
+        use[name] = max(use.get(name, 0.0), np.inf if name.startswith(peak_of("")) else share)
+    if distorted is not None:
+        levels = zip(distorted.limited, distorted.level, strict=True)
+        use |= {name: distortion[name] / level for name, level in levels}
+    return tuple(name for name, share in use.items() if share > _REACHED) or tuple(use)
 
 
 def _distorted_rms(distorted: Products | None, phases: bool, design: Design) -> dict[str, float]:

@@ -23,6 +23,12 @@ from ...maps.second_order import second_order
 from ...orbits.cycle import LimitCycle
 from ...sections.section_list import FamilyLike, as_family
 from ..candidates import Candidates
+from ..signals import Model
+
+
+# Relative difference of H_0 beyond which a system is not that of the model. Those of the hopper
+# between the paper's two families differ by 0.5 and more. Doubled: such a mistake would pass.
+_ANOTHER = 0.3
 
 
 @checked
@@ -67,6 +73,22 @@ class Products(NamedTuple):
     """Mean square of one experiment with random phases: $p^T M p$."""
     bound: Float[np.ndarray, "O K K"]
     """Q."""
+
+    def require_those_of(self, model: Model) -> None:
+        """**Raises:** `DefinitionError` if the model responds in another way."""
+        f, channel = self.cosines.f, self.cosines.channel
+        own = np.mean(self.quadratic.show @ self.quadratic.waves(f, channel), axis=0)
+        of_model = np.asarray(model.htf(f, 0).H)[0, np.arange(len(f)), :, channel]
+        for name, H in zip(self.names, own, strict=True):
+            if name not in model.outputs:
+                continue
+            other = of_model[:, model.outputs.index(name)]
+            off = float(np.linalg.norm(H - other) / np.linalg.norm(other))
+            if not off <= _ANOTHER:
+                raise DefinitionError(
+                    f"`limit` tells the distortion of another system than the model: H_0 to {name} "
+                    f"differs by {off:.0%}. Are its sections those of the model?"
+                )
 
     @property
     def limited(self) -> tuple[str, ...]:

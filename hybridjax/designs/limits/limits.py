@@ -67,7 +67,8 @@ class PowerLimits(NamedTuple):
     """L limits of sums over cosines, and O of quadratic forms."""
 
     names: tuple[str, ...]
-    """What is limited: rms values of signals by their names, rates and peaks."""
+    """What is limited, one by one: rms values of signals by their names, rates, peaks, distortions;
+    not amplitudes and powers."""
     cost: Float[np.ndarray, "L K"]
     """W: share of each limit that a unit of a cosine's power takes."""
     curved: Float[np.ndarray, "O K K"]
@@ -170,14 +171,16 @@ def power_limits(
     silent = [n for level in levels for n, rms in level.items() if rms == 0]
     if silent:
         raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
+    names = [n for level in levels for n in level]
     rows = [
         one[n.removeprefix(peak_of(""))] / rms**2
         for one, level in zip(squares, levels, strict=True)
         for n, rms in level.items()
     ]
     K = len(usual)
-    cost = np.unique(np.reshape(rows, (-1, K)), axis=0)
-    return PowerLimits(tuple(levels[0]), cost, np.zeros((0, K, K)))
+    cost = np.reshape(rows, (-1, K))
+    some = np.sort(np.unique(cost, axis=0, return_index=True)[1])
+    return PowerLimits(tuple(names[i] for i in some), cost[some], np.zeros((0, K, K)))
 
 
 def _levels(limit: Limits, inputs: tuple[str, ...], squares: Squares) -> dict[str, float]:
