@@ -37,7 +37,9 @@ class Distortion(eqx.Module):
 
     It is what `(y(u) + y(-u)) / 2` differs by from the cycle, including the mean, up to fourth
     order in the input. Exact second derivatives tell it, through all events; they compile at the
-    first call, for some ten seconds. Inputs act as they are (no `Window`).
+    first call, for some ten seconds. Inputs act as they are: with a model that is seen through a
+    `Window` the numbers are wrong, and nothing tells. Nor is it checked that `cycle` is that of
+    the model, and of several models there is one distortion.
 
     **Arguments:**
 
