@@ -169,6 +169,43 @@ def test_the_expected_size_with_two_inputs(two):
     assert (error < 0.02 * found.rms(SHORT) ** 2).all()
 
 
+def test_the_expected_size_of_gaussian_inputs(two):
+    """Lines whose amplitudes are random, too."""
+    cosines = Candidates.of(SHORT)
+    quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
+    form = quadratic.products(cosines.f, cosines.channel).gaussian()
+    limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
+    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
+    power, rng, drawn = found.powers(SHORT), np.random.default_rng(0), []
+    expected = np.mean([form @ p @ p for p in power], axis=0)
+    for k in range(500):
+        one = SHORT.realizations(1, seed=k)
+        size = np.sqrt(rng.exponential(size=len(one.amplitude)))
+        one = dataclasses.replace(one, amplitude=one.amplitude * size)
+        drawn.append(found.rms(one, phases=True) ** 2)
+    error = np.std(drawn, axis=0) / np.sqrt(500)
+    assert (np.abs(np.mean(drawn, axis=0) - expected) < 3.5 * error).all()
+    assert (error < 0.05 * expected).all()
+
+
+def test_products_in_parts_and_of_a_design(two, monkeypatch):
+    """Pairs of cosines a few at a time; the form of the mean powers of lines in experiments."""
+    cosines = Candidates.of(SHORT)
+    quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
+    whole = quadratic.products(cosines.f, cosines.channel)
+    monkeypatch.setattr("hybridjax.linear.quadratic._NUMBERS", 2**10)
+    for a, b in zip(whole, quadratic.products(cosines.f, cosines.channel), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(a).max())
+    limit = Distortion(*two[:2], {"x": 0.5, "z": 2.0})
+    found = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
+    each = found.powers(SHORT)
+    power = each.mean(axis=0)
+    kept = np.flatnonzero(power)
+    form = found.divided(kept, each[:, kept] / power[kept])
+    share = form @ power[kept] @ power[kept]
+    np.testing.assert_allclose(share, (found.rms(SHORT) / found.level) ** 2, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", FAMILIES)
 def test_its_expected_size(name, hopper_cycle):
     """Over draws of the phases."""
@@ -209,11 +246,12 @@ def test_designs_within_a_distortion(hopper_cycle):
     model, usual = hj.linearize(hopper_cycle, sections, OUTPUTS), hj.multisine(8, periods=32)
     distortion = Distortion(hopper_cycle, sections, LEVEL)
     plan = hj.optimal_design(model, usual, limit=Limits(distortion=distortion), noise=NOISE)
-    assert plan.limited == ("distortion of yM", "distortion of vM")
+    ends = {f"distortion of {n}": plan.rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL}
+    assert plan.limited == tuple(n for n, share in ends.items() if share > 0.99) != ()
     for rms in (plan.rms, plan.usual_rms):
         assert max(rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL) == pytest.approx(1)
     assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
-    assert "With the distortion of yM and distortion of vM limited it matters" in plan.advice
+    assert f"With the {' and '.join(plan.limited)} limited it matters" in plan.advice
     assert "convex bound of distortions" in repr(plan)
     # Twice what is allowed: twice the power, half of the strides.
     twice = Distortion(hopper_cycle, sections, {n: 2 * x for n, x in LEVEL.items()})
@@ -295,7 +333,7 @@ def test_beside_other_limits(toy):
         [model, model], usual, limit=Limits(rms={"u": 0.01}, distortion=distortion),
         robust="worst", **options,
     )  # fmt: skip
-    assert both.limited == ("u", "distortion of x")
+    assert both.limited == ("u",) and both.rms["distortion of x"] < 1e-3
     assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
 
 
@@ -335,5 +373,8 @@ def test_bad_uses(toy):
     limit = Limits(distortion=Distortion(*toy[:2], {"x": 1.0}))
     with pytest.raises(hj.DefinitionError, match="there is no input 'push'"):
         hj.optimal_design(other, hj.multisine(4, periods=16, inputs="push"), limit=limit)
+    twice = hj.LDTP(toy[2].A, 2 * toy[2].B, toy[2].C, outputs="x")
+    with pytest.raises(hj.DefinitionError, match="another system .* to x differs by 50%"):
+        hj.optimal_design(twice, hj.multisine(4, periods=16), limit=limit)
     with pytest.raises(hj.DefinitionError, match="known of pushes at all sections only"):
         hj.designs.choose_window(toy[2], hj.multisine(4, periods=16), noise={"x": 1.0}, limit=limit)

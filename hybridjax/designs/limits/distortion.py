@@ -37,9 +37,9 @@ class Distortion(eqx.Module):
 
     It is what `(y(u) + y(-u)) / 2` differs by from the cycle, including the mean, up to fourth
     order in the input. Exact second derivatives tell it, through all events; they compile at the
-    first call, for some ten seconds. Inputs act as they are: with a model that is seen through a
-    `Window` the numbers are wrong, and nothing tells. Nor is it checked that `cycle` is that of
-    the model, and of several models there is one distortion.
+    first call, for some ten seconds. Inputs act as they are (no `Window`); of several models there
+    is one distortion. A model that responds in another way than `cycle` between `sections` is
+    refused where H_0 differs by more than 30 %.
 
     **Arguments:**
 
@@ -85,11 +85,12 @@ class Products(NamedTuple):
             if name not in model.outputs:
                 continue
             other = of_model[:, model.outputs.index(name)]
-            off = float(np.linalg.norm(H - other) / np.linalg.norm(other))
-            if not off <= _ANOTHER:
+            off, size = np.linalg.norm(H - other), np.linalg.norm(other)
+            if off > _ANOTHER * size:
                 raise DefinitionError(
                     f"`limit` tells the distortion of another system than the model: H_0 to {name} "
-                    f"differs by {off:.0%}. Are its sections those of the model?"
+                    f"differs by {off / max(size, np.finfo(float).tiny):.0%}. Are its sections "
+                    "those of the model?"
                 )
 
     @property
