@@ -138,9 +138,8 @@ def test_order_and_advice(hopper_recording, angle):
     assert any("plain regression (ARX) would give" in w for w in advice.warnings)
     assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
     assert (np.diff(advice.expected[:, 0]) <= 0).all()
-    too_many = hj.recordings.advise(
-        data, hj.fit_series(data.records, order=3, check=False)
-    ).warnings
+    fast = {"check": False, "distortion": False}
+    too_many = hj.recordings.advise(data, hj.fit_series(data.records, order=3, **fast)).warnings
     order = "Order: the data do not carry 3 multipliers"
     assert any(w.startswith(order) for w in too_many)
     assert not any(w.startswith("Order") for w in advice.warnings)
@@ -151,5 +150,5 @@ def test_order_and_advice(hopper_recording, angle):
             ("yM", "vM"), noisy.trials[0].values[:, 1:].T, strict=True))},
     )  # fmt: skip
     poor = hj.recordings.section_data(slow, angle, **options)
-    said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, check=False)).warnings
+    said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, **fast)).warnings
     assert any(w.startswith("Narrow excitation") for w in said)
