@@ -30,7 +30,8 @@ class Session:
 
 
 def same_output(shown: str, printed: str) -> bool:
-    """The same words, and the same numbers: to 6 digits, or small ones to a factor of 5."""
+    """The same words, and the same numbers: to 6 digits, to the last of 6 decimals or more, which
+    rounding changes, or small ones to a factor of 5."""
     words = [NUMBER.sub("#", text).split() for text in (shown, printed)]
     a, b = (
         np.array([float(x.replace(" ", "")) for x in NUMBER.findall(text)])
@@ -39,6 +40,10 @@ def same_output(shown: str, printed: str) -> bool:
     if words[0] != words[1] or a.shape != b.shape:
         return False
     close = np.abs(a - b) <= 1e-6 * np.abs(b)
+    decimals = np.array(
+        [0 if "e" in x else len(x.partition(".")[2]) for x in NUMBER.findall(shown)]
+    )
+    last = (decimals >= 6) & (np.abs(a - b) < 1.01 * 10.0**-decimals)
     small = (np.abs(a) < 1e-3) & (np.abs(b) < 1e-3)
     rounding = (np.abs(a) < 1e-11) & (np.abs(b) < 1e-11)
-    return bool(np.all(close | rounding | (small & (b < 5 * a) & (a < 5 * b))))
+    return bool(np.all(close | last | rounding | (small & (b < 5 * a) & (a < 5 * b))))
