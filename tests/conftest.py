@@ -3,15 +3,15 @@ import os
 import pathlib
 import subprocess
 import sys
-import tempfile
 
 
 # Said before NumPy and XLA are loaded, here and in the workers of pytest-xdist: threads of BLAS
 # that wait for each other cost ten times the work, and XLA reports each cached program.
 os.environ.update(OPENBLAS_NUM_THREADS="1", TF_CPP_MIN_LOG_LEVEL="3")
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    _programs = tempfile.TemporaryDirectory()
-    os.environ["HYBRIDJAX_CACHE"] = _programs.name
+    # Compiled programs are kept between runs, since compiling is most of the time of a test.
+    _programs = pathlib.Path(__file__).parents[1] / ".pytest_cache" / "programs"
+    os.environ.setdefault("HYBRIDJAX_CACHE", str(_programs))
     # Most of the time of a test is that of compiling what it runs once. (XLA ends the process where
     # it does not know an option.)
     _quick = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"

@@ -1,4 +1,4 @@
-"""Imports flow one way, files and signatures stay small, and importing the package is cheap."""
+"""Imports flow one way, and importing the package is cheap."""
 
 import ast
 import functools
@@ -86,22 +86,9 @@ def test_imports_flow_one_way_inside_of_folders(folder):
     tuple(graphlib.TopologicalSorter(needs).static_order())
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_files_and_signatures_stay_small(file):
-    text = file.read_text()
-    assert len(text.splitlines()) <= 400
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef):
-            all_of_them = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
-            names = [x.arg for x in all_of_them]
-            own = len(names) - (names[:1] in (["self"], ["cls"]))
-            assert own <= 10, f"{node.name} has {own} parameters"
-
-
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda f: str(f.relative_to(ROOT)))
-def test_folders_stay_small_and_hide_no_name(folder):
+def test_folders_hide_no_name(folder):
     """A public name that is also a module of its folder would be either of them, by chance."""
-    assert len(list(folder.glob("*.py"))) <= 17
     modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
     stub = folder / "__init__.pyi"
     if stub.exists():
