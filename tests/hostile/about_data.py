@@ -401,13 +401,6 @@ def recordings(t):
         "recording": instance(t.record), "phase": [None, "x", 3, Other()],
         "data": instance(t.record),
     }  # fmt: skip
-    about = dict(input="f", outputs=("x", "v"), event="strike")
-    yield "mishandle", hj.testing.mishandle, dict(
-        recording=t.recording, mishap="white noise", **about
-    ), {
-        "recording": instance(t.record), "mishap": WORD, "input": SIGNAL, "outputs": SIGNAL,
-        "event": [None, 3, Other()], "seed": SEED,
-    }  # fmt: skip
     data = instance(t.record, t.data)
     yield "advise", hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit), {
         "data": data, "fit": instance(t.structured), "validation": optional(instance(t.data)),
@@ -474,18 +467,11 @@ def recordings(t):
 
 
 def testing(t):
-    yield "Dirt", hj.testing.Dirt, {}, {
-        "noise": NONNEGATIVE, "quantum": NONNEGATIVE, "drift": FINITE,
-        "missing": [*NONNEGATIVE, 1.5], "gap": ["ab", 1.0, (1.0,), (NAN, 1.0), (2.0, 1.0)],
-        "irregular": FLAG, "lost_events": WHOLE, "doubled_events": WHOLE, "stretch": FINITE,
-        "seed": SEED,
+    yield "spoil", hj.testing.spoil, dict(recording=t.recording, signals=("x",)), {
+        "recording": instance(t.record), "signals": SIGNAL, "noise": NONNEGATIVE,
+        "quantum": NONNEGATIVE, "missing": [*NONNEGATIVE, 1.5], "seed": SEED,
+        "gap": ["ab", 1.0, (1.0,), (NAN, 1.0), (2.0, 1.0)], "spikes": [*NONNEGATIVE, 1.5],
     }  # fmt: skip
-    yield (
-        "spoil",
-        hj.testing.spoil,
-        dict(recording=t.recording, signals=("x",), dirt=hj.testing.Dirt()),
-        {"recording": instance(t.record), "signals": SIGNAL, "dirt": instance(PHASE)},
-    )
     yield "random_force", hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5), {
         "duration": [*POSITIVE, 1e12], "rate": [*POSITIVE, 1e12], "bandwidth": [*POSITIVE, 40],
         "rms": NONNEGATIVE, "inputs": LIMITED, "seed": SEED,

@@ -8,6 +8,8 @@ from hybridjax.recordings.beats.estimation import WAVES, fit_curve
 from hybridjax.recordings.beats.intervals import intervals_of
 from hybridjax.recordings.beats.phase_model import Table, basis, forecast
 
+from .mishaps import mishandle, misjudged
+
 
 X = np.arange(200) / 200
 CURVE = 1 - 0.5 * np.cos(2 * np.pi * X) + 0.2 * np.sin(2 * np.pi * X)
@@ -77,7 +79,7 @@ def test_slopes_are_derivatives(noisy):
 
 
 def test_missed_events_do_not_count(noisy):
-    lost = hj.testing.spoil(noisy, "u", hj.testing.Dirt(lost_events=6, seed=1))
+    lost = mishandle(noisy, misjudged(lost=0.1), input="u", outputs=(), event="beat", seed=1)
     phase = hj.recordings.estimate_phase(lost, BEAT)
     fit = fit_curve(intervals_of(lost, phase, "u"), WAVES)
     assert rms(basis(X, WAVES) @ fit.coefficients - CURVE) < 0.1

@@ -7,7 +7,7 @@ import hybridjax as hj
 
 
 def spoil(recording, signals=("yM", "vM"), **dirt):
-    return hj.testing.spoil(recording, signals, hj.testing.Dirt(**dirt))
+    return hj.testing.spoil(recording, signals, **dirt)
 
 
 def test_five_lines(hopper_recording, hopper_cycle, angle):

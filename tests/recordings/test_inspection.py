@@ -7,7 +7,8 @@ import pytest
 from scipy import signal
 
 import hybridjax as hj
-from hybridjax.testing import EVENT_MISHAPS, MISHAPS
+
+from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle
 
 
 STRIDES, TRIALS, RATE = 60, 3, 64
@@ -92,7 +93,7 @@ SAID = {
 @pytest.mark.parametrize("mishap", SAID)
 def test_causes_are_named(mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert SAID[mishap] in causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+    assert SAID[mishap] in causes(mishandle(made_up(0), mishap, **NAMES), phase)
 
 
 HARMLESS = sorted({
@@ -105,7 +106,7 @@ HARMLESS = sorted({
 @pytest.mark.parametrize("mishap", HARMLESS)
 def test_nothing_is_said_of_what_does_no_harm(mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert not causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+    assert not causes(mishandle(made_up(0), mishap, **NAMES), phase)
 
 
 def test_all_mishaps_are_tried():

@@ -13,6 +13,7 @@ import hybridjax as hj
 from hybridjax.apps.cli import main
 
 from .conftest import MULTIPLIER
+from .mishaps import mishandle, misjudged
 
 
 CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(1, 1))
@@ -86,9 +87,10 @@ def test_a_gap_in_the_signals_of_the_phase_masks_all_outputs(wave):
 def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     """They count where they can; what is left out is counted and said."""
     marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)
-    dirty = hj.testing.spoil(
-        marked, ("x", "v"), hj.testing.Dirt(noise=1e-3, lost_events=10, doubled_events=10)
-    )
+    dirty = mishandle(
+        hj.testing.spoil(marked, ("x", "v"), noise=1e-3), misjudged(lost=0.05, doubled=0.05),
+        input="force", outputs=("x", "v"), event="top",
+    )  # fmt: skip
     (trial,) = dirty.trials
     kept = np.abs(trial.time - 77) > 3.4
     events = {k: v[np.abs(v - 77) > 3.4] for k, v in trial.events.items()}
@@ -199,7 +201,7 @@ def test_designs_as_tables(tmp_path, wave):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
-    dirty = hj.testing.spoil(rhythm, ("x", "v"), hj.testing.Dirt(noise=1e-3))
+    dirty = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3)
     (trial,) = dirty.trials
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
