@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.spikes import input_spikes, spike_heights, without_spikes
+from hybridjax.recordings.smoothing import input_spikes, spike_heights, without_spikes
 
 
 T = np.arange(20000) / 500
