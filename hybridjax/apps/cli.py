@@ -183,7 +183,7 @@ def _sweep(options) -> int:
     import matplotlib
 
     matplotlib.use("Agg")  # files only
-    from .._core.compilation.compilation_cache import enable_compilation_cache
+    from .._core.compilation import enable_compilation_cache
     from .._core.precision import enable_x64
     from .map_command import run
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from .._core.cores import core_count
+from .._core.execution import core_count
 from ..errors import ComputationError
 
 

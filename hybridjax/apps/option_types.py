@@ -5,7 +5,7 @@ import math
 from typing import Literal, get_args
 
 from .._core import limits
-from .._core.files.figure_formats import Format
+from .._core.writing import Format
 
 
 def count(text: str) -> int:

@@ -7,12 +7,15 @@ only the kinds that it asks for, by their own checked constructors.
 
 import dataclasses
 import inspect
+import io
 import json
+import math
 import os
 import reprlib
 import textwrap
 import types
 import typing
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,11 +24,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import jaxtyped
 
-from ... import __version__
-from ...errors import DefinitionError, FileFormatError, HybridJaxError
-from .. import limits
-from ..signal import Signal
-from .npz import damaged, read_arrays
+from .. import __version__
+from ..errors import DefinitionError, FileFormatError, HybridJaxError
+from . import limits
+from .signal import Signal
 from .writing import replacing
 
 
@@ -214,3 +216,53 @@ def _matches(value: Any, hint: Any) -> bool:
     if hint is int:
         return isinstance(value, int | np.integer) and not isinstance(value, bool)
     return isinstance(value, hint)
+
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays by name. Members are read whole, so that their checksums are checked.
+
+    **Raises:** `OSError` if the file cannot be read; `FileFormatError` if it is damaged, no npz
+    file, holds Python objects, or declares more than `limits` allow.
+    """
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                _check_sizes(members, path.stat().st_size)
+                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+        except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
+            raise damaged(path, str(error) or type(error).__name__) from error
+
+
+def damaged(path: Path, reason: str) -> FileFormatError:
+    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}.")
+
+
+def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
+    size, most = sum(m.file_size for m in members), limits.unpacked(packed)
+    if size > most:
+        raise ValueError(f"it declares arrays of {size} bytes, but packs them into {packed}")
+    if len({m.filename for m in members}) < len(members):
+        raise ValueError("two of its arrays have one name")
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(member) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in _HEADERS:
+            raise ValueError(f"an array is of version {version}")
+        shape, _, dtype = _HEADERS[version](stream)
+        declared = stream.tell() + math.prod(shape) * dtype.itemsize
+    if dtype.hasobject:
+        raise ValueError(f"'{member.filename}' holds Python objects")
+    if declared != member.file_size or math.prod(shape) > member.file_size:
+        raise ValueError(f"'{member.filename}' declares the shape {shape}, and is not that large")
+    return np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)
