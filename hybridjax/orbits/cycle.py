@@ -7,8 +7,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.executor import to_host
-from .._core.html.multipliers import multiplier_table, unit_circle
-from .._core.html.parts import card, facts
+from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of

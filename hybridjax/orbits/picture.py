@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.html.svg import COLORS, Curve, picture, thinned
+from .._core.html import COLORS, Curve, picture, thinned
 from .._core.signal import unit_of, with_unit
 from ..engine.trajectory import Trajectory
 from ..systems.structure import Structure
