@@ -30,6 +30,14 @@ import hybridjax as hj
 from hybridjax._core import compilation
 
 
+def pytest_xdist_auto_num_workers(config):
+    """A single process for a part of the tests: starting others takes longer than the tests."""
+    if config.args != config.getini("testpaths"):
+        config.option.dist = "no"
+        return 0
+    return None
+
+
 hj.enable_x64()
 hj.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
 hypothesis.settings.register_profile("untimed", hypothesis.settings.default, deadline=None)

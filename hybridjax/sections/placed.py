@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import host_first
 from .._core.executor import Array, is_traced, namespace, on_host, to_host
-from .._core.html.parts import card, facts
+from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
