@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from ..errors import DefinitionError
-from ..sections.crossing import Crossing
-from ..sections.kinematic import KinematicPhase
+from ..orbits.crossing import Crossing
+from ..sections.families import KinematicPhase
 from .phase import LONGEST_GAP, Phase, Winding
 from .recording import Recording
 from .smoothing import FEWEST, bridgeable, gaps, inside, spline, without_spikes
@@ -235,7 +235,7 @@ class PhaseTracker:
         self._loop = 0.0
 
     def update(self, time: float, position: Sample, velocity: Sample) -> float | None:
-        """Return the phase in cycles, counted from the first sample, after one more; NaN are skipped.
+        """Return the phase in cycles, counted from the first sample; NaN are skipped.
 
         **Returns:** None before the first finite sample.
 

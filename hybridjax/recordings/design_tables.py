@@ -8,7 +8,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Positive
-from .._core.files.writing import replacing
+from .._core.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
 from .formats.columns import Wanted

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import DefinitionError
-from ..sections.crossing import AtEvent, Crossing
+from ..orbits.crossing import AtEvent, Crossing
 from .phase import LONGEST_GAP, Phase, Winding
 from .recording import Recording, check_events
 from .smoothing import bridgeable, gaps, inside

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit
@@ -17,7 +17,7 @@ from .data import SectionData, input_band
 
 
 # Fraction of the Nyquist frequency from which on the band of an input needs no smoothing of the
-# push. Larger: every push is smoothed. Smaller: responses contain frequencies that were not excited.
+# push. Larger: every push is smoothed. Smaller: responses contain unexcited frequencies.
 _WHOLE_BAND = 0.9
 # Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
 # More: wide pushes. Fewer: power beyond the band.
@@ -74,7 +74,7 @@ def impulse_responses(
 
     **Arguments:**
 
-    - `fit`: fit to the `data`, whose period gives the area of an input that is held for one section.
+    - `fit`: fit to the `data`, whose period gives the area of an input held for one section.
     - `cycles`: duration of the responses. Default: 3, or for wide pushes twice the time until half
       of one has acted.
     - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one

@@ -2,8 +2,8 @@ r"""Multipliers from natural variability, with intervals by a block bootstrap.
 
 With $x_k$ the state at a section in cycle k, $x_{k+1} = J x_k + w_k$, and $z_k = x_k + v_k$ is
 measured. Least squares on $z_k$ gives $J \Sigma_x (\Sigma_x + \Sigma_v)^{-1}$: noise biases towards
-fast decay. States $q_k$ at earlier sections of the same cycle depend on $x_k$, but not on its noise,
-and not on what happens after it; so
+fast decay. States $q_k$ at earlier sections of the same cycle depend on $x_k$, but not on its
+noise, and not on what happens after it; so
 
 $$J = E[z_{k+1} q_k^T] \, E[z_k q_k^T]^{+}$$
 
@@ -20,7 +20,7 @@ from scipy import stats
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Probability, Seed
-from .._core.boundary.scalars import Whole
+from .._core.boundary.values import Whole
 from .._core.html import card, complex_number, table, text
 from .._core.progress import working
 from ..errors import DefinitionError
@@ -74,8 +74,8 @@ class NaturalMultipliers(eqx.Module):
     def interval(
         self, level: Probability = 0.95, *, plain: bool = False
     ) -> Float[np.ndarray, "d 2"]:
-        """Return bounds that hold the modulus of each multiplier with this probability, in the order
-        of moduli; `plain`: those of least squares.
+        """Return bounds that hold the modulus of each multiplier with this probability, in the
+        order of moduli; `plain`: those of least squares.
 
         They are percentiles of the bootstrap, widened by the ratio of Student's distribution for so
         many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015).
@@ -148,8 +148,8 @@ def natural_multipliers(
       subtracted.
     - `order`: the number of multipliers. Directions that are not among those that vary most act as
       disturbances: trust what does not change with the order. Default: 1.
-    - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement (Künsch
-      1989), within each record; whole records where these are short.
+    - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
+      (Künsch 1989), within each record; whole records where these are short.
 
     **Raises:** `DefinitionError` for too few cycles or signals.
     """

@@ -10,11 +10,10 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html.parts import card, table, text
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError, HybridJaxError
-from ..sections.crossing import Crossing
+from ..orbits.crossing import Crossing
 from .formats.columns import seconds, split_header, time_unit
 from .smoothing import Bandwidth, bridgeable, spline, without_spikes
 
@@ -78,7 +77,7 @@ class Recording(eqx.Module):
         - `time` (n,): times of the samples, in seconds; strictly increasing.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing.
         - `events`: times of events by name, such as foot strikes.
-        - `units`: units by name. `name`: name of the trial. `notes`: remarks for readers of results.
+        - `units`: units by name. `name`: name of the trial. `notes`: remarks on the data.
 
         **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
         backwards, and infinite values, with the sample.
@@ -138,7 +137,7 @@ class Recording(eqx.Module):
         units: Mapping[str, str] | None = None,
         name: str = "trial",
     ) -> "Recording":
-        """Make a trial from a table with named columns: of pandas, polars, pyarrow, or a dictionary.
+        """Make a trial from a table with named columns (pandas, polars, pyarrow, a dictionary).
 
         **Arguments:** `time`: the column with the times; all others are signals. Units may stand in
         the names, `time (ms)` and `force (N)`. The other arguments are those of `Recording`.
@@ -375,8 +374,8 @@ def check_events(
     at = at[np.isfinite(at)]
     if len(at) and not ((at >= time[0] - margin) & (at <= time[-1] + margin)).any():
         raise error(
-            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, which "
-            f"is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or unit."
+            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, "
+            f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or unit."
         )
 
 

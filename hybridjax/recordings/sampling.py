@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Positive, SectionCount, SignalNames
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record

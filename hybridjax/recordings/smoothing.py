@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.linalg import solveh_banded
 
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from ..errors import DefinitionError
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..._core.threads import on_all_cores
+from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
 from ..phase import Phase
 from ..recording import Recording

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core import limits
-from ..._core.files.npz import damaged
+from ..._core.archive import damaged
 from ...errors import DefinitionError, FileFormatError
 from .columns import Columns, Wanted, check_declared, library, reading, split_header, with_unit
 

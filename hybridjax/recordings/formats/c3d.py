@@ -65,12 +65,10 @@ def _points(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
         for kind in ("ANGLE", "FORCE", "MOMENT", "POWER", "SCALAR")
         for label in _texts(parameters, f"{kind}S")
     }
-    points = np.where(visible, data["points"][:3], np.nan)
+    points = np.moveaxis(np.where(visible, data["points"][:3], np.nan), 1, 0)
     return [
         (with_unit(f"{label}.{axis}", units.get(label, usual)), row)
-        for label, rows in zip(
-            _texts(parameters, "LABELS"), np.moveaxis(points, 1, 0), strict=False
-        )
+        for label, rows in zip(_texts(parameters, "LABELS"), points, strict=False)
         for axis, row in zip("xyz", rows, strict=True)
         if label
     ]

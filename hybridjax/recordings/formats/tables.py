@@ -5,7 +5,7 @@ import io
 import zipfile
 from pathlib import Path
 
-from ..._core.files.npz import read_arrays
+from ..._core.archive import read_arrays
 from .columns import (
     EVENT,
     Columns,

@@ -14,8 +14,8 @@ from ..recording import Recording, Trial
 # Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
 # signals of the order of 100. Smaller: genuine extremes are left out.
 _FAR = 3.0
-# Fewest equal samples in a row that form a plateau. More: short plateaus pass. Fewer: rounding makes
-# plateaus everywhere.
+# Fewest equal samples in a row that form a plateau. More: short plateaus pass. Fewer: rounding
+# makes plateaus everywhere.
 _PLATEAU = 3
 # Plateaus per cycle from which on they belong to the rhythm, as those of a foot on the ground.
 # More: the rests of a limb are left out. Fewer: a sensor that fails now and then is believed.
@@ -46,7 +46,7 @@ class Signal(NamedTuple):
     is_input: bool
 
     def left_out(self, cause: str, bad: Rows, text: str) -> tuple[Rows, list[Finding]]:
-        """Return these rows and, if there are any, a finding; {} in `text` are number and places."""
+        """Return the rows and a finding, if there are any; {} in `text`: number and places."""
         count = sum(int(rows.sum()) for rows in bad)
         text = f"{self.name} {text.format(count, places(self.trials, bad))}"
         return bad, [Finding(cause, text, "left out")] if count else []
@@ -193,7 +193,7 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
     columns, trials = [recording.column(name) for name in names], recording.trials
     size = _SAME * np.nanstd(np.concatenate([t.values[:, columns] for t in trials]), axis=0)
     known, findings = [np.zeros(len(t.time), bool) for t in trials], []
-    for (i, a), (j, b) in combinations(enumerate(trials), 2):
+    for (_, a), (j, b) in combinations(enumerate(trials), 2):
         x, y = a.values[:, columns], b.values[:, columns]
         shift = _shift(x, y, size)
         if shift is None:

@@ -1,4 +1,4 @@
-"""Trials that differ from the others: units, zeros, columns, clocks, periods, cycles; slow drift."""
+"""Trials that differ from the others in units, columns, clocks or cycles; slow drift."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -47,22 +47,17 @@ def other_settings(
         others = np.arange(len(trials)) != s
         usual, range_ = np.median(middle[others], axis=0), np.median(width[others], axis=0)
 
-        def alike(i: int, j: int) -> bool:
-            """Return whether signal i is where signal j usually is."""
-            ratio = width[s, i] / range_[j] if width[s, i] > 0 and range_[j] > 0 else np.inf
-            near = abs(middle[s, i] - usual[j]) < min(width[s, i], range_[j])
-            return bool(near and 1 / _ALIKE < ratio < _ALIKE)
-
-        swapped = next(
-            (
-                (i, j)
-                for i, j in combinations(of_outputs, 2)
-                if alike(i, j) and alike(j, i) and not (alike(i, i) or alike(j, j))
-            ),
-            None,
-        )
-        if swapped is not None:
-            a, b = (names[k] for k in swapped)
+        # alike[i, j]: signal i is where signal j usually is.
+        widths = np.broadcast_arrays(width[s][:, None], range_)
+        alike = np.abs(middle[s][:, None] - usual) < np.minimum(*widths)
+        alike &= np.minimum(*widths) * _ALIKE > np.maximum(*widths)
+        swapped = [
+            (names[i], names[j])
+            for i, j in combinations(of_outputs, 2)
+            if alike[i, j] and alike[j, i] and not (alike[i, i] or alike[j, j])
+        ]
+        if swapped:
+            a, b = swapped[0]
             text = f"{a} and {b} have changed places in trial '{trial.name}': swap its columns."
             yield Finding("swapped columns", text, "refused")
             continue
@@ -126,7 +121,7 @@ def clocks(recording: Recording) -> Iterator[Finding]:
 
 
 def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
-    """Find trials with another period, another sign of an output, or cycles that begin elsewhere."""
+    """Find trials with another period, sign of an output, or start of the cycles."""
     for s, trial in enumerate(recording.trials):
         others = [p for k, p in enumerate(phase.periods) if k != s and len(p)]
         if not len(phase.periods[s]) or not others:
