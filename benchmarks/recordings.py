@@ -97,9 +97,9 @@ def errors(seeds=10):
             fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
-            plain.append(distance(hj.recordings.plain_regression(data, 2), true))
+            plain.append(distance(hj.recordings.advise(data, fit).plain, true))
             through = at_sections(dirty, name, bandwidth=np.inf)
-            rough.append(distance(hj.recordings.plain_regression(through, 2), true))
+            rough.append(distance(hj.recordings.advise(through, fit).plain, true))
         row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
         row = "  ".join(f"{x:9.1e}" for x in row)
         print(f"{name:5s}  {strides:7d}  {noise:6.0e}  {row}", flush=True)
@@ -219,7 +219,9 @@ def dirt(seeds=5, strides=500, noise=1e-4):
             if drift is not None:
                 rough = hj.recordings.estimate_phase(dirty, phase_of(name))
                 dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), drift)
-            fit = hj.fit_series(at_sections(dirty, name, drift=drift).records, 2, check=False)
+            data = at_sections(dirty, name)
+            data = data if drift is None else data.with_drift(drift)
+            fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
             hits += bool(fit.contains(true[:1])[0])

@@ -88,12 +88,12 @@ class SectionData(eqx.Module):
             np.concatenate([r.y for r in self.records]),
         )
 
-    def with_drift(self, cycles: float) -> "SectionData":
+    def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
         records = tuple(
             Record(
                 r.u, r.y, n_sections=r.n_sections, first_section=r.first_section, inputs=r.inputs,
-                outputs=r.outputs, lead=r.lead, drift=cycles,
+                outputs=r.outputs, lead=r.lead, drift=float(cycles),
             )
             for r in self.records
         )  # fmt: skip

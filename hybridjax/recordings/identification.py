@@ -30,8 +30,8 @@ class Identification(eqx.Module):
 
     **Fields:** `recording`, without the samples that `inspect` leaves out; `findings` of the
     inspection; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the
-    first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response curve of
-    events alone under one input (else None); `advice`.
+    first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
+    curve of events alone under one input (else None); `advice`.
     """
 
     recording: Recording

@@ -375,7 +375,8 @@ def check_events(
     if len(at) and not ((at >= time[0] - margin) & (at <= time[-1] + margin)).any():
         raise error(
             f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, "
-            f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or unit."
+            f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or "
+            "unit."
         )
 
 

@@ -42,7 +42,7 @@ def findings(recording, phase=TOP):
     clean = inspection.recording
     found = hj.recordings.estimate_phase(clean, phase)
     data = hj.recordings.section_data(clean, found, n_sections=16, **names)
-    return inspection.findings + hj.recordings.inspect_cycles(clean, found, data)
+    return hj.recordings.inspect(recording, **names, phase=found, data=data).findings
 
 
 def causes(recording, phase=TOP):

@@ -48,4 +48,4 @@ def test_what_is_found_is_printed_and_copies_count_once(trials):
     thrice = identify(mishandle(trials, "the same trial thrice", **names))
     np.testing.assert_array_equal(thrice.fit.multipliers, clean.fit.multipliers)
     assert "A trial twice (left out): all samples of trial" in repr(thrice)
-    assert thrice.advice.warnings[: len(thrice.findings)] == tuple(map(repr, thrice.findings))
+    assert thrice.advice.warnings[: len(thrice.findings)] == thrice.findings

@@ -121,4 +121,4 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     assert fits[1].standard_errors[0] < most * fits[0].standard_errors[0]
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     said = hj.recordings.advise(data, fits[1]).warnings
-    assert any(w.startswith("Spikes: ") for w in said)
+    assert any(w.cause == "spikes" for w in said)

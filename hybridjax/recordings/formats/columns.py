@@ -133,6 +133,7 @@ def library(module: str, what: str, extra: str) -> Any:
     **Raises:** `DefinitionError` if it is not installed.
     """
     try:
+        importlib.import_module(module.split(".")[0])
         return importlib.import_module(module)
     except ImportError as error:
         raise DefinitionError(

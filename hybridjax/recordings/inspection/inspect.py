@@ -47,7 +47,8 @@ def inspect(
     inputs that the outputs do not answer, and inputs that depend on the outputs.
 
     **Arguments:** `inputs`, `outputs`: names of signals; others are not inspected. `phase`, `data`:
-    the phase of the recording and its data at the sections. Default: None.
+    phase and data at the sections, of this recording or of the one that an inspection returned.
+    Default: None.
 
     **Raises:** `DefinitionError` for unknown names.
     """
@@ -88,7 +89,8 @@ def inspect(
     findings += other_settings(clean, names, outputs)
     findings += clocks(clean)
     if phase is not None and data is not None:
-        findings += inspect_cycles(recording, phase, data)
+        same = len(phase.stretches) == len(recording.trials)
+        findings += inspect_cycles(recording if same else clean, phase, data)
     return Inspection(tuple(findings), clean)
 
 
