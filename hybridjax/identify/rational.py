@@ -7,16 +7,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
-from ..._core.html.multipliers import complex_number, unit_circle
-from ..._core.html.parts import card, table
-from ..._core.precision import require_x64
-from ..._core.results import Result
-from ...errors import ComputationError, DefinitionError
-from ...linear.htf import HTF
-from ..descent import least_squares
-from ..multipliers.compare import (
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Order, Scalar, Vector
+from .._core.html.multipliers import complex_number, unit_circle
+from .._core.html.parts import card, table
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..errors import ComputationError, DefinitionError
+from ..linear.htf import HTF
+from .descent import least_squares
+from .multiplier_estimate import (
     MultiplierComparison,
     Multipliers,
     channel_index,
@@ -24,15 +24,15 @@ from ..multipliers.compare import (
 )
 
 
-# Steps of the iteration of Sanathanan and Koerner from which fits are started. Doubled: twice the
-# time, as a rule for the same result.
+# Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found for
+# some forms and weightings; more: the same result in longer time.
 _STARTS = (0, 1, 4, 29)
-# Part of the residual, relative to H, that a step may still explain at the end. Doubled: half a
-# step fewer.
+# Part of the residual, relative to H, that a step may still explain at the end. Smaller: descents
+# on exact data stall in rounding; larger: coefficients that are off by as much.
 _ACCURACY = 1e-8
-# Relative difference of costs that are equal. Doubled: none but rounding.
+# Relative difference of costs that are equal: a converged fit is then preferred.
 _EQUAL_COST = 1e-9
-# |H| relative to its rms that counts as zero. Doubled: none but rounding.
+# |H| relative to its rms that counts as zero: relative weights would be infinite.
 _ZERO = 1e-12
 
 
@@ -56,7 +56,7 @@ class RationalFit(eqx.Module):
     - `residual` (ny,): root mean square misfit; relative to the rms of H with uniform weighting,
       of the relative error with relative weighting.
     - `result` (ny,): codes of `Result`, OK or NOT_CONVERGED.
-    - `harmonic`, `n_sections`, `form`, `weighting`, `outputs`, `input`: what was fitted.
+    - `harmonic`, `n_sections`, `form`, `weighting`, `outputs`, `input`: the arguments of the fit.
     """
 
     numerator: Float[np.ndarray, "ny b"]
@@ -75,22 +75,19 @@ class RationalFit(eqx.Module):
 
     @checked
     def htf(self, f: Scalar | Vector) -> HTF:
-        """The fitted functions at frequencies f (F,), cycles per period: one harmonic and input."""
-        f = np.atleast_1d(np.asarray(f, float))
-        w = np.exp(-2j * np.pi * f / self.n_sections)[:, None]
-        delay = w if self.form == "delayed" else 1.0
-        polynomial = np.polynomial.polynomial.polyval
-        columns = range(len(self.outputs))
-        top = [polynomial(w[:, 0], self.numerator[i]) for i in columns]
-        bottom = [polynomial(w[:, 0], self.denominator[i]) for i in columns]
-        H = (delay * np.stack(top, axis=1) / np.stack(bottom, axis=1))[None, :, :, None]
-        N = self.n_sections
+        """Return the fitted functions at frequencies f (F,), cycles per period."""
+        f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
+        w = np.exp(-2j * np.pi * f / N)
+        top, bottom = (
+            np.polynomial.polynomial.polyval(w, x.T) for x in (self.numerator, self.denominator)
+        )
+        H = (top / bottom * (w if self.form == "delayed" else 1.0)).T[None, :, :, None]
         harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
         return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
 
     @checked
     def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
-        """The multipliers of each output's fit (or of one alone) beside the true ones.
+        """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
 
         **Raises:** `DefinitionError` for an output that is not there.
         """
@@ -101,10 +98,10 @@ class RationalFit(eqx.Module):
             f"RationalFit(H_{self.harmonic} from {self.input}, {self.denominator.shape[1] - 1} "
             f"poles, {self.numerator.shape[1] - 1} zeros, {self.form}, {self.weighting} weighting)"
         ]
-        for name, own, residual, code in zip(
+        for name, multipliers, residual, code in zip(
             self.outputs, self.multipliers, self.residual, self.result, strict=True
         ):
-            shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in own)
+            shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in multipliers)
             state = "" if code == Result.OK else f" ({Result(int(code)).message})"
             rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}{state}")
         return "\n".join(rows)
@@ -112,10 +109,10 @@ class RationalFit(eqx.Module):
     def _repr_html_(self) -> str:
         rows = [
             (name, *map(complex_number, (pole, multiplier)), f"{residual:.2e}")
-            for name, poles, own, residual in zip(
+            for name, poles, multipliers, residual in zip(
                 self.outputs, self.poles, self.multipliers, self.residual, strict=True
             )
-            for pole, multiplier in zip(poles, own, strict=True)
+            for pole, multiplier in zip(poles, multipliers, strict=True)
         ]
         of = repr(self).splitlines()[0].removeprefix("RationalFit(").removesuffix(")")
         head = ("output", "pole", "multiplier", "residual")
@@ -133,30 +130,29 @@ def fit_rational(
     zeros: Index = 1,
     form: Literal["delayed", "direct"] = "delayed",
     weighting: Literal["uniform", "relative"] = "uniform",
-    max_steps: StepCount = 200,
 ) -> RationalFit:
     """Fit a rational function of z with real coefficients to one harmonic.
 
-    The residual is the true one, `W (H - B/A)`, minimized by Gauss and Newton's method over
-    the denominator only: for a given denominator the best numerator is a linear problem that is
-    solved inside (variable projection). It starts from several solutions of the linearized
+    The residual `W (H - B/A)` is minimized by Gauss-Newton steps in
+    the denominator only: for a given denominator the best numerator solves a linear problem
+    (variable projection). The descents start from several solutions of the linearized
     problem (Levy 1959; Sanathanan and Koerner 1963) and the best result is kept.
 
     **Arguments:**
 
-    - `htf`: estimated or exact. `harmonic`: usually 0; the others of a real system have complex
-      coefficients, which this form does not have.
-    - `output`: name or index; None fits every output. `input`: name or index.
-    - `poles`, `zeros`: their numbers; 2 and 1 are the paper's.
-    - `form`: `"delayed"`, numerator from z^-1 on (the output does not feel the input of its own
-      section), or `"direct"`, from z^0 on.
-    - `weighting`: `"uniform"`, or `"relative"`, each residual divided by |H|.
+    - `htf`: estimated or exact. `harmonic`: usually 0, the default; the others of a real system
+      have complex coefficients, which this form does not have.
+    - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
+    - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
+    - `form`: `"delayed"`, the default, numerator from z^-1 on (the output does not depend on the
+      input of its own section), or `"direct"`, from z^0 on.
+    - `weighting`: `"uniform"`, the default, or `"relative"`, each residual divided by |H|.
 
     **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
 
     **Raises:** `DefinitionError` for a harmonic, output or input that is not there, for fewer
     lines than coefficients, for NaN or, with relative weighting, zeros in H;
-    `ComputationError` if no start leads anywhere.
+    `ComputationError` if no start leads to a finite fit.
     """
     require_x64(htf.H)
     column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
@@ -169,7 +165,9 @@ def fit_rational(
             f"{len(H)} frequencies."
         )
     w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
-    powers = w ** (int(form == "delayed") + np.arange(zeros + 1)), w ** (1 + np.arange(poles))
+    powers_b, powers_a = (
+        w ** (int(form == "delayed") + np.arange(zeros + 1)), w ** (1 + np.arange(poles))
+    )
     fits = []
     for row in rows:
         h = H[:, row]
@@ -180,25 +178,21 @@ def fit_rational(
         if rms == 0 or (weighting == "relative" and np.abs(h).min() < _ZERO * rms):
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
-        problem = _Problem(*powers, h / rms, weight / np.sqrt(len(h)))
+        problem = _Problem(powers_b, powers_a, h / rms, weight / np.sqrt(len(h)))
         with np.errstate(all="ignore"):
-            tried = [_refined(problem, start, max_steps) for start in _starts(problem)]
-        cost = np.array([one.cost if np.isfinite(one.cost) else np.inf for one in tried])
+            ends = [least_squares(problem.linearize, a, settled_gain=_ACCURACY**2)
+                    for a in problem.starts()]  # fmt: skip
+            projected = [problem.project(end.coefficients) for end in ends]
+        cost = np.array([float(np.linalg.norm(residual)) for _, residual, _ in projected])
+        cost[~np.isfinite(cost)] = np.inf
         if not np.isfinite(cost).any():
             raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
         lowest = cost <= cost.min() * (1 + _EQUAL_COST)
-        best = tried[int(np.argmax(lowest * [1 + one.converged for one in tried]))]
-        fits.append(
-            (
-                best.numerator * rms,
-                np.concatenate([[1.0], best.denominator]),
-                best.cost,
-                Result.OK if best.converged else Result.NOT_CONVERGED,
-            )
-        )
-    numerator, denominator, residual, result = (
-        np.array(values) for values in zip(*fits, strict=True)
-    )
+        best = int(np.argmax(lowest * [1 + end.converged for end in ends]))
+        a, converged = ends[best]
+        result = Result.OK if converged else Result.NOT_CONVERGED
+        fits.append((projected[best][0] * rms, np.append(1.0, a), cost[best], int(result)))
+    numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
     roots = np.stack([_roots(a) for a in denominator])
     with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
         multipliers = roots**htf.n_sections
@@ -209,7 +203,7 @@ def fit_rational(
         zeros=np.stack([_roots(b) for b in numerator]),
         multipliers=multipliers,
         residual=residual,
-        result=result.astype(int),
+        result=result,
         harmonic=harmonic,
         n_sections=htf.n_sections,
         form=form,
@@ -220,7 +214,7 @@ def fit_rational(
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
-    """Roots by decreasing modulus; NaN for each that lies at infinity."""
+    """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
     finite = finite[np.lexsort((-finite.imag, -np.abs(finite)))]
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
@@ -230,68 +224,43 @@ class _Problem(NamedTuple):
     """The weighted residual W (H - B/A) of F lines."""
 
     powers_b: Complex[np.ndarray, "F q1"]
-    """Of z, by which the coefficients of B are multiplied,"""
+    """The powers of z of the coefficients of B,"""
     powers_a: Complex[np.ndarray, "F p"]
-    """and those of A after its leading 1."""
+    """and of those of A after its leading 1."""
     h: Complex[np.ndarray, " F"]
     weight: Float[np.ndarray, " F"]
 
-    def project(self, a: Float[np.ndarray, " p"]) -> "_Projection":
+    def project(
+        self, a: Float[np.ndarray, " p"]
+    ) -> tuple[Float[np.ndarray, " q1"], Float[np.ndarray, " rows"], Float[np.ndarray, "rows p"]]:
+        """Return the best numerator, the residual and its derivative by the coefficients of A."""
         bottom = 1 + self.powers_a @ a
         by_numerator = (self.weight / bottom)[:, None] * self.powers_b
         q, triangle = np.linalg.qr(_real(by_numerator))
         target = _real((self.weight * self.h)[:, None])[:, 0]
         b = np.linalg.solve(triangle, q.T @ target)
         residual = target - q @ (q.T @ target)
-        # What moves with the denominator: B/A, and the space of all B/A (Golub and Pereyra 1973).
+        # B/A and the space of all B/A change with the denominator (Golub and Pereyra 1973).
         slope = -self.powers_a / bottom[:, None]
         moved = _real((by_numerator @ b)[:, None] * slope)
         turned = np.stack([_real(x[:, None] * by_numerator).T @ residual for x in slope.T], axis=1)
         jacobian = q @ (q.T @ moved) - moved - q @ np.linalg.solve(triangle.T, turned)
-        return _Projection(b, residual, jacobian)
+        return b, residual, jacobian
 
+    def linearize(self, a: Float[np.ndarray, " p"]):
+        return self.project(a)[1:]
 
-class _Projection(NamedTuple):
-    """What is best for a denominator."""
-
-    numerator: Float[np.ndarray, " q1"]
-    residual: Float[np.ndarray, " rows"]
-    jacobian: Float[np.ndarray, "rows p"]
-    """Of the residual, by the denominator's coefficients."""
-
-
-class _Trial(NamedTuple):
-    """The fit from one start."""
-
-    denominator: Float[np.ndarray, " p"]
-    """Without its leading 1."""
-    numerator: Float[np.ndarray, " q1"]
-    cost: float
-    """Root mean square of the weighted residual."""
-    converged: bool
-
-
-def _starts(problem: _Problem) -> Iterator[Float[np.ndarray, " p"]]:
-    """Steps of Sanathanan and Koerner: the old denominator as a weight."""
-    h, p = problem.h[:, None], problem.powers_a.shape[1]
-    a = np.zeros(p)
-    for step in range(1 + max(_STARTS)):
-        scale = (problem.weight / np.abs(1 + problem.powers_a @ a))[:, None]
-        columns = _real(scale * np.concatenate([h * problem.powers_a, -problem.powers_b], axis=1))
-        size = np.linalg.norm(columns, axis=0)
-        a = (np.linalg.lstsq(columns / size, -_real(scale * h)[:, 0])[0] / size)[:p]
-        if step in _STARTS:
-            yield a
-
-
-def _refined(problem: _Problem, start: Float[np.ndarray, " p"], max_steps: int) -> _Trial:
-    def linearize(a):
-        found = problem.project(a)
-        return found.residual, found.jacobian
-
-    a, converged = least_squares(linearize, start, max_steps, settled_gain=_ACCURACY**2)
-    found = problem.project(a)
-    return _Trial(a, found.numerator, float(np.linalg.norm(found.residual)), converged)
+    def starts(self) -> Iterator[Float[np.ndarray, " p"]]:
+        """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
+        h, p = self.h[:, None], self.powers_a.shape[1]
+        a = np.zeros(p)
+        for step in range(1 + max(_STARTS)):
+            scale = (self.weight / np.abs(1 + self.powers_a @ a))[:, None]
+            columns = _real(scale * np.concatenate([h * self.powers_a, -self.powers_b], axis=1))
+            size = np.linalg.norm(columns, axis=0)
+            a = (np.linalg.lstsq(columns / size, -_real(scale * h)[:, 0])[0] / size)[:p]
+            if step in _STARTS:
+                yield a
 
 
 def _real(z: Complex[np.ndarray, "F n"]) -> Float[np.ndarray, "rows n"]:

@@ -1,11 +1,11 @@
-r"""Transients taken out of records whose start could not be chosen.
+r"""Transients subtracted from records whose initial condition could not be chosen.
 
-Seen once a period, at one section, the response to an input of P periods is a sum of the few
-sinusoids $e^{2 \pi i c p / P}$, c the classes that are excited, and what is left of the start dies
-out like $\sum_i a_i \lambda_i^p$. The multipliers $\lambda$ are the same at every section, in every
-output and every experiment (after the first period, in which the part of the state with zero
-multipliers is gone). So all amplitudes are linear unknowns that can be projected out, and the d
-multipliers alone are left to be found (variable projection: Golub and Pereyra 1973).
+Sampled once a period, at one section, the response to an input of P periods is a sum of the few
+sinusoids $e^{2 \pi i c p / P}$, c the classes that are excited, and the response to the initial
+condition decays like $\sum_i a_i \lambda_i^p$. The multipliers $\lambda$ are the same at every
+section, in every output and every experiment (after the first period, in which the part of the
+state with zero multipliers vanishes). All amplitudes are linear unknowns, which are eliminated, so
+that d multipliers are left (variable projection: Golub and Pereyra 1973).
 """
 
 import dataclasses
@@ -14,31 +14,25 @@ from typing import Annotated
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import least_squares
 
-from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Complexes
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order
-from ...errors import DefinitionError
-from ...experiments.data import ExperimentData, Simulated
-from ...experiments.design.partition import line_class
-from ..multipliers.denominator import multipliers_of
+from .._core.arguments import Numbers
+from .._core.boundary.arrays import Complexes
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Order
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData, Simulated
+from ..experiments.design.partition import line_class
+from .denominator import multipliers_of
+from .spectral_sums import SILENT_LINE
 
 
-# The largest number of multipliers that is tried. Doubled: longer, and records must have 8 more
-# cycles to be told from everything that repeats.
+# The largest number of multipliers that is tried. Larger: records need 8 more cycles for each one
+# to be separated from all that repeats; smaller: slow modes of larger systems are missed.
 _LARGEST_ORDER = 4
-# Change of the input after P periods, relative to its largest value, that is rounding. Doubled:
-# none but rounding.
-_REPEATS = 1e-6
-# Part of the largest line of an input below which a line is not excited. Doubled: none but
-# rounding.
-_SILENT_LINE = 1e-6
-# Imaginary part that rounding leaves of coefficients. Doubled: none but rounding.
-_REAL = 1e-9
-# Scale of steps for coefficients that start near zero. Doubled: their first steps are twice as
-# long.
+# Change of the input after P periods, relative to its largest value, and imaginary part of
+# coefficients, that are rounding.
+_REPEATS, _REAL = 1e-6, 1e-9
+# Scale of steps for coefficients that start near zero. Smaller: they hardly move.
 _SMALLEST_SCALE = 0.1
 
 
@@ -48,9 +42,9 @@ class TransientFit(eqx.Module):
     **Fields:**
 
     - `data`: the records from period `skip` on, less the transient.
-    - `multipliers` (d,): of the decay, by decreasing modulus. A by-product: fits to all of the
-      data know them better.
-    - `removed` (S, ny): rms of what was taken away in the window, per experiment and output; NaN
+    - `multipliers` (d,): those of the decay, by decreasing modulus. A by-product: fits to all of
+      the data are more accurate.
+    - `removed` (S, ny): rms of the transient in the window, per experiment and output; NaN
       where an experiment failed.
     """
 
@@ -72,22 +66,22 @@ def remove_transient(
     multipliers: Annotated[Numbers, Complexes("d")] | None = None,
     skip: Index = 1,
 ) -> TransientFit:
-    """Fit the decay of whatever the experiments started with, and subtract it.
+    """Fit the decay of the initial condition's response, and subtract it.
 
     Needs no model. The input has the period P over all of the record, which is longer than P
-    periods, by `skip` at least. If it is longer by several (20, say), everything that repeats after
-    P periods is told from the decay, distortion included, and any design will do. With fewer, only
-    the response at lines that are excited is, so that a design is needed that leaves out half of
-    them (`multisine(lines="odd")`).
+    periods, by `skip` at least. If it is longer by several (20, say), the decay is separated from
+    everything that repeats after P periods, distortion included, and any design will do. With
+    fewer, it is separated only from the response at excited lines, so that the design must leave
+    out half of them (`multisine(lines="odd")`).
 
     **Arguments:**
 
-    - `order`: d, the number of non-zero multipliers; by default the one of 1 to 4 with the
+    - `order`: d, the number of non-zero multipliers. Default: the one of 1 to 4 with the
       shortest description (Rissanen 1978).
-    - `multipliers`: where they are known already, conjugates in pairs.
-    - `skip`: periods at the start in which zero multipliers die; they are cut off.
+    - `multipliers`: the multipliers, if they are known, conjugates in pairs. Default: fitted.
+    - `skip`: periods at the start in which zero multipliers vanish; they are cut off. Default: 1.
 
-    **Returns:** `TransientFit`; `estimate_htf(fit.data)` goes on from there.
+    **Returns:** `TransientFit`, whose `data` are the argument of `estimate_htf`.
 
     **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
     and if no experiment ran well.
@@ -107,33 +101,35 @@ def remove_transient(
     if not data.ok.any():
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")
     _require_periodic(data)
-    known = None if multipliers is None else _polynomial(multipliers)
-    if known is not None:
-        order = len(known)
+    c = None if multipliers is None else _polynomial(np.asarray(multipliers))
+    if c is not None:
+        order = len(c)
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
-    scaled = data.y / np.where(size > 0, size, 1.0)
-    y = scaled.reshape(S, -1, N * ny)[:, skip:]
     good = np.flatnonzero(data.ok).tolist()
+    scaled = data.y[data.ok] / np.where(size > 0, size, 1.0)
+    y = scaled.reshape(len(good), -1, N * ny)[:, skip:]
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
-    free = [_free(data, s, cycles, everything) for s in ([good[0]] if everything else good)]
-    free = free * len(good) if everything else free
-    left = [Q @ y[s] for Q, s in zip(free, good, strict=True)]
-    least = min(len(Q) for Q in free)
+    if everything:
+        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
+    else:
+        free = [_free(_classes(data, s), P, cycles) for s in good]
+    left = [Q @ record for Q, record in zip(free, y, strict=True)]
+    least = min(map(len, free))
     if least <= (order or 1):
         raise DefinitionError(
             f"{cycles} cycles with {cycles - least} lines per section leave nothing to tell the "
             "transient from the response: record more cycles, or excite half of the lines "
             "(`multisine(lines='odd')`)."
         )
-    if known is None:
+    if c is None:
         tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
         blocks = _compressed(free, left, everything)
         count = sum(z.size for z in left)
-        fits = [_fit(blocks, _start(y[good], free, d), count, N * ny * len(good)) for d in tried]
-        known = min(fits, key=lambda fit: fit[0])[1]
+        fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
+        c = min(fits, key=lambda fit: fit[0])[1]
 
-    basis = _decays(known, cycles)
+    basis = _decays(c, cycles)
     clean, removed = data.y[:, skip * N :].copy(), np.full((S, ny), np.nan)
     for Q, z, s in zip(free, left, good, strict=True):
         transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
@@ -144,7 +140,7 @@ def remove_transient(
     # Events, some of which lie in the cycles that were cut off, are left out.
     simulated = None if data.simulated is None else Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
-    return TransientFit(data, multipliers_of(known), removed)
+    return TransientFit(data, multipliers_of(c), removed)
 
 
 def _require_periodic(data: ExperimentData) -> None:
@@ -160,24 +156,24 @@ def _require_periodic(data: ExperimentData) -> None:
         )
 
 
-def _polynomial(multipliers) -> Float[np.ndarray, " d"]:
+def _polynomial(multipliers: np.ndarray) -> Float[np.ndarray, " d"]:
     if len(multipliers) == 0:
         raise DefinitionError("`multipliers` must hold one or more.")
-    c = np.poly(np.asarray(multipliers))[1:]
+    c = np.poly(multipliers)[1:]
     if np.abs(np.imag(c)).max() > _REAL:
         raise DefinitionError(f"`multipliers` must be real or in conjugate pairs: {multipliers}.")
     return np.real(c)
 
 
-def _free(data: ExperimentData, s: int, cycles: int, everything: bool):
-    """Rows that are orthogonal to all responses, over the periods at one section."""
-    P = data.periods
-    if everything:
-        classes = np.arange(P // 2 + 1)
-    else:
-        size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
-        classes = line_class(np.flatnonzero(size > _SILENT_LINE * size.max()), P)
-        classes = np.unique(np.r_[0, classes])
+def _classes(data: ExperimentData, s: int) -> np.ndarray:
+    """Return the classes of lines that an experiment excites, and 0."""
+    size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
+    lines = np.flatnonzero(size > SILENT_LINE * size.max())
+    return np.unique(np.append(line_class(lines, data.periods), 0))
+
+
+def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
+    """Return rows that are orthogonal to the sinusoids of these classes at one section."""
     angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
     inner = (classes > 0) & (2 * classes < P)
     signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
@@ -187,7 +183,7 @@ def _free(data: ExperimentData, s: int, cycles: int, everything: bool):
 
 
 def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
-    """Solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`: a basis."""
+    """Return a basis of the solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`."""
     d = len(c)
     v = np.zeros((cycles, d))
     v[:d] = np.eye(d)
@@ -197,7 +193,7 @@ def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycle
 
 
 def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
-    """`y` obeys the equation of the decay but for sinusoids: linear least squares."""
+    """Solve the equation of the decay, which `y` obeys but for sinusoids, by least squares."""
     normal, right = np.zeros((d, d)), np.zeros(d)
     cycles = y.shape[1]
     for Q, record in zip(free, y, strict=True):
@@ -211,18 +207,17 @@ def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
 
 
 def _compressed(free, left, everything: bool):
-    """Pairs (Q, z) with as few columns as rows; what is left over stays as large."""
+    """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
     if everything:
         free, left = free[:1], [np.concatenate(left, axis=1)]
-
-    def fewer(z):
-        return z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T
-
-    return [(Q, fewer(z)) for Q, z in zip(free, left, strict=True)]
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T for z in left]
+    return list(zip(free, fewer, strict=True))
 
 
 def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
-    """Length of the description, and the coefficients."""
+    """Return the length of the description, and the coefficients."""
+    from scipy.optimize import least_squares  # (a third of a second)
+
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
@@ -232,7 +227,7 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
             out.append((z - q @ (q.T @ z)).ravel())
         return np.concatenate(out)
 
-    found = least_squares(residual, start, x_scale=np.maximum(np.abs(start), _SMALLEST_SCALE))
+    fit = least_squares(residual, start, x_scale=np.maximum(np.abs(start), _SMALLEST_SCALE))
     parameters = len(start) * (series + 1)
-    mean = max(2 * found.cost, 1e-300) / count
-    return count * np.log(mean) + parameters * np.log(count), found.x
+    mean = max(2 * fit.cost, 1e-300) / count
+    return count * np.log(mean) + parameters * np.log(count), fit.x
