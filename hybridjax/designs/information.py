@@ -8,11 +8,11 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.html.parts import card, facts
+from .._core.html import card, facts
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.variable_projection import HTFGroup, group_htf, misfit_of
 from ..linear.htf import HTF
 from .goals import Multipliers
 from .questions.multipliers import FEW, wanted_parts

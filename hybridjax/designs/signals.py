@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..identify.multipliers.structured import StructuredFit
+from ..identify.multipliers import StructuredFit
 from ..linear.ldtp import LDTP
 from .candidates import Candidates
 

@@ -99,7 +99,7 @@ def least_squares(
     """Minimize a sum of squares whose linear unknowns are eliminated.
 
     **Arguments:** `linearize(c)` returns the residuals (n,) and their Jacobian (n, d).
-    `max_steps`: default 200. `settled_gain`: a decrease of the sum that does not matter. Default: 0.
+    `max_steps`: default 200. `settled_gain`: a decrease of the sum that does not matter.
     """
     point, converged = descend(_Squares(linearize, start, settled_gain), max_steps)
     return Minimum(point.c, converged)

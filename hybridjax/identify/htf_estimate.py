@@ -13,8 +13,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.partition import line_class
 from ..linear.frequency_response import Harmonics
-from ..linear.htf import HTF
-from ..linear.scatter import Scatter
+from ..linear.htf import HTF, Scatter
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 

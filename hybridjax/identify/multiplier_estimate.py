@@ -11,8 +11,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.arrays import Complexes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Probability
-from .._core.html.multipliers import complex_number, multiplier_table, unit_circle
-from .._core.html.parts import card, table, text
+from .._core.html import card, complex_number, multiplier_table, table, text, unit_circle
 from ..errors import DefinitionError
 
 

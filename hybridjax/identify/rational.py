@@ -9,8 +9,7 @@ from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
-from .._core.html.multipliers import complex_number, unit_circle
-from .._core.html.parts import card, table
+from .._core.html import card, complex_number, table, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
@@ -166,7 +165,8 @@ def fit_rational(
         )
     w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
     powers_b, powers_a = (
-        w ** (int(form == "delayed") + np.arange(zeros + 1)), w ** (1 + np.arange(poles))
+        w ** (int(form == "delayed") + np.arange(zeros + 1)),
+        w ** (1 + np.arange(poles)),
     )
     fits = []
     for row in rows:

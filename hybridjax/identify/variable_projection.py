@@ -181,7 +181,9 @@ def maximum_likelihood(
         jacobian = np.concatenate([p.jacobian.reshape(order, -1) for p in parts], axis=1)
         return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
-    return least_squares(linearize, _linearized(groups, order) if start is None else start, max_steps)
+    return least_squares(
+        linearize, _linearized(groups, order) if start is None else start, max_steps
+    )
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:

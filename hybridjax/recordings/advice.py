@@ -14,7 +14,7 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import RecordedData
-from ..identify.multipliers.compare import compare_multipliers
+from ..identify.multiplier_estimate import compare_multipliers
 from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
 from ..identify.series.cycle_grid import CycleGrid
 from ..identify.series.output_error import OutputErrorProblem

@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
-from ..identify.multipliers.denominator import Denominator
+from ..identify.denominator import Denominator
 from ..identify.series.arx import delayed_outputs, total_least_squares
 from ..identify.series.fit import assemble, fit_series
 from ..identify.series.linearization import linearize

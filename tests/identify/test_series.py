@@ -361,7 +361,7 @@ def test_the_jackknife_is_that_of_fits_without_a_block(cycles, length, modulus, 
     monkeypatch.setattr(shared_state_fit, "jackknife", looked_at)
     monkeypatch.setattr(shared_state_fit, "_SETTLED_GAIN", 1e-20)
     # Also of blocks that the others hardly predict:
-    monkeypatch.setattr("hybridjax.identify.multipliers.covariance._SMALLEST_REMAINDER", 1e-9)
+    monkeypatch.setattr("hybridjax.identify.denominator._SMALLEST_REMAINDER", 1e-9)
     data, _ = quadratic(0, 0.03, cycles, modulus)
     hj.fit_series(data, 2, distortion=True, check=False)
     model, _ = shared_state_fit._minimize(*seen[:2], 50)

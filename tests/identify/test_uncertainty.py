@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.multipliers.error_spectrum import error_spectrum
-from hybridjax.identify.multipliers.error_weights import spectral_weights
-from hybridjax.identify.multipliers.variable_projection import group_htf
+from hybridjax.identify.htf_errors import error_spectrum
+from hybridjax.identify.XXX import spectral_weights
+from hybridjax.identify.variable_projection import group_htf
 
 from ..linear.conftest import blocks_at_random
 

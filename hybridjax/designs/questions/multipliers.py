@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ...errors import DefinitionError
-from ...identify.multipliers.denominator import multipliers_of
+from ...identify.denominator import multipliers_of
 from ..candidates import Candidates
 from ..goals import Multipliers
 from ..noise import Noise

@@ -11,8 +11,8 @@ from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 
 from ...errors import DefinitionError
-from ...identify.multipliers.denominator import chi
-from ...identify.multipliers.error_weights import require_frequencies
+from ...identify.denominator import chi
+from ...identify.htf_errors import require_frequencies
 from ..candidates import Candidates
 from ..goals import Order
 from ..noise import Noise

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...errors import DefinitionError
-from ...identify.multipliers.denominator import chi
-from ...identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ...identify.multipliers.variable_projection import powers_basis
+from ...identify.denominator import chi
+from ...identify.htf_errors import check_values, error_weights, require_frequencies
+from ...identify.variable_projection import powers_basis
 from ...linear.htf import HTF
 from .measured import Measured
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..denominator import multipliers_of
 from ..descent import Coefficients
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.order import refuse_invented
+from ..order import refuse_invented
 from .cycle_filters import delay_cycles, lagged_inputs
 from .output_error import OutputErrorProblem, Part, in_passes
 from .section_regression import SectionRegression, root_of

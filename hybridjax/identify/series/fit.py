@@ -13,9 +13,8 @@ from ..._core.results import Result
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
+from ..denominator import Covariance, Denominator, correlated_cycles, multipliers_of, sandwich
 from ..descent import Coefficients, least_squares
-from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
-from ..multipliers.denominator import Denominator, multipliers_of
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .gradient_covariance import gradient_covariance
 from .linearization import Linearization, linearize

@@ -3,14 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import (
-    Covariance,
-    block_freedom,
-    fading,
-    in_blocks,
-    inverse_of_remainder,
-)
-from ..multipliers.error_spectrum import amounts
+from ..denominator import Covariance, block_freedom, fading, in_blocks, inverse_of_remainder
+from ..htf_errors import amounts
 from .cycle_filters import divide_by_chi
 from .linearization import Linearization, each_part, linearize
 from .output_error import OutputErrorProblem, Part

@@ -11,8 +11,8 @@ from ..._core.signal import unit_of
 from ..._core.text import number
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
-from ..multipliers.denominator import chi
-from ..multipliers.multiplier_estimate import MultiplierEstimate
+from ..denominator import chi
+from ..multiplier_estimate import MultiplierEstimate
 
 
 class SeriesFit(MultiplierEstimate):

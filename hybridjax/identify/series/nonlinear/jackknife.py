@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from ...multipliers.covariance import (
+from ...denominator import (
     Covariance,
     block_freedom,
     correlated_cycles,

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...multipliers.denominator import Denominator
+from ...denominator import Denominator
 from ..cycle_grid import CycleGrid
 from ..section_regression import RANK
 from .shared_state import ProductInputs, set_up, simulate_state, smallest_noise

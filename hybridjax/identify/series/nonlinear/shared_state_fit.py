@@ -5,8 +5,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...multipliers.covariance import Covariance
-from ...multipliers.denominator import Denominator
+from ...denominator import Covariance, Denominator
 from .channels import misfit_of
 from .jackknife import jackknife
 from .shared_state import SharedStateModel, SharedStateProblem, simulate_state
