@@ -151,18 +151,16 @@ UNCHECKED = {
         "ReturnMap.turn_with_jacobian", "Structure", "Winding.when",
     },
     "made by this package": {
-        "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
+        "Advice", "Branch", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
         "InformationMap", "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
-        "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
-        "NaturalMultipliers", "OptimalDesign", "OutputLevels", "ParameterGuesses", "Phase",
-        "PhaseResponse",
+        "LimitCycles", "ModelFit", "NaturalMultipliers", "OptimalDesign", "ParameterGuesses",
+        "Phase", "PhaseResponse",
         "PlacedSections", "Plan", "Plot", "RandomInput",
-        "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
-        "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",
-        "Winding", "WindowChoice",
+        "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
+        "Stepping", "Trajectory", "Trial", "Winding", "WindowChoice",
     },
 }  # fmt: skip
 

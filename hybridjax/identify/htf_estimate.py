@@ -205,7 +205,11 @@ def _roundness(
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
 
 
-def roundness(square, turned, count) -> Float[np.ndarray, "M F ny nu"]:
+def roundness(
+    square: Float[np.ndarray, "*shape"],
+    turned: Complex[np.ndarray, "*shape"],
+    count: Float[np.ndarray, "*#shape"],
+) -> Float[np.ndarray, "*shape"]:
     r"""Return $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ relative to its mean for Gaussian errors.
 
     Of n errors the mean is $(n - 2) / n$: it is Mauchly's criterion of their covariance in the

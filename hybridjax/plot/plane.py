@@ -50,7 +50,7 @@ def multipliers(
     - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them; or the estimate with which
         others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
-        `SeriesFit` or `MultiplierBound`, or multipliers.
+        `SeriesFit` or the result of `multiplier_bound`, or multipliers.
     - `zoom`: draw the inset. `labels`: texts for the outputs by name.
 
     **Raises:** `DefinitionError` if there are no multipliers.

@@ -67,23 +67,11 @@ def estimates(t):
     yield "estimate_htf", hj.estimate_htf, dict(data=t.data, harmonics=0), {
         "data": alone, "harmonics": HARMONICS, "variance": WORD, "half_integers": WORD,
     } | shared  # fmt: skip
-    yield (
-        "estimate_coherence",
-        hj.identify.estimate_coherence,
-        dict(data=t.repeated, harmonics=0, repeats=2),
-        {"data": alone, "harmonics": HARMONICS} | shared,
-    )
     yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
-    yield "htf_p_values", hj.identify.htf_p_values, dict(
-        data=t.four_times, true=t.model.htf(t.design.frequencies[:2], 0)
-    ), {"data": alone, "true": instance(t.model)} | shared  # fmt: skip
     yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
         "data": instance(t.design), "repeats": FEW,
-    }  # fmt: skip
-    yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
-        "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "remove_transient", hj.identify.remove_transient, dict(
         data=t.repeated, order=2, skip=1
@@ -94,7 +82,7 @@ def estimates(t):
     htf = instance(t.model, t.data)
     yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
         "htf": htf, "harmonic": INTEGER, "output": OUTPUT, "input": INPUT, "poles": FEW,
-        "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD, "max_steps": COUNT,
+        "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD,
     }  # fmt: skip
     yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True),
@@ -102,11 +90,6 @@ def estimates(t):
     yield "RationalFit.compare", t.rational.compare, dict(true=[0.5]), {
         "true": TRUE, "output": OUTPUT,
     }  # fmt: skip
-    yield "fit_aaa", hj.identify.fit_aaa, dict(htf=t.estimate), {
-        "htf": htf, "harmonic": INTEGER, "input": INPUT, "tolerance": POSITIVE,
-        "terms": COUNT,
-    }  # fmt: skip
-    yield "AAAFit.compare", t.aaa.compare, dict(true=[0.5]), {"true": TRUE, "output": OUTPUT}
     order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
     yield "fit_multipliers", hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6), {
         "htf": htf, "order": order, "harmonics": HARMONICS, "overhang": optional([*WHOLE, 10**6]),
