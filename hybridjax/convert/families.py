@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._core.packages import package
-from ..orbits.branches.branch import Branch
-from ..orbits.sweep.limit_cycles import LimitCycles
+from .._core.arguments import package
+from ..orbits.branch import Branch
+from ..orbits.limit_cycles import LimitCycles
 from ..systems.system import unit_of_parameter
 
 

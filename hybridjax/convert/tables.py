@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.packages import package
 from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.htf import HTF
-from ..orbits.branches.branch import Branch
-from ..orbits.sweep.limit_cycles import LimitCycles
+from ..orbits.branch import Branch
+from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray

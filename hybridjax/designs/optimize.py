@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, Seed
+from .._core.execution import one_blas_thread
 from .._core.progress import working
 from .._core.text import listed
 from ..errors import DefinitionError

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, PeriodCount, Positive
+from .._core.boundary.values import Reals
 from .._core.progress import working
 from .._core.text import fields
 from ..errors import DefinitionError

@@ -7,16 +7,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
+from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.text import listed
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
-from ..maps.place import as_placed
-from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
 from .flow_batch import Response, course, flow_batch

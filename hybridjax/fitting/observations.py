@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
+from .._core.boundary.values import Reals
 from .._core.text import fields, listed, value
 from ..engine.settings import Settings
 from ..errors import DefinitionError
@@ -24,12 +24,12 @@ from ..experiments.response_function import response_function
 from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
-from ..maps.linearize import linearize
-from ..maps.place import place_sections
-from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
 from ..sections.abstract import AbstractSections
-from ..sections.section_list import FamilyLike, as_family
+from ..sections.families import FamilyLike, as_family
+from ..sections.linearize import linearize
+from ..sections.place import place_sections
+from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
 
 

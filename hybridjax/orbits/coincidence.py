@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation.compile import at_ease, host_first
+from .._core.compilation import at_ease, host_first
 from .._core.executor import namespace, to_host
 from .._core.results import Result
 from ..engine import kernels
@@ -27,9 +27,9 @@ from ..engine.move import record
 from ..engine.target import toward, until
 from ..engine.watch import watch
 from ..errors import ComputationError
-from ..sections.crossing import AtEvent
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
+from .crossing import AtEvent
 from .cycle import LimitCycle
 from .return_map import ReturnMap, Turn
 

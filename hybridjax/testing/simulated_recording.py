@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
+from .._core.boundary.values import Reals
 from .._core.limits import SECTIONS
 from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT
@@ -18,7 +18,7 @@ from ..errors import DefinitionError
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
-from ..sections.clock import ClockPhase
+from ..sections.families import ClockPhase
 from ..systems.output import OutputNames
 from ..systems.structure import Structure
 

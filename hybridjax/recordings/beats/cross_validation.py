@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked
-from ..._core.boundary.scalars import Whole
+from ..._core.boundary.values import Reals, Whole
 from ..._core.progress import working
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
+from ...orbits.crossing import AtEvent, Crossing
 from ..phase.winding import Phase
 from ..recording import Recording
 from .estimation import WAVES, fit_curve, fit_rates, miscounted

@@ -1,0 +1,400 @@
+"""Cycles of many systems, solved in compiled calls of one size, each from a guess of its own."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from .._core.compilation import is_left_to_lapack, quick_jit, uncollected
+from .._core.execution import in_threads
+from .._core.progress import working
+from .._core.results import Result
+from ..engine.lanes import Lanes
+from ..engine.move import move
+from ..engine.settings import TRANSIENT, Settings
+from ..engine.target import toward, until
+from ..systems.system import HybridSystem
+from .coincidence import together
+from .crossing import AtEvent, ListLevels
+from .newton import excess, newton_steps
+from .return_map import ReturnMap, Turn
+
+
+# Periods for which a system flows freely before Newton tries again. Doubled, slower transients die
+# out, and each failure takes twice as long.
+_SETTLE = 40
+
+
+def _own(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
+    """The return map of a system, begun at the same phase of its own clock."""
+    own = map.at_phase_of(system)
+    if map.base is not None:
+        own = dataclasses.replace(own, expected=expected)
+    anchor = eqx.tree_at(lambda x: x.t, anchor, own.anchor.t)
+    return dataclasses.replace(own, anchor=anchor)
+
+
+def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
+    """One turn of every system from its anchor, with the Jacobian if it is `wanted`."""
+
+    def one(system, anchor, expected):
+        own = _own(map, system, anchor, expected)
+        turn = own.turn_with_jacobian(own.anchor.q[:, 0], wanted)
+        events = turn.codes.ravel(), turn.times.ravel()
+        return own.anchor, own.expected, turn._replace(codes=None, times=None), *events
+
+    return eqx.filter_vmap(one)(systems, anchor, period)
+
+
+def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
+    """The anchors ready to be left, periods, and result codes."""
+
+    def one(system, anchor, expected, turn):
+        own, q = _own(map, system, anchor, expected), anchor.q[:, 0]
+        period = own.expected if own.base is None else turn.period
+        return own.departure(q), period, own.judge(q, turn)
+
+    return eqx.filter_vmap(one)(systems, anchor, period, turn)
+
+
+def _settled(systems, map: ReturnMap, anchor: Lanes, period):
+    """Where systems are after they have flowed freely for a while, at the guess's phase or
+    section (NaN for those that do not get there), and their expected periods."""
+    base = map.base
+    patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
+
+    def one(system, anchor, expected):
+        own = _own(map, system, anchor, expected)
+        s, anchor, expected = own.structure, own.anchor, own.expected
+        u = jnp.zeros((s.nu, 1))
+        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
+        if base is not None:
+            at_event = isinstance(base, AtEvent)
+            event = s.transition_index(base.name) if at_event else -1
+            target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
+            if not at_event:
+                target = dataclasses.replace(target, levels=ListLevels((base,)))
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
+        q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
+        anchor = eqx.tree_at(lambda x: (x.chart, x.q), anchor, (moved.lanes.chart, q))
+        return anchor, expected
+
+    return eqx.filter_vmap(one)(systems, anchor, period)
+
+
+class Programs(NamedTuple):
+    """The functions above, compiled."""
+
+    turn: Callable
+    verdict: Callable
+    settled: Callable
+
+
+# For few systems, and for many.
+QUICK, FULL = (
+    Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, eqx.filter_jit)
+)
+
+
+# Newton steps before a system is given up, or tried again. Doubled, hopeless systems cost twice as
+# much.
+_NEWTON = 6
+# Newton steps before a system is left until those that need more steps than most go on together.
+# Doubled, few of a call's systems are still going in its last steps.
+_USUAL = 3
+# Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
+# get no slope. Doubled, a few more do not.
+_RIDGE = 1e-12
+# A step with a guessed Jacobian is taken if it is at most this part of the states' sizes. Doubled,
+# more are taken, and more of them lead astray.
+_NEAR = 0.06
+# Up to this many parameters, guesses from neighbors are quadratic: their number of terms grows with
+# the square. Doubled, four times as many neighbors are needed.
+_QUADRATIC = 4
+
+
+class Rounds(NamedTuple):
+    """What the last Newton step of S systems saw; S is the leading axis of every array."""
+
+    anchor: Lanes
+    excess: Float[np.ndarray, " S"]
+    """Size of that step relative to the tolerance; infinite where the turn was too long, NaN where
+    it failed."""
+    period: Float[np.ndarray, " S"]
+    turn: Turn
+    """Without the codes of events,"""
+    codes: Int[np.ndarray, "S E"]
+    """which stand here, filled up with -1."""
+    together: Bool[np.ndarray, " S"]
+    """Whether two of them coincide."""
+    result: Int[np.ndarray, " S"]
+    steps: Int[np.ndarray, " S"]
+
+
+class Known(NamedTuple):
+    """Cycles of K other systems, from which guesses are taken."""
+
+    systems: HybridSystem
+    """Their arrays have a leading axis of K systems."""
+    anchor: Lanes
+    period: Float[np.ndarray, " K"]
+    jacobian: Float[np.ndarray, "K d d"]
+    """Of the return map less the identity, in each."""
+    result: Int[np.ndarray, " K"]
+
+
+class Tiles(NamedTuple):
+    """How the systems are solved."""
+
+    systems: HybridSystem
+    """Their arrays have a leading axis of S systems."""
+    map: ReturnMap
+    """That of the guess, with the settings asked for."""
+    size: int
+    """Systems in one compiled call."""
+    workers: int
+    programs: Programs
+    """`QUICK` or `FULL`."""
+    known: Known | None = None
+
+    @property
+    def parameters(self) -> Float[np.ndarray, "S p"]:
+        """The numbers in which the systems differ, each in units of its spread; below them those of
+        the systems that are known. (What is not finite has no neighbors to learn from; it is taken
+        for the mean.)"""
+        flat = _numbers(self.systems)
+        if self.known is not None:
+            flat = np.concatenate([flat, _numbers(self.known.systems)])
+        good = np.isfinite(flat)
+        count = np.maximum(good.sum(axis=0), 1)
+        flat = np.where(good, flat - np.where(good, flat, 0.0).sum(axis=0) / count, 0.0)
+        spread = np.sqrt((flat**2).sum(axis=0) / count)
+        if not spread.any():
+            return flat[:, :1]
+        return flat[:, spread > 0] / spread[spread > 0]
+
+    def solve(self, S: int) -> Rounds:
+        """Newton for all systems: first for some, spread over all, from the cycles that are known
+        or the one guess there is, then for as many again from where their neighbors' cycles are,
+        and so on. Systems that fail begin again from the cycle of the nearest one that was found,
+        and in the end from where they are after flowing freely."""
+        parameters, known = self.parameters[:S], self.parameters[S:]
+        order = np.random.default_rng(0).permutation(S)
+        out = None
+
+        def guessed(rows, out, **options):
+            found = known, self.known
+            if out is not None:
+                own = parameters[order[: len(out.result)]]
+                found = own, Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
+                if self.known is not None:
+                    found = (
+                        np.concatenate([own, known]),
+                        _join(found[1], self.known._replace(systems=None)),
+                    )
+            return self._by_neighbors(*found, parameters[rows], **options)
+
+        with working("cycles", S) as call:
+            while (done := 0 if out is None else len(out.result)) < S:
+                call.done = done
+                more = slice(done, max(2 * done, self.size))
+                rows = order[more]
+                if out is None and self.known is None:
+                    with uncollected:  # here the programs are compiled
+                        given = self._given(len(rows))
+                        out = self._settled(rows, self._newton(rows, *given, _NEWTON))
+                    continue
+                rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
+                order[more] = rows
+                begin = self._first_step(rows, *guessed(rows, out))
+                part = self._newton(rows, *begin, _USUAL)
+                part = part._replace(steps=part.steps + 1)
+                out = part if out is None else _join(out, part)
+        late = np.flatnonzero(out.excess > 1)
+        if len(late):
+            anchor, period = _pick((out.anchor, out.period), late)
+            part = self._newton(order[late], anchor, period, _NEWTON - _USUAL)
+            out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
+        failed = np.flatnonzero(out.result != Result.OK)
+        if len(failed) and (self.known is not None or len(failed) < S):
+            anchor, period, _ = guessed(order[failed], out, moved=False)
+            part = self._newton(order[failed], anchor, period, _NEWTON)
+            better = part.result == Result.OK
+            part = part._replace(steps=part.steps + out.steps[failed])
+            out = _replace(out, failed[better], _pick(part, better))
+        return _pick(self._settled(order, out), np.argsort(order))
+
+    def _given(self, count: int) -> tuple[Lanes, Float[np.ndarray, " S"]]:
+        given = self.map.anchor, self.map.expected
+        return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
+
+    def _settled(self, rows, out: Rounds) -> Rounds:
+        """Another try for the systems that failed, from where they are after flowing freely."""
+        failed = np.flatnonzero(out.result != Result.OK)
+        if not len(failed):
+            return out
+        begin = self._in_tiles(self.programs.settled, rows[failed], *self._given(len(failed)))
+        there = np.isfinite(begin[0].q).all(axis=(1, 2))
+        if not there.any():
+            return out
+        failed, begin = failed[there], _pick(begin, there)
+        return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
+
+    def _by_neighbors(self, known, found: Known, wanted, moved: bool = True):
+        """The cycle of the nearest system, unless it should not be `moved` as those around it in
+        the same chart suggest: its anchor, its period, and the Jacobian there (NaN where nothing is
+        known)."""
+        ok = np.flatnonzero(found.result == Result.OK)
+        if not len(ok):
+            blank = np.full((len(wanted), *found.jacobian.shape[1:]), np.nan)
+            return *self._given(len(wanted)), blank
+        known = known[ok]
+        terms = _powers(known[:1]).shape[1]
+        _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
+        near = near.reshape(len(wanted), -1)
+        first = near[:, 0]
+        anchor, period, jacobian = _pick((found.anchor, found.period, found.jacobian), ok)
+        if not moved:
+            return _pick((anchor, period, jacobian), first)
+        flat = jacobian.reshape(len(ok), -1)
+        values = np.concatenate([anchor.q[..., 0], period[:, None], flat], axis=1)
+        same = anchor.chart[near] == anchor.chart[first][:, None]
+        apart = _powers(known[near] - known[first][:, None]) * same
+        change = (values[near] - values[first][:, None]) * same
+        across = apart.transpose(0, 2, 1)
+        gram = across @ apart
+        size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+        ridge = np.where(size > 0, _RIDGE * size, 1.0) * np.eye(gram.shape[-1])
+        slope = np.linalg.solve(gram + ridge, across @ change)
+        guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
+        d = anchor.q.shape[1]
+        anchor = eqx.tree_at(lambda x: x.q, _pick(anchor, first), guess[:, :d, None])
+        return anchor, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
+
+    def _first_step(self, rows, anchor: Lanes, period, jacobian):
+        """Newton's first step, with Jacobians that are guessed, where it is a small one."""
+        if not np.isfinite(jacobian).any():
+            return anchor, period
+        anchor, period, turn, *_ = self._turn(rows, anchor, period, wanted=False)
+        sizes, step = self._step_from(anchor, turn.residual, jacobian)
+        small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
+        q = anchor.q[..., 0] + np.where(small, step * sizes, 0.0)
+        return eqx.tree_at(lambda x: x.q, anchor, q[..., None]), period
+
+    def _newton(self, rows, anchor: Lanes, period, steps: int) -> Rounds:
+        """Newton's method; systems that are done make room for others."""
+        out = self._step(rows, anchor, period)
+        for _ in range(steps - 1):
+            going = np.flatnonzero(out.excess > 1)
+            if not len(going):
+                break
+            part = self._step(rows[going], *_pick((out.anchor, out.period), going))
+            out = _replace(out, going, part._replace(steps=part.steps + out.steps[going]))
+        judged = self._in_tiles(self.programs.verdict, rows, out.anchor, out.period, out.turn)
+        anchor, period, result = judged
+        return out._replace(anchor=anchor, period=period, result=result)
+
+    def _step(self, rows, anchor: Lanes, period) -> Rounds:
+        """One step of Newton's method."""
+        anchor, period, turn, codes, coincide = self._turn(rows, anchor, period)
+        sizes, step = self._step_from(anchor, turn.residual, turn.jacobian)
+        q = anchor.q[..., 0] + step * sizes
+        size = excess(q / sizes, step)
+        # A turn that closes but met its section too often was given too long a period.
+        extra = turn.closed & (turn.meetings > self.map.multiplicity)
+        period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
+        size[extra] = np.inf
+        anchor, once = eqx.tree_at(lambda x: x.q, anchor, q[..., None]), np.ones(len(rows), int)
+        return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
+
+    def _step_from(self, anchor: Lanes, residual, jacobian):
+        """Sizes of the states (S, d) of some systems, and their Newton steps in these sizes."""
+        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
+        scaled = jacobian * sizes[:, None, :] / sizes[:, :, None]
+        return sizes, newton_steps(scaled, residual / sizes)
+
+    def _turn(self, rows, anchor: Lanes, period, wanted: bool = True):
+        """Anchors, expected periods, turns, codes of events, and whether two coincide."""
+        options = (np.asarray(wanted),)
+        return self._in_tiles(
+            self.programs.turn, rows, anchor, period, options=options, then=self._seen
+        )
+
+    def _seen(self, turned):
+        anchor, expected, turn, codes, times = jax.tree_util.tree_map(np.asarray, turned)
+        at_event = isinstance(self.map.base, AtEvent)
+        begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
+        return anchor, expected, turn, front(codes), together(codes, times, begin, turn.period)
+
+    def _in_tiles(self, program, rows, *arguments, options=(), then=lambda x: x):
+        """`program` for some systems, in calls of one size, so that there is one for all."""
+        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+
+        def of_tile(k):
+            some = np.arange(k, k + self.size) % len(rows)
+            systems = eqx.combine(_pick(arrays, rows[some]), rest)
+            return systems, self.map, *_pick(arguments, some), *options
+
+        def tile(k):
+            return _pick(then(program(*of_tile(k))), slice(len(rows) - k))
+
+        several = self.workers > 1 and len(rows) > self.size
+        alone = not several or is_left_to_lapack(program, *of_tile(0))
+        found = in_threads(tile, range(0, len(rows), self.size), 1 if alone else self.workers)
+        return _join(*found)
+
+
+def _numbers(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
+    """The numbers of systems, one row for each."""
+    arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
+    return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+
+
+def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:
+    """x, and for few parameters the products of two of its columns."""
+    p = x.shape[-1]
+    i, j = np.triu_indices(p if p <= _QUADRATIC else 0)
+    return np.concatenate([x, x[..., i] * x[..., j]], axis=-1)
+
+
+def _pick(tree, rows):
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], tree)
+
+
+def _join(*parts):
+    return jax.tree_util.tree_map(lambda *x: np.concatenate(_of_one_width(x)), *parts)
+
+
+def _of_one_width(parts):
+    """Arrays with as many columns as the widest, filled up with -1 (codes of events)."""
+    width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
+    if all(x.ndim != 2 or x.shape[1] == width for x in parts):
+        return parts
+    fill = lambda x: ((0, 0), (0, width - x.shape[1]))  # noqa: E731
+    return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
+
+
+def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
+    """`out` with other values in some rows, which are written in place where they fit."""
+
+    def put(x, y):
+        x, y = _of_one_width((x, y))
+        x[rows] = y
+        return x
+
+    return jax.tree_util.tree_map(put, out, new)
+
+
+def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
+    """Codes of events moved to the front of each row, and the columns without any left out."""
+    row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
+    count = np.bincount(row, minlength=len(codes))
+    out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
+    out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
+    return out

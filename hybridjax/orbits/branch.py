@@ -1,0 +1,135 @@
+"""A branch of limit cycles along a parameter, and the points at which its stability changes."""
+
+from typing import Literal, NamedTuple, SupportsIndex, get_args
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from .._core.boundary.checked import checked_methods
+from .._core.html import COLORS, Curve, card, complex_number, picture, table
+from .._core.memo import remembered
+from .._core.results import Result
+from .cycle import LimitCycle
+from .limit_cycles import LimitCycles
+
+
+# A multiplier is shown with a point if its modulus is this near to 1; critical ones are 1 to
+# rounding. Doubled, others that are all but critical are shown twice as often.
+_ON_CIRCLE = 1e-6
+
+Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
+KINDS = get_args(Kind)
+
+
+class BranchPoint(NamedTuple):
+    """Where a multiplier of a branch lies on the unit circle."""
+
+    kind: str
+    """"fold" (a multiplier +1: the branch turns back), "branch point" (+1: another branch crosses),
+    "flip" (-1: a cycle of twice the period begins) or "Neimark-Sacker" (a complex pair)."""
+    index: int
+    """Its row in the branch."""
+    value: float
+    """Of the parameter."""
+    multipliers: Complex[np.ndarray, " r"]
+    """The critical ones among them lie on the unit circle to rounding."""
+
+    @property
+    def critical(self) -> Complex[np.ndarray, " c"]:
+        """Those of the multipliers."""
+        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < _ON_CIRCLE]
+
+
+class BranchEnd(NamedTuple):
+    """Why a branch ends where it does."""
+
+    value: float
+    """Of the parameter."""
+    result: Result
+    """`Result.OK` where the values end."""
+    message: str
+
+
+@checked_methods
+class Branch(eqx.Module):
+    """Limit cycles along one parameter, in the order in which the branch meets them.
+
+    **Fields:**
+
+    - `parameter`: its name. `values` (K,): of it.
+    - `cycles`: the K cycles; `branch[k]` is one of them, with its system.
+    - `points`: where multipliers cross the unit circle, each a row of the branch of its own.
+    - `ends`: why the branch begins and ends where it does.
+    """
+
+    parameter: str = eqx.field(static=True)
+    values: Float[np.ndarray, " K"]
+    cycles: LimitCycles
+    points: tuple[BranchPoint, ...]
+    ends: tuple[BranchEnd, BranchEnd]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, k: SupportsIndex) -> LimitCycle:
+        return self.cycles[k]
+
+    def find(self, kind: Kind) -> tuple[BranchPoint, ...]:
+        """The points of a kind: "fold", "branch point", "flip" or "Neimark-Sacker"."""
+        return tuple(p for p in self.points if p.kind == kind)
+
+    @remembered
+    def multipliers(self) -> Complex[np.ndarray, "K r"]:
+        """Floquet multipliers of every cycle, the largest first, filled up with zeros."""
+        rows = [self[k].multipliers for k in range(len(self))]
+        out = np.zeros((len(rows), max(map(len, rows))), complex)
+        for row, values in zip(out, rows, strict=True):
+            row[: len(values)] = values
+        return out
+
+    @remembered
+    def stable(self) -> Bool[np.ndarray, " K"]:
+        """Which cycles are stable. At a marked point itself this is left to rounding."""
+        return np.array([self[k].stable for k in range(len(self))])
+
+    def largest(self, output: str) -> Float[np.ndarray, " K"]:
+        """The largest value of a state or output on each cycle, as accurate as a plot needs.
+
+        **Raises:** `DefinitionError` for a name that does not exist.
+        """
+        return np.array([np.nanmax(self[k].trajectory()(output)[1]) for k in range(len(self))])
+
+    def summary(self) -> str:
+        """One line for each marked point and each end."""
+        lines = [f"from {self.parameter} = {self.ends[0].value:.9g}: {self.ends[0].message}"]
+        for p in self.points:
+            on = p.critical
+            at = ", ".join(f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in on)
+            lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
+        lines.append(f"to {self.parameter} = {self.ends[1].value:.9g}: {self.ends[1].message}")
+        return "\n  ".join(lines)
+
+    def __repr__(self):
+        name = type(self.cycles.systems).__name__
+        return f"Branch({name} along {self.parameter}: {len(self)} cycles)\n  {self.summary()}"
+
+    def _repr_html_(self) -> str:
+        largest = np.abs(self.multipliers).max(axis=1)
+        marks = [p.index for p in self.points]
+        rows = [
+            ("from", f"{self.ends[0].value:.9g}", self.ends[0].message),
+            *(
+                (p.kind, f"{p.value:.9g}", ", ".join(complex_number(z) for z in p.critical))
+                for p in self.points
+            ),
+            ("to", f"{self.ends[1].value:.9g}", self.ends[1].message),
+        ]
+        curves = [
+            Curve(self.values[[0, -1]], np.ones(2), color=COLORS[-1]),
+            Curve(self.values, largest),
+            Curve(self.values[marks], largest[marks], color=COLORS[1], points=True),
+        ]
+        drawn = picture(curves, self.parameter, "largest modulus of multipliers")
+        of = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
+        return card("Branch", of, table(("", self.parameter, ""), rows), drawn)

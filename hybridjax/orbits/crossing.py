@@ -1,0 +1,125 @@
+"""Single sections: where a function crosses a level, and the state after an event."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Scalar, SignalNames
+from .._core.executor import Definition
+from .._core.precision import real
+from .._core.text import fields
+from ..engine.target import AbstractLevels
+from ..systems.output import Output
+from ..systems.structure import Structure
+
+
+Direction = Literal["falling", "rising"]
+
+
+@checked
+class Crossing(Definition):
+    """A section: the level set `function = value`, crossed in a stated direction.
+
+    In a recording (`hj.recordings.estimate_phase`) it is the beginning of each cycle.
+
+    **Fields:**
+
+    - `function`: the name of a state, an output or a recorded signal; an `Output`; or a function
+      (t, q) -> number.
+    - `direction`: "falling" or "rising".
+    - `value`: the level, in the function's unit.
+    - `charts`: names of the charts in which it is crossed; by default all in which it is defined.
+    """
+
+    function: str | Output | Callable[..., Any]
+    direction: Direction = eqx.field(static=True)
+    value: Float[Array, ""]
+    charts: tuple[str, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        function: str | Output | Callable[..., Any],
+        direction: Direction,
+        value: Scalar = 0.0,
+        charts: SignalNames | None = None,
+    ):
+        self.function, self.direction, self.charts = function, direction, charts
+        self.value = real(value)
+
+    def __str__(self):
+        name = self.function
+        if not isinstance(name, str):
+            name = getattr(name, "name", getattr(name, "__name__", "function"))
+        return f"{name} {self.direction}"
+
+    def __repr__(self):
+        return fields(self)
+
+    def check(self, s: Structure) -> None:
+        """**Raises:** `DefinitionError` for charts or outputs that the system does not have."""
+        for name in self.charts or ():
+            s.chart_index(name)
+        if isinstance(self.function, str | Output):
+            s.resolve_outputs(self.function)
+
+    def in_chart(self, s: Structure, a: int) -> bool:
+        """Whether it can be crossed in chart a."""
+        if self.charts is not None and s.names[a] not in self.charts:
+            return False
+        if isinstance(self.function, str | Output):
+            return s.resolve_outputs(self.function).defined(a)
+        return True
+
+    def level(
+        self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        """A function of one state of chart a that falls through zero at the section."""
+        if isinstance(self.function, str | Output):
+            value = s.resolve_outputs(self.function)(a, t, q, jnp.zeros(s.nu))[0]
+        else:
+            value = jnp.asarray(self.function(t, q), float)
+        sign = 1.0 if self.direction == "falling" else -1.0
+        return sign * (value - self.value)
+
+
+@checked
+class AtEvent(eqx.Module):
+    """A hybrid boundary as a section: the state right after the event `name` and its reset.
+
+    In a recording (`hj.recordings.estimate_phase`) the event is the beginning of each cycle.
+    """
+
+    name: str = eqx.field(static=True)
+
+    def __str__(self):
+        return f"after {self.name}"
+
+    def __repr__(self):
+        return fields(self)
+
+    def check(self, s: Structure) -> None:
+        """**Raises:** `DefinitionError` for an event that the system does not have."""
+        s.transition_index(self.name)
+
+
+class ListLevels(AbstractLevels):
+    """The level functions of the crossings among some sections."""
+
+    items: tuple[Crossing | AtEvent, ...]
+
+    def present(self, s, a):
+        return any(isinstance(x, Crossing) and x.in_chart(s, a) for x in self.items)
+
+    def level(self, s, a, i, t, q):
+        def branch(item):
+            if isinstance(item, Crossing) and item.in_chart(s, a):
+                return lambda: item.level(s, a, t, q)
+            return lambda: jnp.ones(())
+
+        branches = [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
+        return jax.lax.switch(i + 1, branches)

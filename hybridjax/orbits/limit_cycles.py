@@ -1,0 +1,250 @@
+"""Limit cycles of many systems at once: the points of a parameter sweep side by side."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import SupportsIndex
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Index, Positive
+from .._core.execution import Execution
+from .._core.html import Curve, card, picture, table, thinned
+from .._core.memo import remembered
+from .._core.precision import require_x64
+from .._core.progress import working
+from .._core.results import Result
+from ..engine.lanes import Lanes
+from ..engine.settings import SWEEP, Settings
+from ..errors import DefinitionError
+from ..systems.check import check_system
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+from .batches import FULL, QUICK, Programs, Rounds, Tiles
+from .coincidence import commutes
+from .crossing import AtEvent, Crossing
+from .cycle import LimitCycle
+from .return_map import ReturnMap, turn_product
+from .scale import given_sizes, scale_of
+
+
+# Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
+# Doubled, it is 6 s.
+_SMALL = 2000
+# Of cycles on which events coincide, so many are looked at for whether the order of these matters,
+# and all others if it does in one of them. Doubled, that takes twice as long.
+_LOOKED_AT = 50
+# Systems per compiled call. Doubled: fewer calls, whose arrays leave the cache.
+BATCH = 250
+
+
+@checked_methods
+class LimitCycles(eqx.Module):
+    """Limit cycles of S systems; `cycles[i]` is one of them.
+
+    **Fields**, with the systems on the first axis:
+
+    - `systems`; `period` (S,); `anchor`, the lanes at which they begin; `legs`, `factors`: see
+        `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `codes`: the events of one period, in order, filled up with negative numbers.
+
+    `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
+    """
+
+    systems: HybridSystem
+    base: Crossing | AtEvent | None
+    period: Float[np.ndarray, " S"]
+    anchor: Lanes
+    legs: Lanes
+    factors: Float[np.ndarray, "S K d d"]
+    residual: Float[np.ndarray, " S"]
+    iterations: Int[np.ndarray, " S"]
+    result: Int[np.ndarray, " S"]
+    codes: Int[np.ndarray, "S R"]
+    settings: Settings
+    conserved: dict[str, Float[Array, ""]]
+    multiplicity: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.result)
+
+    def __getitem__(self, i: SupportsIndex) -> LimitCycle:
+        """The cycle of system i, found or not (see its `result`)."""
+        pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
+        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+        return LimitCycle(
+            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.anchor),
+            pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
+            pick(self.result),
+            tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
+            self.conserved, self.multiplicity,
+        )  # fmt: skip
+
+    @property
+    def scale(self) -> dict[str, float]:
+        """What counts as 1 in each state of every cycle, by name."""
+        return self[0].scale
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " S"]:
+        """Which cycles were found."""
+        return self.result == Result.OK
+
+    @property
+    def failed(self) -> Int[np.ndarray, " F"]:
+        """Indices of the systems without a cycle."""
+        return np.flatnonzero(~self.ok)
+
+    @remembered
+    def multipliers(self) -> Complex[np.ndarray, "S d"]:
+        """Floquet multipliers, the largest first; NaN where there is no cycle.
+
+        Eigenvalues of the product of the factors, filled up with zeros: those far below the
+        largest are lost in rounding. `cycles[i].multipliers` sees them, too.
+        """
+        return _multipliers(np.asarray(self.factors), self.ok)
+
+    def summary(self, limit: Index = 5) -> str:
+        """`10000/10000 found`, or why the first `limit` of the others were not."""
+        text = [f"{self.ok.sum()}/{len(self)} found"]
+        text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
+        if len(self.failed) > limit:
+            text.append(f"and {len(self.failed) - limit} more")
+        return "; ".join(text)
+
+    def __repr__(self):
+        return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
+
+    def _repr_html_(self) -> str:
+        """(Of very many only some are looked at.)"""
+        k = thinned(len(self))
+        largest = np.abs(_multipliers(np.asarray(self.factors)[k], self.ok[k])[:, 0])
+        shown = {"period": np.asarray(self.period)[k], "largest modulus": largest}
+        rows = [
+            (name, f"{np.nanmin(x):.6g}", f"{np.nanmax(x):.6g}")
+            for name, x in shown.items()
+            if np.isfinite(x).any()
+        ]
+        ranges = table(("", "from", "to"), rows) if rows else ""
+        curve = picture([Curve(k, largest)], "system", "largest modulus of multipliers")
+        of = f"of {type(self.systems).__name__}: {self.summary(1)}"
+        return card("LimitCycles", of, ranges, curve)
+
+
+@checked
+@working("find_limit_cycles")
+def find_limit_cycles(
+    systems: HybridSystem | Sequence[HybridSystem],
+    guess: LimitCycle,
+    *,
+    scale: Mapping[str, Positive] | None = None,
+    settings: Settings | None = None,
+    execution: Execution | None = None,
+) -> LimitCycles:
+    """Find the limit cycles of many systems that differ in their parameters.
+
+    Newton starts from the guess for some of them, side by side, and then for as many again from
+    the cycles of their neighbors, until all are done. Systems for which that fails flow freely
+    for some periods, and Newton starts again from where they are then.
+
+    **Arguments:**
+
+    - `systems`: a list of systems of one class, or one system whose arrays all have a leading
+        axis, as `equinox.filter_vmap` makes it:
+        `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
+    - `guess`: a limit cycle of a similar system.
+    - `scale`: sizes of states by name, by default those of the guess.
+    - `settings`: accuracy of the flow; by default 1e-9 per step; and its `solver`.
+    - `execution`: how it is run: systems per compiled call (`batch`, by default 250), threads
+        (`workers`). Always in double precision.
+
+    **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
+    for those.
+
+    **Raises:** `DefinitionError` for systems that do not belong together, or single precision.
+    """
+    execution = Execution() if execution is None else execution
+    if execution.precision != "double":
+        raise DefinitionError("limit cycles are found in double precision only.")
+    systems = _stacked(systems)
+    require_x64(systems)
+    settings = Settings() if settings is None else settings
+    systems = settings.system(systems)
+    arrays, rest = eqx.partition(systems, eqx.is_array)
+    S = len(jax.tree_util.tree_leaves(arrays)[0])
+    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
+    map = map_for_sweep(guess, scale, settings)
+    size = min(execution.batch or BATCH, S)
+    tiles = Tiles(systems, map, size, execution.threads, programs_for(S))
+    return as_cycles(tiles, tiles.solve(S))
+
+
+def map_for_sweep(
+    guess: LimitCycle, scale: Mapping[str, float] | None, settings: Settings | None
+) -> ReturnMap:
+    """The return map of `guess`, for the search of the cycles of many systems."""
+    settings = (Settings() if settings is None else settings).filled(SWEEP)
+    s = Structure(guess.system)
+    known = guess.settings.scale if settings.scale is None else settings.scale
+    settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
+    return dataclasses.replace(guess.return_map, settings=settings)
+
+
+def programs_for(S: int) -> Programs:
+    """What solves so many systems in all."""
+    return QUICK if S <= _SMALL else FULL
+
+
+def as_cycles(tiles: Tiles, found: Rounds) -> LimitCycles:
+    """The cycles that were found."""
+    turn, map = found.turn, tiles.map
+    cycles = LimitCycles(
+        tiles.systems, map.base, found.period, found.anchor, turn.legs, turn.factors,
+        turn.distance, found.steps, found.result, found.codes, map.settings, map.conserved,
+        map.multiplicity,
+    )  # fmt: skip
+    return without_coincidences(cycles, found.together)
+
+
+def without_coincidences(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
+    """Cycles of which those are none on which events coincide (`together`) whose order matters."""
+    rows = np.flatnonzero(together & cycles.ok)
+    few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
+    if all(commutes(cycles[i]) for i in few):
+        return cycles
+    result = cycles.result.copy()
+    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    return dataclasses.replace(cycles, result=result)
+
+
+def _multipliers(
+    factors: Float[np.ndarray, "S K d d"], ok: Bool[np.ndarray, " S"]
+) -> Complex[np.ndarray, "S d"]:
+    """See `LimitCycles.multipliers`."""
+    product = np.where(ok[:, None, None], turn_product(factors), 0.0)
+    values = np.linalg.eigvals(product).astype(complex)
+    order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+    values = np.take_along_axis(values, order, axis=-1)
+    values[~ok] = np.nan
+    return values
+
+
+def _stacked(systems) -> HybridSystem:
+    if isinstance(systems, HybridSystem):
+        shapes = {x.shape[:1] for x in jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_array))}
+        if len(shapes) != 1 or () in shapes:
+            raise DefinitionError(
+                "all arrays of `systems` need the same leading axis, one entry for each system: "
+                "make it by equinox.filter_vmap, or pass a list of systems."
+            )
+        return systems
+    kinds = {jax.tree_util.tree_structure(eqx.filter(x, eqx.is_array)) for x in systems}
+    if len(kinds) != 1:
+        raise DefinitionError("`systems` must be at least one system, all of the same class.")
+    arrays = [eqx.filter(x, eqx.is_array) for x in systems]
+    stacked = jax.tree_util.tree_map(lambda *x: jnp.stack(x), *arrays)
+    return eqx.combine(stacked, eqx.filter(systems[0], eqx.is_array, inverse=True))

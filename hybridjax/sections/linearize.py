@@ -1,0 +1,149 @@
+"""From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import SignalNames
+from .._core.compilation import at_ease, host_first
+from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, to_host
+from .._core.lanes import by_lane
+from .._core.progress import working
+from .._core.results import Result
+from ..engine import kernels
+from ..engine.jacobian import tape_jacobian
+from ..engine.lanes import for_each_chart, only
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from ..orbits.cycle import LimitCycle
+from ..systems.output import Output, OutputNames
+from ..systems.structure import Outputs, Structure
+from .place import as_placed
+from .placed import PlacedSections, SectionsLike
+
+
+@checked
+@working("linearize")
+def linearize(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    outputs: OutputNames | None = None,
+    inputs: SignalNames | None = None,
+) -> LDTP:
+    """The linear discrete-time periodic system between consecutive sections, eqs. (5) and (6).
+
+    A[n] and B[n] map deviations at section n, and the input held until section n+1, to deviations
+    at section n+1; exact, through all events in between, also where the interval's end depends
+    on the state. C[n] and D[n] give the outputs' deviations at section n.
+
+    The coordinates on a section are deviations of the chart's states; on a state-based section of
+    a clocked system the time of crossing comes first. On a section given by a level function, the
+    coordinate that the flow changes fastest across it is left out. `ldtp.coordinates` names them.
+
+    **Arguments:** `sections`, a family or `PlacedSections`; `outputs`, names or `Output`s, by
+    default all states that every chart defines; `inputs`, by default all.
+
+    **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
+    lies, or an input that does not exist; `ComputationError` as `place_sections`.
+    """
+    placed = as_placed(cycle, sections)
+    s, traced = placed.structure(), is_traced(placed)
+    z = s.resolve_outputs(_states_everywhere(s) if outputs is None else outputs)
+    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
+        z.require(int(a))
+    names, columns = inputs_of(s, inputs)
+    if traced or is_inside_program():
+        A, B = _section_jacobians(placed)
+    else:
+        with at_ease():
+            A, B = _section_jacobians(to_host(placed))
+    C, D = _output_jacobians(placed, tuple(z.items))
+    d = s.d + 1
+    if not traced:
+        A, B, C, D = jax.device_get((A, B, C, D))
+        d = int(np.max(np.asarray(placed.dims)))
+    return LDTP(
+        A[:, :d, :d], B[:, :d, columns], C[:, :, :d], D[..., columns], placed.dims,
+        inputs=names, outputs=z.names,
+        coordinates=None if traced else to_host(placed).coordinates(),
+    )  # fmt: skip
+
+
+def _states_everywhere(s: Structure) -> list[str]:
+    """The states that every chart defines."""
+    charts = range(len(s.charts))
+    return [n for n in s.state_names() if all(s.state_function(n, a) is not None for a in charts)]
+
+
+def inputs_of(
+    s: Structure, inputs: tuple[str, ...] | None
+) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
+    """Names of inputs, all by default, and their indices."""
+    known = s.inputs
+    names = known if inputs is None else inputs
+    for name in names:
+        if name not in known:
+            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
+    columns = np.array([known.index(n) for n in names], int)
+    return tuple(known[k] for k in columns), columns
+
+
+def _section_jacobians(
+    placed: PlacedSections,
+) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
+    """A and B, padded; NaN where the flow failed.
+
+    (On the host, the direction of an autonomous flow does not drown what contracts strongly.)
+    """
+    n = 1 + placed.lanes.q.shape[0]
+    following, _, target = placed.onwards()
+    across = None
+    if on_host(placed.lanes.t) and not placed.cycle.clocked and np.isinf(placed.bound.time).all():
+        across = placed.cycle.settings.scale
+    jacobian, _ = tape_jacobian(
+        placed.structure(), placed.lanes, target, placed.tape, across=across
+    )
+    xp = namespace(jacobian)
+    jacobian = xp.where((placed.result == Result.OK)[:, None, None], jacobian, xp.nan)
+    embed, select = placed.frames()
+    after = select[following]
+    return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+
+
+@host_first
+def _output_jacobians(
+    placed: PlacedSections, outputs: tuple[str | Output, ...]
+) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
+    """C and D, padded."""
+    s, lanes, xp = placed.structure(), placed.lanes, namespace(placed.lanes.t)
+    z = s.resolve_outputs(outputs)
+    n, ny = 1 + s.d, len(outputs)
+
+    def work(a, here, out):
+        if not z.defined(a):
+            return out
+        d = s.dims[a]
+        J = _jacobians(s, a, z, only(here, lanes.t), only(here, lanes.q[:d]))
+        blank = xp.zeros((ny, s.d - d, placed.n_sections))
+        J = xp.concatenate([J[:, : 1 + d], blank, J[:, 1 + d :]], axis=1)
+        return xp.where(here, J, out)
+
+    everywhere = xp.ones(placed.n_sections, bool)
+    nothing = xp.zeros((ny, n + s.nu, placed.n_sections))
+    J = xp.moveaxis(for_each_chart(s, lanes.chart, everywhere, work, nothing), -1, 0)
+    return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]
+
+
+def _jacobians(s: Structure, a: int, z: Outputs, t, q) -> Float[Array, "ny m N"]:
+    """Derivatives of outputs in chart a by (t, q, u), at u = 0."""
+    if on_host(t):
+        return kernels.outputs(s, a, tuple(z.items), t, q, np.zeros((s.nu, 1)))[:, 1:]
+
+    def jacobian(t, q):
+        J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
+        t, q, u = J(t, q, jnp.zeros(s.nu))
+        return jnp.concatenate([t[:, None], q, u], axis=1)
+
+    return by_lane(jacobian)(t, q)

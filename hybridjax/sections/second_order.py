@@ -1,0 +1,239 @@
+"""Second derivatives of the maps between sections, and of outputs there."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from .._core.compilation import quick_jit
+from .._core.executor import from_host, to_host
+from ..engine.move import retrace
+from ..linear.time_response import monodromy, periodic_states
+from ..orbits.cycle import LimitCycle
+from ..systems.output import Output
+from ..systems.structure import Structure
+from .families import FamilyLike
+from .linearize import inputs_of
+from .place import as_placed
+from .placed import PlacedSections
+
+
+# Complex numbers in the largest array of responses to pairs of cosines. Doubled: twice the memory,
+# hardly less time.
+_NUMBERS = 2**21
+
+
+class Quadratic(NamedTuple):
+    """Derivatives by the m deviations of states and inputs at each of N sections."""
+
+    step: Float[np.ndarray, "N n m"]
+    """Of the states at the next section."""
+    bend: Float[np.ndarray, "N n m m"]
+    """The second ones."""
+    show: Float[np.ndarray, "N ny m"]
+    """Of the outputs."""
+    show_bend: Float[np.ndarray, "N ny m m"]
+
+    @property
+    def _states(self) -> Float[np.ndarray, "N n n"]:
+        return self.step[:, :, : self.step.shape[1]]
+
+    def second_order(self, u: Float[np.ndarray, "S time nu"]) -> Float[np.ndarray, "S time ny"]:
+        """What inputs that repeat after their whole number of periods cause in second order."""
+        N, n, _ = self.step.shape
+        S, steps, _ = u.shape
+        A, folded = self._states, (S, steps // N, N, -1)
+        first = np.asarray(periodic_states(A, self.step[:, :, n:], u.reshape(folded)))
+        w = np.concatenate([self._run(first, np.zeros((S, steps, n)), u), u], axis=2)
+        section = np.arange(steps) % N
+        forcing = _bent(self.bend[section], w) / 2
+        unit = np.tile(np.eye(n), (N, 1, 1))
+        second = np.asarray(periodic_states(A, unit, forcing.reshape(folded)))
+        x = self._run(second, forcing, 0 * u)
+        seen = np.einsum("toi,sti->sto", self.show[section][:, :, :n], x)
+        return seen + _bent(self.show_bend[section], w) / 2
+
+    def _run(self, x, forcing, u) -> Float[np.ndarray, "S time n"]:
+        """States from a start, with what is added to them and with inputs."""
+        found = []
+        for k in range(u.shape[1]):
+            found.append(x)
+            step = self.step[k % len(self.step)]
+            x = np.concatenate([x, u[:, k]], axis=1) @ step.T + forcing[:, k]
+        return np.stack(found, axis=1)
+
+    def waves(
+        self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]
+    ) -> Complex[np.ndarray, "N m K"]:
+        """Linear responses to $e^{2 \\pi i f n/N}$ at an input, divided by it, with that input."""
+        N, n, m = self.step.shape
+        own = (np.arange(m - n)[:, None] == channel).astype(complex)
+        u = np.broadcast_to(own, (N, *own.shape))
+        return np.concatenate([self._steady(self.step[:, :, n:] @ u, f), u], axis=1)
+
+    def _steady(
+        self, forcing: Complex[np.ndarray, "N n K"], f: Float[np.ndarray, " K"]
+    ) -> Complex[np.ndarray, "N n K"]:
+        """States that are moved by $e^{2 \\pi i f n/N}$ times something periodic, divided by it."""
+        A, back = self._states, np.exp(-2j * np.pi * f / len(self.step))
+        x = np.zeros(forcing.shape[1:], complex)
+        for step, push in zip(A, forcing, strict=True):
+            x = (step @ x + push) * back
+        turn = np.exp(-2j * np.pi * f)[:, None, None] * monodromy(A)
+        x = np.linalg.solve(np.eye(A.shape[-1]) - turn, x.T[:, :, None])[:, :, 0].T
+        found = []
+        for step, push in zip(A, forcing, strict=True):
+            found.append(x)
+            x = (step @ x + push) * back
+        return np.stack(found)
+
+    def products(self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]) -> "Products":
+        """Of all pairs of cosines."""
+        N, n, _ = self.step.shape
+        K, ny = len(f), self.show.shape[1]
+        w = self.waves(f, channel)
+        squares, mean = np.zeros((2, ny, K, K)), np.zeros((ny, N, K))
+        rows = max(_NUMBERS // (2 * N * max(n, ny, 1) * K), 1)
+        for begin in range(0, K, rows):
+            some = np.arange(begin, min(begin + rows, K))
+            others = w[:, :, begin:]
+            forcing = _pairs(self.bend, w[:, :, some], others)
+            f_here, f_others = f[some][:, None], f[begin:]
+            sums = np.concatenate([f_here + f_others, f_here - f_others], axis=1)
+            x = self._steady(forcing.reshape(N, n, -1), sums.ravel())
+            y = self.show[:, :, :n] @ x
+            y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, some], others)
+            both = y.reshape(N, ny, len(some), 2, -1)
+            mean[:, :, some] = np.moveaxis(both.real, 0, 1)[
+                :, :, np.arange(len(some)), 1, np.arange(len(some))
+            ]
+            size = np.moveaxis(np.mean(np.abs(both) ** 2, axis=0), 2, 0)
+            squares[:, :, some, begin:] = size
+            squares[:, :, begin:, some] = size.swapaxes(2, 3)
+        return Products(squares[0], squares[1], mean)
+
+
+class Products(NamedTuple):
+    """Responses of second order to pairs of cosines, $F''(w_k, w_l)$ in place of an input."""
+
+    sum: Float[np.ndarray, "ny K K"]
+    """Mean squares over the sections, at the sum of their frequencies."""
+    difference: Float[np.ndarray, "ny K K"]
+    mean: Float[np.ndarray, "ny N K"]
+    """Of a cosine with itself, at the difference."""
+
+    def gaussian(self) -> Float[np.ndarray, "ny K K"]:
+        """G: mean square of the part of second order, $p^T G p$, for random inputs with powers p
+        about the lines, or many lines with random phases."""
+        return (self.sum + self.difference) / 4 + self._shift()
+
+    def cosines(self) -> Float[np.ndarray, "ny K K"]:
+        """The same for cosines with random phases: less, since each has a constant amplitude."""
+        pairs = (self.sum + self.difference) / 4
+        k = np.arange(pairs.shape[-1])
+        pairs[:, k, k] = self.sum[:, k, k] / 8
+        return pairs + self._shift()
+
+    def _shift(self) -> Float[np.ndarray, "ny K K"]:
+        """Of the mean over time at each section."""
+        return np.einsum("onk,onl->okl", self.mean, self.mean) / (4 * self.mean.shape[1])
+
+
+def _bent(bend, w):
+    """Second derivatives (time, rows, m, m), along (S, time, m) twice."""
+    return np.einsum("toij,sti,stj->sto", bend, w, w, optimize=True)
+
+
+def _pairs(bend, one, other) -> Complex[np.ndarray, "N rows some both"]:
+    """Second derivatives along each of some waves (N, m, some) and each of others, which come
+    twice: as they are, and conjugate."""
+    along = np.einsum("noij,nis->nosj", bend, one, optimize=True)
+    N, rows, some, m = along.shape
+    along = along.reshape(N, rows * some, m)
+    both = np.concatenate([along @ other, along @ other.conj()], axis=2)
+    return both.reshape(N, rows, some, -1)
+
+
+# Second derivatives in units of the states' sizes, relative to the first ones, that are left to
+# rounding. A hundred times more: what is nearly linear counts as linear; less: rounding counts.
+_ROUNDING = 1e-11
+
+
+def second_order(
+    cycle: LimitCycle, sections: FamilyLike, outputs: tuple[str, ...], inputs: tuple[str, ...]
+) -> Quadratic:
+    """First and second derivatives by time and state at each section and by the inputs that are
+    held from there on: exact, through all events.
+
+    States are (t, q) in full: where a section is curved, no coordinates on it have to be. Without
+    a clock time is left out.
+
+    **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
+    lies, or an input that does not exist; `ComputationError` as `place_sections`.
+    """
+    placed = as_placed(cycle, sections)
+    s = placed.structure()
+    z = s.resolve_outputs(outputs)
+    for a in np.unique(placed.lanes.chart):
+        z.require(int(a))
+    _, columns = inputs_of(s, inputs)
+    first, second = to_host(_derivatives(from_host(placed), tuple(z.items)))
+    n = 1 + s.d
+    kept = np.r_[:n, n + columns]
+    size = _sizes(to_host(placed), s, first[:, :n])[:, kept]
+    first, second = first[:, :, kept], second[:, :, kept][..., kept]
+    if not cycle.clocked:
+        first[:, 0], second[:, 0] = 0.0, 0.0
+    after = np.roll(size[:, :n], -1, axis=0)
+    unit = np.abs(first[:, :n] * size[:, None]).max(axis=2) / after
+    own = after * np.maximum(unit.max(axis=1, keepdims=True), 1.0)
+    shown = np.abs(first[:, n:] * size[:, None]).max(axis=2)
+    least = _ROUNDING * np.concatenate([own, shown], axis=1)
+    bend = second * size[:, None, :, None] * size[:, None, None, :]
+    second = np.where(np.abs(bend) > least[:, :, None, None], second, 0.0)
+    return Quadratic(first[:, :n], second[:, :n], first[:, n:], second[:, n:])
+
+
+@quick_jit
+def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
+    """First (N, rows, m) and second derivatives (N, rows, m, m) of (t, q) at the next section and
+    of outputs at this one."""
+    following, _, target = placed.onwards()
+    s: Structure = placed.structure()
+    z, lanes, n = s.resolve_outputs(items), placed.lanes, 1 + s.d
+
+    def work(x):
+        here = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
+        t, q = retrace(s, here, x[n:], target, placed.tape)
+        return jnp.concatenate([t[None], q, observe(s, z, here, x[n:])])
+
+    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])
+    m = len(x)
+
+    def along(direction):
+        tangent = jnp.broadcast_to(direction[:, None], x.shape)
+        return lambda x: jax.jvp(work, (x,), (tangent,))[1]
+
+    def twice(one, other):
+        tangent = jnp.broadcast_to(other[:, None], x.shape)
+        return jax.jvp(along(one), (x,), (tangent,))
+
+    i, j = np.triu_indices(m)
+    first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])
+    place = np.zeros((m, m), int)
+    place[i, j] = place[j, i] = np.arange(len(i))
+    return first[place[:, -1]].transpose(2, 1, 0), second[place].transpose(3, 2, 0, 1)
+
+
+def _sizes(placed: PlacedSections, s: Structure, step) -> np.ndarray:
+    """(N, m): of time, states and inputs at each section; an input of size one moves some state by
+    its size."""
+    scale = np.asarray(placed.cycle.settings.scale)[placed.lanes.chart]
+    own = np.concatenate([np.full((len(scale), 1), placed.cycle.period), scale], axis=1)
+    moved = np.abs(step[:, :, own.shape[1] :]) / np.roll(own, -1, axis=0)[:, :, None]
+    most = moved.max(axis=(0, 1))
+    of_inputs = 1 / np.where(most > 0, most, 1.0)
+    return np.concatenate([own, np.broadcast_to(of_inputs, (len(own), s.nu))], axis=1)

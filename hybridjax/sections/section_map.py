@@ -1,0 +1,126 @@
+"""The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
+
+from typing import Annotated, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Index, Numbers, Scalar
+from .._core.boundary.values import Reals
+from .._core.compilation import host_first
+from .._core.executor import is_traced, namespace, put
+from .._core.precision import require_x64
+from .._core.results import Result, update_result
+from ..engine.move import move
+from ..errors import ComputationError, DefinitionError
+from ..orbits.cycle import LimitCycle
+from .place import as_placed
+from .placed import PlacedSections, SectionsLike
+
+
+class Arrival(NamedTuple):
+    """Where a section map arrives. Times and states are NaN if it does not, and so are their
+    derivatives."""
+
+    t: Float[Array, ""]
+    """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""
+    q: Float[Array, " n"]
+    """State in the chart in which the cycle crosses section j."""
+    result: Int[Array, ""]
+    """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's."""
+
+
+@checked_methods
+class SectionMap(eqx.Module):
+    """P_{i->j}: from a state on section i, under a constant input, to section j.
+
+    Call it with `q` (n_i,), a state near section i of the cycle, `u` (nu,), zero by default, and
+    `t`, the time there (by default the cycle's). It returns an `Arrival` and can be
+    differentiated, jitted and vmapped. Made under a JAX transformation, where charts are not
+    known, it takes and returns states that are padded with zeros to the largest chart's dimension.
+
+    **Raises** (outside of JAX transformations): `ComputationError` if section j is not reached,
+    or is reached in another chart than the cycle's.
+    """
+
+    placed: PlacedSections
+    i: int = eqx.field(static=True)
+    j: int = eqx.field(static=True)
+    dims: tuple[int, int] = eqx.field(static=True)
+    """Dimensions n_i and n_j."""
+
+    def __repr__(self):
+        (n, m), family = self.dims, self.placed.family
+        system = type(self.placed.cycle.system).__name__
+        ends = f"{family.describe(self.i)} to {family.describe(self.j)}"
+        return f"SectionMap({system}: from {ends}; {n} states to {m})"
+
+    @property
+    def fixed_point(self) -> Float[Array, " n"]:
+        """The cycle's state at section i."""
+        return self.placed.lanes.q[: self.dims[0], self.i]
+
+    def __call__(
+        self,
+        q: Annotated[Numbers, Reals("n")],
+        u: Annotated[Numbers, Reals()] | None = None,
+        t: Scalar | None = None,
+    ) -> Arrival:
+        require_x64()
+        if q.shape != self.dims[:1]:
+            raise DefinitionError(
+                f"`q` must be a state on {self.placed.family.describe(self.i)}, where the map "
+                f"starts and states have the shape {self.dims[:1]}; got {q.shape}."
+            )
+        nu = len(self.placed.cycle.system.inputs)
+        u = np.zeros(nu) if u is None else u
+        if u.shape not in ((), (nu,)):
+            raise DefinitionError(f"`u` must be {nu} numbers, one for each input; got {u.shape}.")
+        arrival = _map(self, q, u, t)
+        if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
+            raise ComputationError(
+                f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
+                f"{code.message}."
+            )
+        return arrival
+
+
+@checked
+def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -> SectionMap:
+    """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
+
+    For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
+    range; `ComputationError` as `place_sections`.
+    """
+    placed = as_placed(cycle, sections)
+    for k in (i, j):
+        if k >= placed.n_sections:
+            raise DefinitionError(
+                f"section {k} does not exist; sections are 0..{placed.n_sections - 1}."
+            )
+    s, chart = placed.structure(), placed.lanes.chart
+    dims = (s.d, s.d) if is_traced(chart) else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
+    return SectionMap(placed, i, j, dims)
+
+
+@host_first
+def _map(map: SectionMap, q, u, t) -> Arrival:
+    placed, i, j = map.placed, map.i, map.j
+    s, xp, lanes = placed.structure(), namespace(q), placed.lanes
+    pick, u = slice(i, i + 1), xp.broadcast_to(u, len(placed.cycle.system.inputs))
+    t = lanes.t[i] if t is None else t
+    q = put(xp.zeros((s.d, 1)), (slice(len(q)), 0), q)
+    start = eqx.tree_at(
+        lambda x: (x.t, x.q, x.chart, x.armed, x.events, x.pace),
+        lanes,
+        (t[None], q, lanes.chart[pick], lanes.armed[:, pick], lanes.events[pick],
+         lanes.pace[:, pick]),
+    )  # fmt: skip
+    target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
+    moved = move(s, start, u[:, None], target, placed.cycle.settings)
+    end = moved.lanes
+    result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
+    keep = xp.where(result == Result.OK, 1.0, xp.nan)  # a factor makes derivatives NaN, too
+    return Arrival((keep * end.t)[0], (keep * end.q)[: map.dims[1], 0], result[0])
