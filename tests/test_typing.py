@@ -153,14 +153,13 @@ UNCHECKED = {
     "made by this package": {
         "Advice", "Branch", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
-        "InformationMap", "Inspection",
+        "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
-        "LimitCycles", "ModelFit", "NaturalMultipliers", "OptimalDesign", "ParameterGuesses",
-        "Phase", "PhaseResponse",
-        "PlacedSections", "Plan", "Plot", "RandomInput",
+        "LimitCycles", "ModelFit", "NaturalMultipliers", "ParameterGuesses", "Phase",
+        "PhaseResponse", "PlacedSections", "Plan", "Plot",
         "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
-        "Stepping", "Trajectory", "Trial", "Winding", "WindowChoice",
+        "Stepping", "Trajectory", "Trial", "Winding",
     },
 }  # fmt: skip
 

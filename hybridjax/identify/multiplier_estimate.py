@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Complexes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Probability
+from .._core.boundary.values import Complexes
 from .._core.html import card, complex_number, multiplier_table, table, text, unit_circle
 from ..errors import DefinitionError
 

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Complexes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order
+from .._core.boundary.values import Complexes
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
