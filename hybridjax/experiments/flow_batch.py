@@ -20,7 +20,7 @@ from ..sections.abstract import BoundSections
 from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .stepping.plan import Plan
+from .plan import Plan
 
 
 # The error that rounding alone may leave at a section, relative to the states' scales. Twice as
