@@ -13,6 +13,7 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.html.multipliers import complex_number, multiplier_table
 from hybridjax._core.html.svg import Curve, picture
+from hybridjax.orbits.branch import BranchEnd, BranchPoint
 
 
 BYTES = 20_000  # the most that a result may take
@@ -89,8 +90,8 @@ def test_many_cycles_and_branches(hopper_cycle):
     assert time.process_time() - start < 0.5
     lost = eqx.tree_at(lambda c: c.result, cycles, np.full(2, hj.Result.BLOW_UP))
     assert "left all bounds" in "".join(shown(lost).texts)
-    point = hj.orbits.BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
-    end = hj.orbits.BranchEnd(1.0, hj.Result.OK, "the <values> end")
+    point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
+    end = BranchEnd(1.0, hj.Result.OK, "the <values> end")
     branch = shown(hj.Branch("k", np.array([1.0, 2.0]), cycles, (point,), (end, end)))
     assert {"flip", "2", "-1", "the <values> end"} <= set(branch.texts) and branch.pictures == 1
 

@@ -209,10 +209,10 @@ def _identify(options) -> int:
     matplotlib.use("Agg")  # files only
     from .._core.precision import enable_x64
     from .._core.results import Result
+    from ..orbits.crossing import AtEvent, Crossing
     from ..recordings.identification import identify_recording
     from ..recordings.read import read_recording
-    from ..sections.crossing import AtEvent, Crossing
-    from ..sections.kinematic import KinematicPhase
+    from ..sections.families import KinematicPhase
     from .recording_report import PAGE, report_folder, write_results
 
     enable_x64()

@@ -11,7 +11,7 @@ import numpy as np
 from .._core.packages import package
 from ..errors import DefinitionError
 from ..plot.look import Plot, panels, save
-from ..scale.map import sweep
+from ..scale.sweep import sweep
 from ..scale.wanted import Want
 
 

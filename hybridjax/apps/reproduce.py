@@ -29,16 +29,15 @@ from ..identify.multipliers.structured import StructuredFit, fit_multipliers
 from ..identify.rational.fit import RationalFit, fit_rational
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from ..maps.linearize import linearize
-from ..maps.place import place_sections
-from ..maps.placed import PlacedSections
 from ..models.hopper import VerticalHopper
+from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.abstract import AbstractSections
-from ..sections.clock import ClockPhase
-from ..sections.crossing import Crossing
-from ..sections.kinematic import KinematicPhase
+from ..sections.families import ClockPhase, KinematicPhase
+from ..sections.linearize import linearize
+from ..sections.place import place_sections
+from ..sections.placed import PlacedSections
 from ..systems.system import own_fields
 from .helper import Helper
 from .paper_report import OUTPUTS, summarize, table

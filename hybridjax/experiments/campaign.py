@@ -20,9 +20,9 @@ from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
-from ..maps.place import as_placed
-from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
 from .batches import divide, in_batches, precision_of
@@ -36,7 +36,9 @@ from .single_precision import plan_single
 from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
 
 
-DesignLike = Design | Annotated[np.ndarray | jax.Array, Reals("S n nu", missing=True, infinite=True)]
+DesignLike = (
+    Design | Annotated[np.ndarray | jax.Array, Reals("S n nu", missing=True, infinite=True)]
+)
 """A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
 
 # From so many samples in all, a run waits for the optimized program: it takes 10 s longer to

@@ -8,8 +8,8 @@ from .._core.execution import Execution
 from .._core.pieces.run import Workers
 from .._core.progress import working
 from ..errors import DefinitionError
-from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
 from .campaign import DesignLike, Options, prepare
 from .data import ExperimentData
@@ -121,7 +121,9 @@ def stream_experiments(
     """
     if store is not None:
         with working("stream_experiments"):
-            return store_experiments((cycle, sections, design, outputs), options, chunk, store, client)
+            return store_experiments(
+                (cycle, sections, design, outputs), options, chunk, store, client
+            )
     if client is not None:
         raise DefinitionError("a `client` needs a `store` to put records into.")
     campaign = prepare(cycle, sections, design, outputs, options, chunk)

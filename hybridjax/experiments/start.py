@@ -13,8 +13,8 @@ from .._core.memo import Memory
 from ..engine.settings import Settings
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
-from ..maps.linearize import linearize
-from ..maps.placed import PlacedSections
+from ..sections.linearize import linearize
+from ..sections.placed import PlacedSections
 from ..systems.output import Output
 from .flow_batch import Course, flow_batch
 from .plan import Plan, Stepping

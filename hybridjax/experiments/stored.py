@@ -20,9 +20,8 @@ from .._core.results import Result
 from .._core.signal import Signal, unit_of
 from ..engine.describe import describe
 from ..errors import ComputationError, DefinitionError
-from ..maps.placed import SectionsLike
-from ..orbits.cycle import LimitCycle
-from ..orbits.rough import rough
+from ..orbits.cycle import LimitCycle, rough
+from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
 from .campaign import Campaign, DesignLike, Options, prepare
 from .data import ExperimentData, Simulated, summary
@@ -199,7 +198,7 @@ class ExperimentJob:
 
     def begin(self, client: DaskClient | None) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
-        campaign, description = self.campaign, self.describe()
+        campaign, description = self.campaign, self.description
         placed, here = campaign.placed, campaign.at_sections
         n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
         codes = {
@@ -253,16 +252,15 @@ class ExperimentJob:
             for old, new in zip(leaves, arrays, strict=True)
         ]
         placed, stepping, model = eqx.combine(structure.unflatten(leaves), others)
-        campaign = dataclasses.replace(
-            self.campaign, placed=placed, stepping=stepping, model=model
-        )
+        campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
         return dataclasses.replace(self, campaign=campaign)
 
     def _computed(self) -> Any:
         return self.campaign.placed, self.campaign.stepping, self.campaign.model
 
-    def describe(self) -> dict[str, Any]:
-        """Return JSON from which the experiments can be told from others."""
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """JSON from which the experiments can be told from others."""
         campaign = self.campaign
         placed, inputs, noise = campaign.placed, campaign.inputs, campaign.process_noise
         z = campaign.at_sections.outputs

@@ -13,7 +13,7 @@ import hybridjax as hj
 from hybridjax._core.executor import to_host
 from hybridjax.engine.solver import take_step
 from hybridjax.engine.solver.implicit import inverse
-from hybridjax.orbits.stiffness import stiff_charts
+from hybridjax.orbits.scale import stiff_charts
 from hybridjax.systems.solver import as_method
 from hybridjax.systems.structure import Structure
 

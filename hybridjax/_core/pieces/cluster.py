@@ -30,9 +30,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # options of mallopt
 _jobs: dict[str, tuple[Any, ZarrStore | None]] = {}
 
 
-def run_on(
-    client: Any, job: Any, store: MemoryStore | ZarrStore, missing: Sequence[int]
-) -> None:
+def run_on(client: Any, job: Any, store: MemoryStore | ZarrStore, missing: Sequence[int]) -> None:
     """Compute pieces on the workers of a client.
 
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a

@@ -21,8 +21,9 @@ class Job(Protocol):
     """Work in pieces whose results do not depend on who computes them, and in which order. Workers
     get it pickled."""
 
-    def describe(self) -> Mapping[str, Any]:
-        """Return JSON from which the results can be told from those of other jobs."""
+    @property
+    def description(self) -> Mapping[str, Any]:
+        """JSON from which the results can be told from those of other jobs."""
         ...
 
     def begin(self, client: "DaskClient | None") -> tuple["Job", Layout]:
@@ -69,14 +70,16 @@ def fill(job: Job, address: Any = None, workers: Workers | None = None) -> Memor
     client = None if isinstance(workers, tuple) else workers
     rank, size = workers if isinstance(workers, tuple) else (0, 1)
     if rank >= size:
-        raise DefinitionError(f"`client` must be a Dask client, or (rank, size) with 0 <= rank < size, not {workers}.")
+        raise DefinitionError(
+            f"`client` must be a Dask client, or (rank, size) with 0 <= rank < size, not {workers}."
+        )
     if address is None:
         if size > 1:
             raise DefinitionError("a `client` of (rank, size) needs a `store` for its pieces.")
         job, layout = job.begin(client)
         store = MemoryStore(layout)
     else:
-        address, description = absolute(address), job.describe()
+        address, description = absolute(address), job.description
         store = open_store(address, description)
         if store is None and rank > 0:
             say("waiting for the process of rank 0")

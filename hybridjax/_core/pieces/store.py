@@ -251,8 +251,10 @@ def open_store(address: str, description: Mapping[str, Any]) -> ZarrStore | None
     try:
         group = _group(address, "r")
     except FileNotFoundError:
-        if "://" not in address and os.path.exists(address) and (
-            os.path.isfile(address) or os.listdir(address)
+        if (
+            "://" not in address
+            and os.path.exists(address)
+            and (os.path.isfile(address) or os.listdir(address))
         ):
             raise DefinitionError(
                 f"'{address}' is there, and is no store of results: choose another name."

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Int
 
-from ...experiments.design.crest import optimize_phases
 from ...experiments.design.design import Design
+from ...experiments.design.multisine import optimize_phases
 
 
 def below_peaks(design: Design, peak: dict[str, float], seed: int) -> Design:

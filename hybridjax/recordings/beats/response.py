@@ -19,7 +19,7 @@ from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
 from ..._core.text import p_value
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
+from ...orbits.crossing import AtEvent, Crossing
 from ..phase.estimation import estimate_phase
 from ..phase.winding import Phase
 from ..recording import Recording
