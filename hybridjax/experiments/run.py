@@ -120,10 +120,9 @@ def stream_experiments(
     lost.
     """
     if store is not None:
+        arguments = cycle, sections, design, outputs
         with working("stream_experiments"):
-            return store_experiments(
-                (cycle, sections, design, outputs), options, chunk, store, client
-            )
+            return store_experiments(arguments, options, chunk, store, client)
     if client is not None:
         raise DefinitionError("a `client` needs a `store` to put records into.")
     campaign = prepare(cycle, sections, design, outputs, options, chunk)

@@ -60,8 +60,8 @@ class Prediction(NamedTuple):
     """The linearization of the map from a start to the state one window later."""
 
     gain: Float[Array, "m m"]
-    r"""$(I - \Phi^P)^{-1} \Phi^P$ in times and states: Newton's step is the defect plus `gain` times
-    the defect."""
+    r"""$(I - \Phi^P)^{-1} \Phi^P$ in times and states: Newton's step is the defect plus `gain`
+    times the defect."""
     size: Float[Array, "m 1"]
     """Characteristic magnitudes of time and states."""
     moves: Float[Array, "m 1"]

@@ -42,9 +42,10 @@ from .values import (
 
 SECTIONS = [None, "ClockPhase", 8, [], [3], NAN, Other(), hj.Execution(), TRACED]
 PAIR = ["ab", 1.0, (1.0,), (1.0, 2.0, 3.0), (NAN, 1.0), (1j, 0.0), (None, 1.0), TRACED]
-SHARES = [None, 1, (0,), (2, 2), (-1, 2), (0, 0), (0.5, 2), ("0", "2")]
 SIZES = ["x", 3, ["x"], {"x": -1.0}, {"x": NAN}, {"x": "1"}, {"x": 1j}, {"nope": 1.0}]
-CLIENTS = ["tcp://here", 3, Other()]
+CLIENTS = [
+    "tcp://here", 3, Other(), 1, (0,), (2, 2), (-1, 2), (0, 0), (0.5, 2), ("0", "2"),
+]  # fmt: skip
 RANGES = [None, 3, {}, {"x": 3}, {"x": (1.0,)}, {"x": (1.0, 0.0)}, {"x": (0.0, NAN)}, Other()]
 VALUES = [None, 3, {}, {"x": []}, {"x": [NAN]}, {"x": ["1"]}, {"x": [1.0], "y": [1.0, 2.0]}]
 BAND = [2.0, (1.0,), ("0", "1"), (NAN, 1.0), (0.0, INF), (-1.0, 1.0), (1.0, 0.5), (0.0, 1j)]
@@ -64,8 +65,7 @@ def calls(t):
 
 def scale(t):
     """In pieces."""
-    pieces = {"chunk": COUNT[1:], "store": PATH[1:], "share": SHARES, "client": CLIENTS}
-    measures = [3, {"x": 3}, {3: abs}, {"result": abs}, Other()]
+    pieces = {"chunk": COUNT[1:], "store": PATH[1:], "client": CLIENTS}
     yield (
         "sweep",
         hj.sweep,

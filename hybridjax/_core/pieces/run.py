@@ -17,6 +17,7 @@ from .store import Layout, MemoryStore, ZarrStore, absolute, make_store, open_st
 _PATIENCE, _CHECK = 3600.0, 0.5
 
 
+@runtime_checkable
 class Job(Protocol):
     """Work in pieces whose results do not depend on who computes them, and in which order. Workers
     get it pickled."""

@@ -37,8 +37,8 @@ Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
 
-# Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at the
-# edges. Larger: a line outside of the band is taken.
+# Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at
+# the edges. Larger: a line outside of the band is taken.
 _EDGE = 1e-9
 # Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
 # (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
