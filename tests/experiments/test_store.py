@@ -89,9 +89,8 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
 
 def test_processes_share_the_chunks(arguments, whole, tmp_path):
     for rank in (0, 1):
-        stored = stream(
-            *arguments, Options(**BATCH), store=tmp_path / "records.zarr", chunk=40, client=(rank, 2)
-        )
+        options, store = Options(**BATCH), tmp_path / "records.zarr"
+        stored = stream(*arguments, options, store=store, chunk=40, client=(rank, 2))
         assert stored.missing() == ([] if rank else [1])
     np.testing.assert_array_equal(records(stored), whole.y)
 
@@ -134,7 +133,8 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     design = hj.experiments.single_cosine([0.25, 0.75], 32, 4)
     options = Options(start=start)
     job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
-    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(None, job.arrays())))
+    _, layout = job.begin(None)
+    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     here, there = job.run(0, None), sent.run(0, 1)
     assert here.keys() == there.keys()
     for name, values in here.items():

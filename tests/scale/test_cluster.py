@@ -211,7 +211,7 @@ def experiments():
 
 
 def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
-    call, stream = {"options": hj.experiments.Options(discard=2), "chunk": 2}
+    call = {"options": hj.experiments.Options(discard=2), "chunk": 2}
     stream = hj.experiments.stream_experiments
     stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
     alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
