@@ -8,11 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.device import on_cpu
-from .._core.execution import Execution
+from .._core.execution import Execution, in_threads
+from .._core.executor import on_cpu
 from .._core.precision import single, single_precision
 from .._core.progress import counted
-from .._core.threads import in_threads
 
 
 # Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of

@@ -1,6 +1,5 @@
 """Experiments on one system, one cycle and one family of sections, run all at once or in parts."""
 
-import contextlib
 import dataclasses
 from typing import Annotated, NamedTuple
 
@@ -8,11 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
-from .._core.compilation.fingerprint import IndescribableError
-from .._core.compilation.stored import Stored
+from .._core.boundary.values import Reals
+from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import Memory, remembered
@@ -29,7 +27,7 @@ from .batches import divide, in_batches, precision_of
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
 from .events import EventList, EventTimes, in_order
-from .flow_batch import Course, IntervalEvents, closed, course, flow_batch
+from .flow_batch import Course, IntervalEvents, course, flow_batch
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
 from .single_precision import plan_single
@@ -156,8 +154,8 @@ class Campaign:
         return _at_sections(self.placed, self.outputs, self.execution)
 
     @remembered
-    def _programs(self) -> tuple[Stored, Stored]:
-        return Stored(flow_batch, self.large), Stored(settle_batch, self.large)
+    def _programs(self) -> tuple[TwoTiers, TwoTiers]:
+        return TwoTiers(flow_batch, self.large), TwoTiers(settle_batch, self.large)
 
     def _starts(self, u, first: int, execution: Execution) -> Float[np.ndarray, "m S"]:
         """Return times and states on section 0 at which experiments start.
@@ -230,7 +228,7 @@ class Campaign:
         u = np.zeros((1, placed.n_sections, len(placed.cycle.system.inputs)))
         capacity = max(len(placed.cycle.event_sequence), 1)
         silent = dataclasses.replace(self.at_sections.course, outputs=())
-        flow = Stored(flow_batch, large=False)
+        flow = TwoTiers(flow_batch, large=False)
         arguments = *from_host((on_cycle(placed), u)), stepping.settings, capacity
         return IntervalEvents(*map(np.asarray, flow(silent, stepping.plan, *arguments).log))
 
@@ -351,7 +349,7 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
 class _AtSections(NamedTuple):
     outputs: Outputs
     course: Course
-    """In the precision of the campaign, and without users' functions if these have a digest."""
+    """In the precision of the campaign."""
     on_cycle: Float[np.ndarray, "N ny"]
     given: tuple[str | Output, ...]
     """The outputs by whose `id` this is found: they must not be collected."""
@@ -368,8 +366,6 @@ def _at_sections(placed: PlacedSections, outputs, execution: Execution) -> _AtSe
         z = placed.structure().resolve_outputs(outputs)
         with precision_of(execution) as convert:
             made = convert(course(placed, z.items))
-            with contextlib.suppress(IndescribableError):
-                made = closed(made)
         return _AtSections(z, made, np.asarray(placed.observe(tuple(z.items))), outputs)
 
     return _resolved.recall(placed, (names, execution.precision), make)

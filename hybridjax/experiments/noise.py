@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
+from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from .data import ExperimentData

@@ -11,7 +11,6 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Path
-from .._core.compilation import stored
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, definition_digest, digest_of, versions
 from .._core.pieces.run import DaskClient, Workers, fill
@@ -155,8 +154,7 @@ def prepare_pieces(
     # (Batches as for one thread: their size does not depend on the machine.)
     execution = dataclasses.replace(options.execution or Execution(), workers=1)
     options = dataclasses.replace(options, execution=execution)
-    one_program = stored.ONE_PROGRAM
-    campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program)
+    campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program=True)
     S = len(campaign.inputs)
     return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
 

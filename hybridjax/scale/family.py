@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
-from .._core.compilation.fingerprint import IndescribableError, digest
+from .._core.boundary.values import Reals
+from .._core.fingerprint import IndescribableError, program_digest
 from .._core.pieces.description import digest_of, function_digest
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
@@ -183,7 +183,7 @@ class Family:
 
         try:
             given = {name: jnp.asarray(x) for name, x in values.items()}
-            return digest_of(digest(jax.make_jaxpr(numbers)(given)))
+            return digest_of(program_digest(numbers, given))
         except IndescribableError:
             return function_digest(self.model)
 

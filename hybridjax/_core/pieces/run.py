@@ -7,8 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ...errors import DefinitionError
+from ..arguments import package
 from ..boundary.kinds import ExperimentCount, Index
-from ..packages import package
 from ..progress import counted, say
 from .store import Layout, MemoryStore, ZarrStore, absolute, make_store, open_store
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import DefinitionError, FileFormatError
-from ..packages import package
+from ..arguments import package
 from ..progress import counted
 from .description import difference
 
