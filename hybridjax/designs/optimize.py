@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.blas import one_blas_thread
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
+from .._core.execution import one_blas_thread
 from .._core.progress import working
 from .._core.text import listed
 from ..errors import DefinitionError

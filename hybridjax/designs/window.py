@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
+from .._core.boundary.values import Reals
 from .._core.text import fields
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData

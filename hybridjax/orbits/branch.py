@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from .._core.boundary.checked import checked_methods
-from .._core.html.multipliers import complex_number
-from .._core.html.parts import card, table
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, complex_number, picture, table
 from .._core.memo import remembered
 from .._core.results import Result
 from .cycle import LimitCycle

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..errors import DefinitionError
@@ -97,7 +97,8 @@ class Point:
     @ft.cached_property
     def pairs(self) -> list[tuple[complex, complex]]:
         """All pairs of multipliers."""
-        return list(itertools.combinations(np.linalg.eigvals(self.monodromy).astype(complex), 2))
+        values = np.linalg.eigvals(self.monodromy).astype(complex)
+        return list(itertools.combinations(values, 2))
 
     @ft.cached_property
     def tests(self) -> dict[str, float]:

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.arguments import require_same
-from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Order, Positive, Seed
-from ..._core.html.multipliers import multiplier_table
-from ..._core.html.parts import card, table, text
+from ..._core.execution import one_blas_thread
+from ..._core.html import card, multiplier_table, table, text
 from ..._core.progress import working
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
