@@ -18,7 +18,7 @@ from .multipliers.structured import StructuredFit as StructuredFit
 from .rational.aaa import AAAFit as AAAFit, fit_aaa as fit_aaa
 from .rational.fit import RationalFit as RationalFit
 from .series.realization import realize as realize
-from .series.series_fit import SeriesFit as SeriesFit
+from .series.fit import SeriesFit as SeriesFit
 from .validation.amplitude import (
     AmplitudeSweep as AmplitudeSweep,
     amplitude_sweep as amplitude_sweep,

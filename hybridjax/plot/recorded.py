@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers.compare import Multipliers
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.fit import SeriesFit
 from ..recordings.beats.response import PhaseResponse, curve_unit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
