@@ -15,10 +15,10 @@ from . import (
     sections as sections,
     testing as testing,
 )
-from ._core.compilation.compilation_cache import (
+from ._core.compilation import (
     enable_compilation_cache as enable_compilation_cache,
+    enable_loop_kernels as enable_loop_kernels,
 )
-from ._core.compilation.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.execution import Execution as Execution
 from ._core.precision import enable_x64 as enable_x64
 from ._core.progress import enable_progress as enable_progress
@@ -65,7 +65,7 @@ from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
-from .scale.map import sweep as sweep
+from .scale.sweep import sweep as sweep
 from .sections.families import (
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,

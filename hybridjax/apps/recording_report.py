@@ -14,8 +14,7 @@ import numpy as np
 
 from .. import __version__, plot
 from .._core.boundary.checked import checked
-from .._core.files.figure_formats import Format
-from .._core.files.results_folder import results_folder
+from .._core.writing import Format, results_folder
 from ..io import save
 from ..linear.htf import HTF
 from ..plot import look
@@ -134,7 +133,7 @@ def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
         figures = {
             "phase": plot.phase(found.phase),
             "sections": plot.section_data(found.data),
-            "multipliers": plot.multiplier_regions(found.fit, found.advice.plain),
+            "multipliers": plot.multipliers(found.fit, {"plain regression": found.advice.plain}),
             "impulse_responses": plot.impulse_responses(found.responses),
             "validation": plot.validation(found.held_out.validation),
         }

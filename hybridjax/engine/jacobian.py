@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import Array, namespace, on_host
-from .._core.lanes.vmap_as_lanes import vmap_to_lanes
+from .._core.lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .chain import chain
 from .lanes import Lanes, constant

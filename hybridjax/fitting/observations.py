@@ -11,17 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
+from .._core.boundary.values import Reals
 from .._core.text import fields, listed, value
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.flow_batch import course, flow_batch
+from ..experiments.plan import Plan
 from ..experiments.response_function import response_function
-from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle

@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Positive
 from .._core.execution import Execution
-from .._core.html.parts import card, table
-from .._core.html.svg import Curve, picture, thinned
+from .._core.html import Curve, card, picture, table, thinned
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working

@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html.parts import card, table, text
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing

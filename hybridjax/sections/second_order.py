@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation import quick_jit
 from .._core.executor import from_host, to_host
 from ..engine.move import retrace
 from ..linear.time_response import monodromy, periodic_states
@@ -18,7 +18,7 @@ from ..systems.structure import Structure
 from .families import FamilyLike
 from .linearize import inputs_of
 from .place import as_placed
-from .placed import PlacedSections
+from .placed import PlacedSections, observe
 
 
 # Complex numbers in the largest array of responses to pairs of cosines. Doubled: twice the memory,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import quick_jit
+from hybridjax._core.compilation import quick_jit
 from hybridjax.engine.events import start_lanes
 from hybridjax.engine.move import record
 from hybridjax.engine.settings import Settings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import quick_jit
+from hybridjax._core.compilation import quick_jit
 from hybridjax.engine.events import start_lanes
 from hybridjax.engine.move import move, record
 from hybridjax.engine.settings import Settings

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, cond, namespace, put
-from ..._core.lanes.rows import pick, take_rows
+from ..._core.lanes import pick, take_rows
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..events import width

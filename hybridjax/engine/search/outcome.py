@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, cond, namespace, put
-from ..._core.lanes.rows import pick
+from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, cond, namespace, while_loop
-from ..._core.lanes.per_lane import shared
+from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..event_log import EventLog, blank_log, log_events

@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 
 from ..._core import limits
 from ..._core.arguments import Numbers, names
-from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
 from ..._core.boundary.containers import Names
 from ..._core.boundary.kinds import (
@@ -25,6 +24,7 @@ from ..._core.boundary.kinds import (
     SignalNames,
     Vector,
 )
+from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import check_sharing, is_real, meets_itself, regular
 
@@ -283,7 +283,7 @@ class Design(eqx.Module):
     def with_negatives(self) -> "Design":
         """Every experiment followed by the same with the sign changed.
 
-        In half the difference of their responses (`odd_part`) all even-order distortion cancels.
+        All even-order distortion cancels in `ExperimentData.odd_part`.
         """
         phase = np.stack([self.phase, (self.phase + np.pi) % (2 * np.pi)])
         return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))

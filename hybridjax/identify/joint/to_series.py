@@ -10,8 +10,8 @@ from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import all_harmonics
 from ...linear.ldtp import LDTP
-from ..series.records import PreparedRecords
 from ..series.realization import given_dims
+from ..series.records import PreparedRecords
 from .coordinates import local_coordinates
 from .ldtp_fit import LDTPFit, finished
 from .minimize import minimize

@@ -9,8 +9,7 @@ from jaxtyping import Complex, Float, Int
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
-from ..._core.html.multipliers import complex_number, unit_circle
-from ..._core.html.parts import card, table
+from ..._core.html import card, complex_number, table, unit_circle
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from ..._core.threads import on_all_cores
+from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
 from ..descent import Coefficients
 from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses

@@ -1,0 +1,117 @@
+"""Limit cycles over parameters: branches, and maps of sweeps."""
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from .._core.boundary.checked import checked
+from .._core.signal import Signal
+from ..errors import DefinitionError
+from ..orbits.branch import KINDS, Branch
+from ..systems.structure import Structure
+from ..systems.system import unit_of_parameter
+from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
+
+
+_MARKS = dict(
+    zip(KINDS, (("o", "red"), ("D", "orange"), ("s", "green"), ("^", "purple")), strict=True)
+)
+
+
+@checked
+def branch(
+    *branches: Branch,
+    output: str | None = None,
+    labels: Mapping[str, str] | None = None,
+    ax: AxesLike | None = None,
+) -> Plot:
+    """Branches of limit cycles, with marks where their stability changes.
+
+    Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
+
+    **Arguments:**
+
+    - `branches`: from `continuation`, all along the same parameter.
+    - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
+        default the first state of the chart in which the cycle begins.
+    - `labels`: texts for the axes by name, e.g. `{"Vin": "supply"}`; units are added.
+    - `ax`: where to draw; a new figure of one column's width by default.
+
+    **Raises:** `DefinitionError` for branches along different parameters, or a name that does not
+    exist.
+    """
+    names = {b.parameter for b in branches}
+    if len(names) != 1:
+        raise DefinitionError(
+            f"branches to be drawn together need the same parameter; these have {sorted(names)}."
+        )
+    with panels(ax) as axes:
+        panel = axes[0, 0]
+        shown = set()
+        for b, color in zip(branches, itertools.cycle(CYCLE)):
+            name = _first_state(b) if output is None else output
+            height = b.largest(name)
+            for part, stable in _parts(b):
+                panel.plot(b.values[part], height[part], "-" if stable else "--", color=color)
+            for p in b.points:
+                marker, tint = _MARKS[p.kind]
+                panel.plot(
+                    p.value, height[p.index], marker, ms=4.5, mfc="white", mec=COLORS[tint],
+                    mew=1.2, zorder=5, label=None if p.kind in shown else p.kind,
+                )  # fmt: skip
+                shown.add(p.kind)
+        gray = COLORS["gray"]
+        panel.plot([], [], "-", color=gray, label="stable")
+        panel.plot([], [], "--", color=gray, label="unstable")
+        system = branches[0][0].system
+        parameter = Signal(b.parameter, unit_of_parameter(system, b.parameter))
+        (output_name,) = Structure(system).resolve_outputs(name).names
+        panel.set(
+            xlabel=axis_of(parameter, labels), ylabel=f"largest {axis_of(output_name, labels)}"
+        )
+        panel.locator_params(axis="x", nbins=6)
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2)
+    return Plot(axes)
+
+
+def _first_state(branch: Branch) -> str:
+    cycle = branch[0]
+    return Structure(cycle.system).charts[int(cycle.anchor.chart[0])].states[0]
+
+
+def _parts(branch: Branch) -> list[tuple[slice, bool]]:
+    """Rows from one marked point to the next, and whether the cycles between them are stable."""
+    cuts = [0, *(p.index for p in branch.points), len(branch) - 1]
+    parts = []
+    for a, b in itertools.pairwise(cuts):
+        if b > a:
+            inside = branch.stable[a + 1 : b] if b > a + 1 else branch.stable[[a, b]]
+            parts.append((slice(a, b + 1), bool(np.mean(inside) > 0.5)))
+    return parts
+
+
+@checked
+def sweep(maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = None) -> Plot:
+    """Draw a quantity of a sweep: a curve over one parameter, or a map over two.
+
+    **Arguments:**
+
+    - `maps`: the dataset that `hj.sweep` returns.
+    - `name`: the quantity. Default: "spectral_radius".
+    - `ax`: Axes to draw on. Default: a new figure of one column's width.
+
+    **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
+    """
+    axes_of = {str(key): values.dims for key, values in maps.data_vars.items()}
+    if not 1 <= len(axes_of.get(name, ())) <= 2:
+        drawable = [key for key, dims in axes_of.items() if 1 <= len(dims) <= 2]
+        raise DefinitionError(
+            f"the sweep has no `{name}` over one or two parameters; it has {', '.join(drawable)}."
+        )
+    with panels(ax) as axes:
+        quantity = maps[name]
+        quantity.plot(ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {}))
+        axes[0, 0].set_title("")
+    return Plot(axes)
