@@ -32,7 +32,7 @@ from ..linear.ldtp import LDTP
 from ..maps.linearize import linearize
 from ..maps.place import place_sections
 from ..maps.placed import PlacedSections
-from ..models.hopper import VerticalHopper
+from ..models.hoppers import VerticalHopper
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.abstract import AbstractSections

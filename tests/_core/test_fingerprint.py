@@ -133,7 +133,7 @@ def test_what_users_write_has_no_digest_of_its_own(thing):
 
 
 def test_nor_has_what_calls_itself_one_of_ours():
-    scope = {"__name__": "hybridjax.models.hopper", "eqx": eqx}
+    scope = {"__name__": "hybridjax.models.hoppers", "eqx": eqx}
     exec("class VerticalHopper(eqx.Module): pass", scope)
     with pytest.raises(IndescribableError):
         digest(scope["VerticalHopper"]())
