@@ -229,8 +229,8 @@ class FiveLinkBiped(HybridSystem):
     stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
 
     def mechanism(self) -> Mechanism:
-        """The biped by five angles, and for the floating base also by the position (x, y) of the stance
-        foot."""
+        """The biped by five angles, and for the floating base also by the position (x, y) of
+        the stance foot."""
         order = np.array([0, 1, 2, 1, 0])
         m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])[order]
         about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]

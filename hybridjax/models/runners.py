@@ -17,13 +17,9 @@ from ..systems.transition import Transition
 
 Leg = Literal["hind", "front"]
 Legs = tuple[Leg, ...]
+_LEGS: Legs = get_args(Leg)
 # Charts by the legs that stand on the table.
-_CHARTS: dict[Legs, str] = {
-    (): "air",
-    ("hind",): "hind",
-    ("front",): "front",
-    get_args(Leg): "both",
-}
+_CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
 
 
 class BarStanding(Chart):
@@ -35,7 +31,7 @@ class BarStanding(Chart):
     def field(self, t, state, u):
         bar = self.bar
         _, v, _, p = state
-        forces = {leg: bar.force(leg, t, state) for leg in self.legs}
+        forces: dict[Leg, Array] = {leg: bar.force(leg, t, state) for leg in self.legs}
         torque = sum((bar.hip(leg) * F for leg, F in forces.items()), start=0.0)
         return v, (sum(forces.values(), start=0.0) + u[0]) / bar.m - bar.g, p, torque / bar.J
 
@@ -95,9 +91,9 @@ class TwoLeggedBar(HybridSystem):
     def transitions(self):
         transitions = []
         for legs, name in _CHARTS.items():
-            for leg in get_args(Leg):
+            for leg in _LEGS:
                 lands = leg not in legs
-                other = tuple(x for x in get_args(Leg) if (x in legs) != (x == leg))
+                other = tuple(x for x in _LEGS if (x in legs) != (x == leg))
                 transitions.append(
                     Transition(
                         f"{leg} {'lands' if lands else 'lifts'} ({name})",
