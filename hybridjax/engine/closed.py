@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._core.compilation.fingerprint import Program
-from ..systems.alike import Kind, Member
 from ..systems.chart import Chart
+from ..systems.kinds import Kind, Member
 from ..systems.output import Output
 from ..systems.solver import Method
 from ..systems.structure import Structure

@@ -23,10 +23,10 @@ from ..systems.check import check_system
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
-from .events import start_lanes
-from .hermite import interpolate
+from .cubic import interpolate
+from .lanes import start_lanes
 from .move import record
-from .search.stride import initial_step
+from .search.first_step import initial_step
 from .settings import SIMULATION, Settings
 from .tape import IDLE
 from .target import until

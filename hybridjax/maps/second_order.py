@@ -7,7 +7,7 @@ import numpy as np
 
 from .._core.compilation.compile import quick_jit
 from .._core.executor import from_host, to_host
-from ..engine.move import retrace
+from ..engine.replay import replay
 from ..linear.quadratic import Quadratic
 from ..orbits.cycle import LimitCycle
 from ..sections.section_list import FamilyLike
@@ -69,7 +69,7 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
 
     def work(x):
         here = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
-        t, q = retrace(s, here, x[n:], target, placed.tape)
+        t, q = replay(s, here, x[n:], target, placed.tape)
         return jnp.concatenate([t[None], q, observe(s, z, here, x[n:])])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])

@@ -7,7 +7,7 @@ from .._core.compilation.compile import at_ease
 from .._core.executor import to_host
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.hermite import interpolate
+from ..engine.cubic import interpolate
 from ..engine.tape import IDLE
 from ..engine.watch import slopes
 from ..errors import ComputationError

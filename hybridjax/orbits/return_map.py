@@ -19,10 +19,11 @@ from .._core.executor import Array, namespace, on_host, scan, singular_values, s
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.events import arm, start_lanes
+from ..engine.events import arm
 from ..engine.jacobian import flow_jacobian
-from ..engine.lanes import Lanes
-from ..engine.move import move, retrace
+from ..engine.lanes import Lanes, start_lanes
+from ..engine.move import move
+from ..engine.replay import replay
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
@@ -200,7 +201,7 @@ class ReturnMap(eqx.Module):
                     time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
                     to = dataclasses.replace(target, time=time)
                     moved = Structure(_moved(self.system, direction, step))
-                    return retrace(moved, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
+                    return replay(moved, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
 
                 # The parameter as one more state, which stays what it is.
                 column = _derivative(end)[:, None]
