@@ -6,7 +6,6 @@ from . import (
     experiments as experiments,
     fitting as fitting,
     identify as identify,
-    maps as maps,
     mechanics as mechanics,
     models as models,
     orbits as orbits,
@@ -54,30 +53,28 @@ from .identify.rational.fit import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
 from .identify.validation.validate import validate as validate
 from .io import load as load, save as save
-from .linear.htf import HTF as HTF
+from .linear.htf import HTF as HTF, Scatter as Scatter
 from .linear.ldtp import LDTP as LDTP
-from .linear.scatter import Scatter as Scatter
-from .maps.linearize import linearize as linearize
-from .maps.place import place_sections as place_sections
-from .maps.placed import PlacedSections as PlacedSections
-from .maps.section_map import section_map as section_map
-from .orbits.branches.branch import Branch as Branch
-from .orbits.branches.continuation import continuation as continuation
+from .orbits.branch import Branch as Branch
+from .orbits.continuation import continuation as continuation
+from .orbits.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .orbits.cycle import LimitCycle as LimitCycle
 from .orbits.find import find_limit_cycle as find_limit_cycle
-from .orbits.sweep.limit_cycles import (
-    LimitCycles as LimitCycles,
-    find_limit_cycles as find_limit_cycles,
-)
+from .orbits.limit_cycles import LimitCycles as LimitCycles, find_limit_cycles as find_limit_cycles
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
 from .scale.map import sweep as sweep
-from .sections.clock import ClockPhase as ClockPhase
-from .sections.crossing import AtEvent as AtEvent, Crossing as Crossing
-from .sections.kinematic import KinematicPhase as KinematicPhase
-from .sections.section_list import SectionList as SectionList
+from .sections.families import (
+    ClockPhase as ClockPhase,
+    KinematicPhase as KinematicPhase,
+    SectionList as SectionList,
+)
+from .sections.linearize import linearize as linearize
+from .sections.place import place_sections as place_sections
+from .sections.placed import PlacedSections as PlacedSections
+from .sections.section_map import section_map as section_map
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
 from .systems.quotient import Quotient as Quotient

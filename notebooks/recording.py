@@ -127,7 +127,7 @@ advice
 # %%
 for strides, errors in zip(advice.strides, advice.expected, strict=True):
     print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
-axes = hj.plot.multiplier_regions(fit, advice.plain)
+axes = hj.plot.multipliers(fit, {"plain regression": advice.plain})
 
 # %% [markdown]
 # ## Transfer functions and impulse responses

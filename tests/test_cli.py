@@ -59,16 +59,8 @@ def test_reproduce_writes_its_results(results):
             assert file[f"H_exact_{family}"].shape == (32, F, 2, 1)
             assert file[f"H_estimate_{family}"].shape == (32, F, 2, 1)
             d = file[f"A_{family}"].shape[1]
-            assert file[f"A_{family}"].shape == (32, d, d) and file[f"B_{family}"].shape == (
-                32,
-                d,
-                1,
-            )
-            assert file[f"C_{family}"].shape == (32, 2, d) and file[f"D_{family}"].shape == (
-                32,
-                2,
-                1,
-            )
+            for name, shape in {"A": (d, d), "B": (d, 1), "C": (2, d), "D": (2, 1)}.items():
+                assert file[f"{name}_{family}"].shape == (32, *shape)
             times = file[f"section_times_{family}"]
             assert np.all(np.diff(times) > 0) and times[-1] < times[0] + 1
             assert np.all((file["event_times"] >= times[0]) & (file["event_times"] < times[0] + 1))
@@ -113,33 +105,33 @@ WRONG = {
         "--out x --family all": "invalid choice: 'all'",
         "--out x --param M": "'M' is not NAME=VALUE with a number",
         "--out x --param M=1 --param M=2": "--param gives a parameter twice",
-        "--out x --cycles 0": "--cycles: 0 is not between 1 and",
-        "--out x --keep 1.5": "--keep: '1.5' is not a whole number",
-        "--out x --experiments 1000000000000": "--experiments: 1000000000000 is not between 1 and",
-        "--out x --seed -1": "--seed: -1 is negative",
+        "--out x --cycles 0": "--cycles: '0' is not a whole number from 1 to",
+        "--out x --keep 1.5": "--keep: '1.5' is not a whole number from 1 to",
+        "--out x --experiments 1000000000000": "--experiments: '1000000000000' is not a whole",
+        "--out x --seed -1": "--seed: '-1' is not a whole number from 0 on",
         "--out x --seed x": "--seed: 'x' is not a whole number",
         "--out x --formats gif": "--formats: 'gif' is not one of png, pdf, svg",
         "--out x --formats png,png": "--formats: 'png,png' is not a list of different names",
-        "--out x --amplitude 0": "--amplitude: 0 is not a positive number",
-        "--out x --amplitude inf": "--amplitude: 'inf' is not a number",
+        "--out x --amplitude 0": "--amplitude: '0' is not a positive number",
+        "--out x --amplitude inf": "--amplitude: 'inf' is not a positive number",
     },
     "identify x.csv --out x --input u --outputs y": {
         "": "one of the arguments --phase --crossing --event is required",
         "--phase y,v --event e": "not allowed with argument --phase",
-        "--phase y": "--phase: it needs two entries with a comma in between, not 'y'",
+        "--phase y": "--phase: 'y' is not a pair with a comma in between",
         "--phase y,y": "--phase: 'y,y' is not a list of different names",
         "--event e --outputs y,,v": "--outputs: 'y,,v' is not a list of different names",
         "--event e --input u,u": "--input: 'u,u' is not a list of different names",
         "--event e --center 1,2": "--center and --scale are of the angle of --phase",
         "--crossing y --scale 1,2": "--center and --scale are of the angle of --phase",
-        "--phase y,v --center 1": "--center: it needs two entries",
+        "--phase y,v --center 1": "--center: '1' is not a pair",
         "--phase y,v --center 1,x": "--center: 'x' is not a number",
-        "--phase y,v --scale 1,-2": "--scale: '1,-2' holds a number that is not positive",
-        "--event e --bandwidth=-3": "--bandwidth: -3 is not a positive number",
-        "--event e --bandwidth nan": "--bandwidth: 'nan' is not a number",
-        "--event e --drift 0": "--drift: 0 is not a positive number",
-        "--event e --order 0": "--order: 0 is not between 1 and",
-        "--event e --sections 8.5": "--sections: '8.5' is not a whole number",
+        "--phase y,v --scale 1,-2": "--scale: '-2' is not a positive number",
+        "--event e --bandwidth=-3": "--bandwidth: '-3' is not a positive number",
+        "--event e --bandwidth nan": "--bandwidth: 'nan' is not a positive number",
+        "--event e --drift 0": "--drift: '0' is not a positive number",
+        "--event e --order 0": "--order: '0' is not a whole number from 1 to",
+        "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--event e --timing now": "invalid choice: 'now'",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
@@ -169,7 +161,7 @@ def protocols(monkeypatch):
     """What `reproduce` would be asked for; it does nothing, and converges."""
     asked = []
 
-    def reproduce(out, protocol, formats, helper):
+    def reproduce(out, protocol, formats, process):
         assert formats == ("png",)
         asked.append(protocol)
         return {"families": {"isochron": {"converged": protocol.seed == 0}}}

@@ -82,6 +82,7 @@ def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
 ANYTHING = {
     "charts of a system take whatever their subclass declares": {"Chart.field"},
     "returned by users' functions": {"HybridSystem.period"},
+    "of a library that is an extra": {"sweep.maps"},
     "pytrees of any kind": {"Structure.by_lane"},
     "looked at by the function itself, which names what it can do": {
         "save.thing",

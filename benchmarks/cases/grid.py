@@ -15,7 +15,7 @@ from scipy.optimize import fsolve
 
 import hybridjax as hj
 from hybridjax._core.results import Result
-from hybridjax.orbits.sweep.limit_cycles import LimitCycles, find_limit_cycles
+from hybridjax.orbits.limit_cycles import LimitCycles, find_limit_cycles
 
 from .problems import cycle
 

@@ -14,7 +14,7 @@ import truth
 from peers import contest
 
 import hybridjax as hj
-from hybridjax.maps.linearize import _section_jacobians
+from hybridjax.sections.linearize import _section_jacobians
 
 from .problems import ALL, Problem, first_and_later, problem
 

@@ -3,26 +3,16 @@
 import _thread
 import argparse
 import contextlib
+import math
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, get_args
 
 from .. import __version__
-from .option_types import (
-    assignment,
-    axis,
-    count,
-    crossing,
-    formats,
-    model,
-    names,
-    positive,
-    seed,
-    two_names,
-    two_numbers,
-    two_sizes,
-)
+from .._core import limits
+from .._core.files.figure_formats import Format
 
 
 # Sizes of the paper's protocol, and of its short form.
@@ -33,6 +23,101 @@ _SIZES = {
 }
 
 
+def _number(convert: Callable[[str], Any], allowed: Callable[[Any], bool], kind: str):
+    """A function that converts the text of an option to a number, or says which kind it must be."""
+
+    def number(text: str) -> Any:
+        try:
+            value = convert(text)
+        except ValueError:
+            value = None
+        if value is None or not allowed(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {kind}")
+        return value
+
+    return number
+
+
+_count = _number(
+    int, lambda n: 1 <= n <= limits.DECLARED, f"a whole number from 1 to {limits.DECLARED}"
+)
+_seed = _number(int, lambda n: n >= 0, "a whole number from 0 on")
+_finite = _number(float, math.isfinite, "a number")
+_positive = _number(float, lambda x: 0 < x < math.inf, "a positive number")
+
+
+def _two(item: Callable[[str], Any]) -> Callable[[str], tuple]:
+    """A function that splits the text of an option into two items."""
+
+    def pair(text: str) -> tuple:
+        parts = text.split(",")
+        if len(parts) != 2:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a pair with a comma in between")
+        return tuple(map(item, parts))
+
+    return pair
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Different names with commas in between."""
+    names = tuple(name.strip() for name in text.split(","))
+    if "" in names or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of different names")
+    return names
+
+
+def _two_names(text: str) -> tuple[str, ...]:
+    return _names(",".join(_two(str)(text)))
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    """Formats of figures with commas in between."""
+    known = get_args(Format)
+    for name in _names(text):
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"{name!r} is not one of {', '.join(known)}")
+    return _names(text)
+
+
+def _model(text: str) -> tuple[str, str]:
+    """A file of Python and the name of a model in it."""
+    file, colon, name = text.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not FILE.py:NAME")
+    return file, name
+
+
+def _axis(text: str) -> tuple[str, float, float, int]:
+    """A parameter, its lowest and highest value, and the number of values."""
+    name, _, values = text.partition("=")
+    parts = values.split(":")
+    if not name or len(parts) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=LOW:HIGH:COUNT")
+    return name, _finite(parts[0]), _finite(parts[1]), _count(parts[2])
+
+
+def _crossing(text: str) -> tuple[str, Literal["rising", "falling"], float]:
+    """The text `signal:direction:value`; default direction: rising; default value: 0."""
+    signal, *more = text.split(":")
+    direction, value = (*more, *("rising", "0")[len(more) :])[:2]
+    try:
+        if len(more) > 2 or direction not in ("rising", "falling") or not signal.strip():
+            raise ValueError
+        return signal.strip(), direction, _finite(value)
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a signal, a direction and a value, as in x:falling:0.2"
+        ) from None
+
+
+def _assignment(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number") from None
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `hybridjax` command.
 
@@ -41,6 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options that are wrong or contradict each other, 130 where it was interrupted.
     """
     options = _parser().parse_args(arguments)
+    # XLA reports, as errors, that cached programs name CPU features of its own; and for small
+    # matrices more BLAS threads than one only wait for each other.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ..errors import HybridJaxError
 
     try:
@@ -98,15 +187,15 @@ def _add_reproduce(commands) -> None:
     add("--family", choices=("isochron", "kinematic", "both"), default="both",
         help="Poincaré sections (default: %(default)s)")  # fmt: skip
     for name, (metavar, what, paper, quick) in _SIZES.items():
-        add(f"--{name}", type=count, metavar=metavar,
+        add(f"--{name}", type=_count, metavar=metavar,
             help=f"{what} (default: {paper}; {quick} with --quick)")  # fmt: skip
-    add("--sections", type=count, default=32, metavar="N",
+    add("--sections", type=_count, default=32, metavar="N",
         help="sections in each cycle (default: %(default)s)")  # fmt: skip
-    add("--amplitude", type=positive, default=0.01, metavar="A",
+    add("--amplitude", type=_positive, default=0.01, metavar="A",
         help="of each cosine, in N (default: %(default)s)")  # fmt: skip
-    add("--seed", type=seed, default=0,
+    add("--seed", type=_seed, default=0,
         help="of the random subsets and phases (default: %(default)s)")  # fmt: skip
-    add("--param", action="append", default=[], metavar="NAME=VALUE", type=assignment,
+    add("--param", action="append", default=[], metavar="NAME=VALUE", type=_assignment,
         help="change a parameter of the hopper, e.g. M=1.8; may be repeated")  # fmt: skip
     add("--quick", action="store_true", help="a short form, with other defaults")
     _add_formats(reproduce)
@@ -114,7 +203,7 @@ def _add_reproduce(commands) -> None:
 
 
 def _add_formats(command) -> None:
-    command.add_argument("--formats", type=formats, default=("png",), metavar="NAMES",
+    command.add_argument("--formats", type=_formats, default=("png",), metavar="NAMES",
         help="of the figures: png, pdf, svg, or several with commas (default: png)")  # fmt: skip
 
 
@@ -128,29 +217,29 @@ def _add_identify(commands) -> None:
     add = identify.add_argument
     add("files", nargs="+", metavar="FILE", help="one trial in each: CSV, Excel, Parquet, MATLAB, "
         "HDF5, C3D, OpenSim, ROS and more")  # fmt: skip
-    add("--input", required=True, type=names, metavar="NAMES", help="measured perturbations")
-    add("--outputs", required=True, type=names, metavar="NAMES", help="measured outputs")
+    add("--input", required=True, type=_names, metavar="NAMES", help="measured perturbations")
+    add("--outputs", required=True, type=_names, metavar="NAMES", help="measured outputs")
     phase = identify.add_mutually_exclusive_group(required=True)
-    phase.add_argument("--phase", type=two_names, metavar="X,V",
+    phase.add_argument("--phase", type=_two_names, metavar="X,V",
         help="two signals whose angle about the center is the phase")  # fmt: skip
-    phase.add_argument("--crossing", type=crossing, metavar="X:DIRECTION[:VALUE]",
+    phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:VALUE]",
         help="a cycle begins where signal X crosses a value, rising or falling")  # fmt: skip
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
-    add("--center", type=two_numbers, metavar="X,V",
+    add("--center", type=_two(_finite), metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
-    add("--scale", type=two_sizes, metavar="X,V",
+    add("--scale", type=_two(_positive), metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
     add("--out", required=True, metavar="DIR", help="folder for the results; made if needed")
-    add("--sections", type=count, default=32, metavar="N",
+    add("--sections", type=_count, default=32, metavar="N",
         help="sections in each cycle (default: %(default)s)")  # fmt: skip
-    add("--order", type=count, metavar="D", help="number of multipliers; found by default")
-    add("--bandwidth", type=positive, metavar="HZ", help="of the splines through the outputs; by "
+    add("--order", type=_count, metavar="D", help="number of multipliers; found by default")
+    add("--bandwidth", type=_positive, metavar="HZ", help="of the splines through the outputs; by "
         "default N per period")  # fmt: skip
     add("--time", default="time", metavar="NAME",
         help="column with the times (default: %(default)s)")  # fmt: skip
     add("--timing", choices=("clock", "duration"), help="an extra output, from when "
         "sections are crossed: for systems with a clock, or without")  # fmt: skip
-    add("--drift", type=positive, metavar="CYCLES", help="remove changes of the cycle that take "
+    add("--drift", type=_positive, metavar="CYCLES", help="remove changes of the cycle that take "
         "longer than this")  # fmt: skip
     _add_formats(identify)
     identify.set_defaults(run=_identify, parser=identify)
@@ -164,11 +253,11 @@ def _add_sweep(commands) -> None:
         "store, which a later call goes on with, and pictures beside it.",
     )
     add = sweep.add_argument
-    add("model", type=model, metavar="FILE.py:NAME",
+    add("model", type=_model, metavar="FILE.py:NAME",
         help="a system, its class, or a function of parameters that gives one")  # fmt: skip
-    add("--over", required=True, action="append", type=axis, metavar="NAME=LOW:HIGH:COUNT",
+    add("--over", required=True, action="append", type=_axis, metavar="NAME=LOW:HIGH:COUNT",
         help="values of a parameter, evenly spaced; may be repeated")  # fmt: skip
-    add("--want", type=names, default=("spectral_radius", "period"), metavar="NAMES",
+    add("--want", type=_names, default=("spectral_radius", "period"), metavar="NAMES",
         help="period, state, multipliers, spectral_radius, events, residual; with "
         "commas (default: spectral_radius,period)")  # fmt: skip
     add("--out", required=True, metavar="STORE", help="the Zarr store, e.g. map.zarr")
@@ -177,24 +266,29 @@ def _add_sweep(commands) -> None:
     sweep.set_defaults(run=_sweep, parser=sweep)
 
 
-def _sweep(options) -> int:
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+def _begin(*, cache: bool) -> None:
+    """Set up the process: figures go to files only, and results are in double precision."""
     import matplotlib
 
-    matplotlib.use("Agg")  # files only
+    matplotlib.use("Agg")
     from .._core.compilation.compilation_cache import enable_compilation_cache
     from .._core.precision import enable_x64
-    from .map_command import run
 
     enable_x64()
-    enable_compilation_cache()
-    found, pictures = run(
+    if cache:
+        enable_compilation_cache()
+
+
+def _sweep(options) -> int:
+    _begin(cache=True)
+    from .sweep_command import run
+
+    maps, pictures = run(
         options.model, options.over, options.want, options.out, options.scheduler, options.force
     )
-    print(found)
-    count = int((found.result == 0).sum())
-    print(f"{count} of {found.result.size} points have a limit cycle")
+    print(maps)
+    converged = int((maps.result == 0).sum())
+    print(f"{converged} of {maps.result.size} points have a limit cycle")
     print("\n".join(pictures))
     return 0
 
@@ -202,20 +296,13 @@ def _sweep(options) -> int:
 def _identify(options) -> int:
     if options.phase is None and (options.center or options.scale):
         options.parser.error("--center and --scale are of the angle of --phase, which is not given")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import matplotlib
-
-    matplotlib.use("Agg")  # files only
-    from .._core.precision import enable_x64
+    _begin(cache=False)
     from .._core.results import Result
     from ..recordings.identification import identify_recording
     from ..recordings.read import read_recording
-    from ..sections.crossing import AtEvent, Crossing
-    from ..sections.kinematic import KinematicPhase
+    from ..sections.families import AtEvent, Crossing, KinematicPhase
     from .recording_report import PAGE, report_folder, write_results
 
-    enable_x64()
     with report_folder(options.out, options.input, options.formats) as folder:
         named = (*options.input, *options.outputs, *(options.phase or (options.crossing or ())[:1]))
         signals = tuple(dict.fromkeys(named))
@@ -223,57 +310,49 @@ def _identify(options) -> int:
         print(recording)
         if options.phase is not None:
             position, velocity = options.phase
-            phase = KinematicPhase(
+            sections: Any = KinematicPhase(
                 options.sections, position=position, velocity=velocity,
                 center=options.center, scale=options.scale,
             )  # fmt: skip
         elif options.crossing is not None:
             signal, direction, value = options.crossing
-            phase = Crossing(signal, direction, value=value)
+            sections = Crossing(signal, direction, value=value)
         else:
-            phase = AtEvent(options.event)
-        found = identify_recording(
-            recording, phase, inputs=options.input, outputs=options.outputs,
+            sections = AtEvent(options.event)
+        result = identify_recording(
+            recording, sections, inputs=options.input, outputs=options.outputs,
             n_sections=options.sections, order=options.order, bandwidth=options.bandwidth,
             timing=options.timing, drift=options.drift,
         )  # fmt: skip
-        print(found)
-        write_results(folder, found, options.formats)
+        print(result)
+        write_results(folder, result, options.formats)
     print(os.path.join(options.out, PAGE))
-    return _status(found.fit.result == Result.OK)
+    return _status(result.fit.result == Result.OK)
 
 
 def _reproduce(options) -> int:
     changed = [name for name, _ in options.param]
     if len(set(changed)) < len(changed):
         options.parser.error("--param gives a parameter twice")
-    # XLA reports, at the level of errors, that cached programs name CPU features of its own.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    # The matrices are small: more BLAS threads than one only wait for each other.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from .helper import Helper
+    from .second_process import second_process
 
-    helper = Helper("hybridjax.apps.reproduce", "hybridjax.apps.paper_figures")
-    from .reproduce import Protocol, reproduce
+    with second_process("hybridjax.apps.reproduce", "hybridjax.apps.paper_figures") as process:
+        from .reproduce import Protocol, reproduce
 
-    sizes = {
-        name: getattr(options, name) or (quick if options.quick else paper)
-        for name, (_, _, paper, quick) in _SIZES.items()
-    }
-    both = ("isochron", "kinematic")
-    summary = reproduce(
-        options.out,
-        Protocol(
+        sizes = {
+            name: getattr(options, name) or (quick if options.quick else paper)
+            for name, (_, _, paper, quick) in _SIZES.items()
+        }
+        both = ("isochron", "kinematic")
+        protocol = Protocol(
             families=both if options.family == "both" else (options.family,),
             n_sections=options.sections,
             amplitude=options.amplitude,
             seed=options.seed,
             parameters=dict(options.param),
             **sizes,
-        ),
-        options.formats,
-        helper,
-    )
+        )
+        summary = reproduce(options.out, protocol, options.formats, process)
     return _status(all(family["converged"] for family in summary["families"].values()))
 
 

@@ -9,8 +9,8 @@ from matplotlib import pyplot
 from .. import plot
 from .._core.files.figure_formats import Format
 from ..engine.trajectory import Trajectory
-from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
+from ..sections.placed import PlacedSections
 from .paper_report import OUTPUTS
 
 

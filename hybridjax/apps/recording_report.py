@@ -134,7 +134,7 @@ def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
         figures = {
             "phase": plot.phase(found.phase),
             "sections": plot.section_data(found.data),
-            "multipliers": plot.multiplier_regions(found.fit, found.advice.plain),
+            "multipliers": plot.multipliers(found.fit, {"plain regression": found.advice.plain}),
             "impulse_responses": plot.impulse_responses(found.responses),
             "validation": plot.validation(found.held_out.validation),
         }

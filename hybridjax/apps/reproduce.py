@@ -8,6 +8,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,18 +30,16 @@ from ..identify.multipliers.structured import StructuredFit, fit_multipliers
 from ..identify.rational.fit import RationalFit, fit_rational
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from ..maps.linearize import linearize
-from ..maps.place import place_sections
-from ..maps.placed import PlacedSections
 from ..models.hoppers import VerticalHopper
+from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.abstract import AbstractSections
-from ..sections.clock import ClockPhase
-from ..sections.crossing import Crossing
-from ..sections.kinematic import KinematicPhase
+from ..sections.families import ClockPhase, KinematicPhase
+from ..sections.linearize import linearize
+from ..sections.place import place_sections
+from ..sections.placed import PlacedSections
 from ..systems.system import own_fields
-from .helper import Helper
 from .paper_report import OUTPUTS, summarize, table
 
 
@@ -88,15 +87,15 @@ class _Clock:
 
 
 def reproduce(
-    out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format], helper: Helper
+    out: str | os.PathLike, protocol: Protocol, formats: Sequence[Format], process: Executor
 ) -> dict:
     """Run the protocol and write figures, `summary.json` and `results.npz` into the folder `out`.
 
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
 
-    **Arguments:** `formats` of the figures, as in `hj.plot.save`; `helper`, which does its part and
-    is ended.
+    **Arguments:** `formats`: of the figures, as in `hj.plot.save`. `process`: an executor, which
+    does half of the work.
 
     **Returns:** what `summary.json` holds.
 
@@ -105,8 +104,8 @@ def reproduce(
     fails.
     """
     names = _names(protocol.families, formats)
-    with results_folder(Path(out), "reproduce", names) as folder, helper:
-        return _reproduce(folder, protocol, formats, helper)
+    with results_folder(Path(out), "reproduce", names) as folder:
+        return _reproduce(folder, protocol, formats, process)
 
 
 def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
@@ -117,7 +116,7 @@ def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
     return ["summary.json", "results.npz", *files]
 
 
-def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], helper: Helper) -> dict:
+def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process: Executor) -> dict:
     _set_up()
     clock = _Clock(time.time())
     hopper = _hopper(protocol.parameters)
@@ -127,23 +126,23 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], helper:
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
     clock.done("cycle", f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
 
-    # One family is identified here, another one beside; then those figures are drawn beside that
-    # take longer.
+    # The second process identifies the second family, and then draws the figures that take longer.
     first, *others = protocol.families
-    for name in others:
-        helper.begin(_identify, name, cycle, design, protocol, clock.begin)
+    begun = [
+        process.submit(_identify, name, cycle, design, protocol, clock.begin) for name in others
+    ]
     families = {}
     families[first], seconds = _identify(first, cycle, design, protocol, clock.begin)
     orbit, perturbed = cycle.trajectory(), _perturbed(cycle)
-    for name in others:
-        families[name], more = helper.result()
+    for name, task in zip(others, begun, strict=True):
+        families[name], more = task.result()
         seconds |= more
-    helper.begin(_draw, "comparisons", (cycle, families), out, formats, clock.begin)
+    task = process.submit(_draw, "comparisons", (cycle, families), out, formats, clock.begin)
     placed = {name: family.placed for name, family in families.items()}
     seconds |= _draw("cycles", (placed, perturbed), out, formats, clock.begin)
     summary = summarize(protocol, cycle, families)
     _write_results(out / "results.npz", protocol, cycle, orbit, families)
-    seconds = clock.seconds | seconds | helper.result()
+    seconds = clock.seconds | seconds | task.result()
     summary["seconds"] = {**seconds, "total": time.time() - clock.begin}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from .._core.packages import package
-from ..orbits.branches.branch import Branch
-from ..orbits.sweep.limit_cycles import LimitCycles
+from ..orbits.branch import Branch
+from ..orbits.limit_cycles import LimitCycles
 from ..systems.system import unit_of_parameter
 
 

@@ -9,8 +9,8 @@ from .._core.packages import package
 from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.htf import HTF
-from ..orbits.branches.branch import Branch
-from ..orbits.sweep.limit_cycles import LimitCycles
+from ..orbits.branch import Branch
+from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray

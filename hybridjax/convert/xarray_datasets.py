@@ -8,8 +8,8 @@ from .._core.precision import require_x64
 from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from ..io import KINDS, Saved
-from ..orbits.branches.branch import Branch
-from ..orbits.sweep.limit_cycles import LimitCycles
+from ..orbits.branch import Branch
+from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
 from .families import from_branch, from_limit_cycles

@@ -10,7 +10,7 @@ from .._core.boundary.kinds import Count, Index, NonNegative, Positive, SignalNa
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..orbits.cycle import LimitCycle
-from ..sections.section_list import FamilyLike, as_family
+from ..sections.families import FamilyLike, as_family
 
 
 Criterion = Literal["A", "D"]

@@ -8,7 +8,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.html.parts import card, facts
+from .._core.html import card, facts
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies

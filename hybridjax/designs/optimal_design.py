@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import PeriodCount, Positive, Seed
-from .._core.html.parts import card, table, text
+from .._core.html import card, table, text
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from .sequences import RandomInput, random_sequence

@@ -19,9 +19,9 @@ from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
-from ..maps.place import as_placed
-from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output
 from ..systems.structure import Outputs
 from .batches import divide, in_batches, precision_of

@@ -10,8 +10,7 @@ from .._core.arguments import Numbers, names
 from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
-from .._core.html.parts import card, facts, table
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, facts, picture, table
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import fields, listed

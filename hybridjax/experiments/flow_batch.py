@@ -14,9 +14,8 @@ from ..engine.closed import close
 from ..engine.lanes import Lanes
 from ..engine.move import Moved, glide
 from ..engine.settings import Settings
-from ..maps.outputs import observe
-from ..maps.placed import PlacedSections, section_target
 from ..sections.abstract import BoundSections
+from ..sections.placed import PlacedSections, observe, section_target
 from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem

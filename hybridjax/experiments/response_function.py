@@ -14,9 +14,9 @@ from .._core.precision import require_x64
 from .._core.text import listed
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
-from ..maps.place import as_placed
-from ..maps.placed import PlacedSections, SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.place import as_placed
+from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
 from .flow_batch import Response, course, flow_batch

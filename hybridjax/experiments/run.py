@@ -9,8 +9,8 @@ from .._core.pieces.place import check_share
 from .._core.pieces.run import DaskClient
 from .._core.progress import working
 from ..errors import DefinitionError
-from ..maps.placed import SectionsLike
 from ..orbits.cycle import LimitCycle
+from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
 from .campaign import chunks, prepare
 from .data import ExperimentData

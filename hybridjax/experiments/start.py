@@ -14,8 +14,8 @@ from .._core.progress import counted
 from ..errors import ComputationError
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
-from ..maps.linearize import linearize
-from ..maps.placed import PlacedSections
+from ..sections.linearize import linearize
+from ..sections.placed import PlacedSections
 from ..systems.output import Output
 from .batches import in_batches
 from .flow_batch import Course

@@ -15,9 +15,8 @@ from .._core.pieces.layout import Constant, Layout, Variable
 from .._core.pieces.place import filled
 from .._core.results import Result
 from ..engine.describe import describe
-from ..orbits.cycle import LimitCycle
+from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..orbits.rough import rough
 from ..systems.system import HybridSystem
 from .observations import AbstractObservation
 from .problem import FitProblem, levenberg_marquardt

@@ -11,7 +11,7 @@ from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
-from .._core.html.parts import card, table, text
+from .._core.html import card, table, text
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle

@@ -24,12 +24,12 @@ from ..experiments.response_function import response_function
 from ..experiments.stepping.plan import Plan
 from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.htf import HTF
-from ..maps.linearize import linearize
-from ..maps.place import place_sections
-from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
 from ..sections.abstract import AbstractSections
-from ..sections.section_list import FamilyLike, as_family
+from ..sections.families import FamilyLike, as_family
+from ..sections.linearize import linearize
+from ..sections.place import place_sections
+from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
 
 

@@ -13,8 +13,7 @@ from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, NonNegative, PeriodCount, Vector
 from .._core.executor import from_host
-from .._core.html.multipliers import multiplier_table, unit_circle
-from .._core.html.parts import card, facts
+from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.text import listed

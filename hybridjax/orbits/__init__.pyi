@@ -1,3 +1,1 @@
-from .branches.branch import BranchEnd as BranchEnd, BranchPoint as BranchPoint
-from .coincidence import Coincidence as Coincidence, coincidences as coincidences
-from .return_map import ReturnMap as ReturnMap
+from .coincidence import coincidences as coincidences

@@ -27,9 +27,9 @@ from ..engine.move import record
 from ..engine.target import toward, until
 from ..engine.watch import watch
 from ..errors import ComputationError
-from ..sections.crossing import AtEvent
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
+from .crossing import AtEvent
 from .cycle import LimitCycle
 from .return_map import ReturnMap, Turn
 

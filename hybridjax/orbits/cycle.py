@@ -1,5 +1,7 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
@@ -7,26 +9,22 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
 from .._core.executor import to_host
-from .._core.html.multipliers import multiplier_table, unit_circle
-from .._core.html.parts import card, facts
+from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, thinned, unit_circle
 from .._core.memo import remembered
 from .._core.results import Result
-from .._core.signal import unit_of
+from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..linear.multipliers import product_eigenvalues
-from ..sections.crossing import AtEvent, Crossing
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .fine_factors import fine_factors, weakest
-from .liouville import log_determinant
-from .picture import orbit_picture
+from .crossing import AtEvent, Crossing
 from .return_map import ReturnMap
-from .scale import sizes_of
-from .stiffness import has_implicit, stiff_charts
+from .scale import has_implicit, sizes_of, stiff_charts
+from .small_multipliers import fine_factors, log_determinant, weakest
 
 
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
@@ -255,3 +253,55 @@ def _format(z: complex, least: str) -> str:
     if z == 0:
         return f"below {least}"
     return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"
+
+
+def orbit_picture(
+    orbit: Trajectory,
+    sections: tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]]
+    | None = None,
+) -> str:
+    """An SVG, in the plane of the first two states that every chart has, or of time and the only
+    one; "" where there is no such state.
+
+    **Arguments:** `sections`: times, charts and states at which the orbit meets some, as of
+    `Trajectory.dense`.
+    """
+    s, turn = Structure(orbit.system), orbit.dense()
+    names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
+    if not names:
+        return ""
+
+    def seen(t, chart, q):
+        columns = [np.array([s.charts[a].states.index(x) for a in chart]) for x in names]
+        values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
+        return values if len(names) == 2 else [t, *values]
+
+    (t, chart, _), (x, y) = turn, seen(*turn)
+    cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
+    named: set[int] = set()
+    curves = []
+    for k in np.split(np.arange(len(t)), cuts):
+        a = int(chart[k[0]])
+        name = s.names[a] if len(s.names) > 1 and a not in named else ""
+        named.add(a)
+        k = k[thinned(len(k), len(k) / len(t))]
+        curves.append(Curve(x[k], y[k], name, COLORS[a % len(COLORS)]))
+    if sections is not None:
+        curves.append(Curve(*seen(*sections), color="currentColor", points=True))
+    labels = [with_unit(x, unit_of(x)) for x in names]
+    if len(names) == 1:
+        labels.insert(0, with_unit("t", orbit.system.time_unit))
+    return picture(curves, *labels)
+
+
+def rough(cycle: LimitCycle) -> dict[str, Any]:
+    """A cycle in words that are the same however it was found: its period, and where it begins, in
+    sizes of the states."""
+    chart = int(np.asarray(cycle.anchor.chart)[0])
+    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
+    return {
+        "period": f"{float(cycle.period):.5g}",
+        "time": f"{float(cycle.anchor.t[0]):.5g}",
+        "chart": chart,
+        "state": [f"{x:.4f}" for x in (q / size).round(4) + 0.0],
+    }

@@ -16,21 +16,28 @@ from .._core.results import Result
 from .._core.tracing import is_traced
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
-from ..sections.crossing import AtEvent, Crossing
 from ..systems.check import check_system
 from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, integrated
-from .clock import check_clock, check_times
+from .checks import check_clock, check_conserved, check_times, explain
 from .coincidence import check_begin, coincident, commutes, events_of
-from .conserved import check_conserved
+from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
-from .explain import explain
 from .guess import begin, check_section, guessed_lane, own_guess
 from .newton import Solution, solve, solve_damped
 from .return_map import ReturnMap
-from .scale import Sizes, given_sizes, scale_of, sizes_near, sizes_of, sizes_on
-from .stiffness import has_implicit, slow_time, stiff_charts
+from .scale import (
+    Sizes,
+    given_sizes,
+    has_implicit,
+    scale_of,
+    sizes_near,
+    sizes_of,
+    sizes_on,
+    slow_time,
+    stiff_charts,
+)
 
 
 # An autonomous system is given up if it does not return within so many of the times in which the

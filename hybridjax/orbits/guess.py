@@ -20,11 +20,10 @@ from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
 from ..errors import ComputationError, DefinitionError
-from ..sections.crossing import AtEvent, Crossing
-from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
-from .stiffness import stiff_mode
+from .crossing import AtEvent, Crossing, ListLevels
+from .scale import stiff_mode
 
 
 # A guess lies on the section if it would meet it within this part of the time in which the states

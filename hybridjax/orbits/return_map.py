@@ -28,10 +28,9 @@ from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import slopes, watch
 from ..linear.time_response import monodromy
-from ..sections.crossing import AtEvent, Crossing
-from ..sections.section_list import ListLevels
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from .crossing import AtEvent, Crossing, ListLevels
 
 
 # Pieces into which one turn is cut: their Jacobians are the factors of the monodromy. Doubled, a

@@ -1,4 +1,3 @@
-from .branches import branch as branch
 from .designs import information as information, spectrum as spectrum, strides as strides
 from .fit_quality import amplitude as amplitude, validation as validation
 from .frequency import (
@@ -16,10 +15,10 @@ from .look import (
     style as style,
 )
 from .orbit import cycle as cycle
+from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
 from .recorded import (
     impulse_responses as impulse_responses,
-    multiplier_regions as multiplier_regions,
     phase as phase,
     phase_response as phase_response,
     section_data as section_data,

@@ -11,8 +11,8 @@ from .._core.boundary.kinds import Index
 from ..engine import kernels
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
-from ..maps.placed import PlacedSections
 from ..orbits.cycle import LimitCycle
+from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
 from .look import COLORS, AxesLike, Plot, axis_of, panels
 

@@ -40,27 +40,28 @@ def multipliers(
     labels: Mapping[str, str] | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Floquet multipliers in the unit disc: the true ones as crosses, estimates as open markers.
+    """Draw Floquet multipliers in the unit disc: true ones as crosses, estimates as open markers.
 
-    The legend gives each estimate's largest distance |Δλ| from the true ones, and an inset
-    enlarges the surroundings of the leading multiplier so that the estimates can be told apart.
-    Estimates that know their uncertainty get the borders of their 95 % regions.
+    The legend gives the largest distance |Δλ| of each estimate from the true multipliers, and an
+    inset enlarges the surroundings of the leading multiplier so that the estimates can be told
+    apart. Estimates with a covariance get the borders of their 95 % confidence regions.
 
     **Arguments:**
 
-    - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them.
+    - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them; or the estimate with which
+        others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
         `SeriesFit` or `MultiplierBound`, or multipliers.
     - `zoom`: draw the inset. `labels`: texts for the outputs by name.
 
     **Raises:** `DefinitionError` if there are no multipliers.
     """
+    reference = "estimate" if isinstance(true, MultiplierEstimate) else "exact"
+    borders = _borders({reference: true, **(estimates or {})})
     true = _values(true.multipliers if isinstance(true, LDTP) else true)
     if true.size == 0:
         raise DefinitionError("`true` holds no multiplier to draw.")
     series = _series(estimates or {}, labels)
-    borders = _borders(estimates or {})
-    own = ax is None
     with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
         panel = axes[0, 0]
         _unit_circle(panel)
@@ -68,10 +69,14 @@ def multipliers(
         far = max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
         panel.set(xlim=(-1.1 * far, 1.1 * far), ylim=(-1.1 * far, 1.1 * far), aspect="equal")
         panel.locator_params(nbins=5)
-        if zoom and series:
+        if zoom and (series or borders):
             boxes.append(_zoom(panel, true, series, borders))
         for box in boxes:
-            box.plot(true.real, true.imag, "+", ms=9, mew=1.2, color="black", label="exact", ls="")
+            box.plot(
+                true.real, true.imag, "+", ms=9, mew=1.2, color="black", label=reference, ls=""
+            )
+            for border in borders.get(reference, ()):
+                box.plot(border.real, border.imag, lw=0.7, color="black")
             for k, (label, z) in enumerate(series.items()):
                 error = compare_multipliers(z, true).max_error
                 box.plot(
@@ -82,7 +87,7 @@ def multipliers(
                 for border in borders.get(label, ()):
                     box.plot(border.real, border.imag, lw=0.7, color=CYCLE[k % len(CYCLE)])
         _complex_axes(panel, r"\lambda")
-        if own and series:
+        if ax is None and series:
             shown = panel.get_legend_handles_labels()
             panel.get_figure(root=True).legend(*shown, loc="outside lower center")
         elif series:

@@ -7,8 +7,6 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from ..errors import DefinitionError
-from ..identify.multipliers.compare import Multipliers
-from ..identify.series.series_fit import SeriesFit
 from ..recordings.beats.response import PhaseResponse, curve_unit
 from ..recordings.data import SectionData
 from ..recordings.impulse import ImpulseResponses
@@ -154,50 +152,4 @@ def phase_response(
             xlabel="phase (cycles)", ylabel=f"{name}\n({curve_unit(found.input)})", xlim=(0, 1)
         )
         curve.legend()
-    return Plot(axes)
-
-
-@checked
-def multiplier_regions(
-    fit: SeriesFit, plain: Multipliers | None = None, *, ax: AxesLike | None = None
-) -> Plot:
-    """Estimated multipliers in the unit circle with 95 % regions, enlarged in an inset where these
-    are small; beside them those of plain regression, if given."""
-    with panels(ax, height=3.4) as axes:
-        panel = axes[0, 0]
-        circle = np.exp(2j * np.pi * np.linspace(0, 1, 200))
-        leading = fit.multipliers[0]
-        reach = 0.0
-        if np.isfinite(fit.covariance).all():
-            reach = 2 * np.abs(fit.ellipse(0) - leading).max()
-        boxes = [panel]
-        if 0 < reach < 0.1:
-            corner = 0.2 if leading.real > 0 else 0.52
-            boxes.append(panel.inset_axes((corner, 0.33, 0.32, 0.32)))
-            boxes[1].set(
-                xlim=(leading.real - reach, leading.real + reach),
-                ylim=(leading.imag - reach, leading.imag + reach),
-            )
-            boxes[1].tick_params(labelsize="xx-small", length=2)
-            boxes[1].locator_params(nbins=3)
-            panel.indicate_inset_zoom(boxes[1], edgecolor="0.4")
-        for box in boxes:
-            box.plot(circle.real, circle.imag, color=COLORS["gray"], lw=0.6, zorder=0)
-            if plain is not None:
-                box.plot(
-                    plain.real, plain.imag, "x", color=COLORS["red"], ms=5, label="plain regression"
-                )
-            z = fit.multipliers
-            box.plot(z.real, z.imag, "o", mfc="none", color=CYCLE[0], label="output error")
-            if reach:
-                for i in range(len(z)):
-                    border = fit.ellipse(i)
-                    box.fill(border.real, border.imag, color=CYCLE[0], alpha=0.3, lw=0)
-            box.set_aspect("equal")
-        far = 1.25 * max(1.0, np.abs(fit.multipliers).max())
-        panel.set(
-            xlim=(-far, far), ylim=(-far, far), xlabel=r"Re $\lambda$", ylabel=r"Im $\lambda$"
-        )
-        panel.locator_params(nbins=5)
-        panel.legend(loc="upper left")
     return Plot(axes)

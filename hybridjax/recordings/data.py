@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
-from .._core.html.parts import card, facts, table
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, facts, picture, table
 from .._core.signal import unit_of, with_unit
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record

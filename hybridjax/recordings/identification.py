@@ -6,7 +6,7 @@ import equinox as eqx
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
-from .._core.html.parts import card, text
+from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..identify.series.fit import fit_series

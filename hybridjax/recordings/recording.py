@@ -9,11 +9,10 @@ from jaxtyping import Float
 
 from .._core import limits
 from .._core.boundary.checked import checked
-from .._core.html.parts import card, table, text
-from .._core.html.svg import COLORS, Curve, picture
+from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import with_unit
 from ..errors import DefinitionError
-from ..sections.crossing import Crossing
+from ..orbits.crossing import Crossing
 from .headers import seconds, split_header, time_unit
 from .smoothing import Bandwidth, bridgeable, spline
 from .spikes import without_spikes

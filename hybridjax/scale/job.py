@@ -13,10 +13,10 @@ from .._core.pieces.blocks import Blocks
 from .._core.pieces.layout import Variable
 from .._core.pieces.run import call
 from .._core.progress import say
+from ..orbits.batches import Known, Rounds, Tiles
 from ..orbits.cycle import LimitCycle
+from ..orbits.limit_cycles import BATCH, LimitCycles, as_cycles, map_for_sweep, programs_for
 from ..orbits.return_map import ReturnMap
-from ..orbits.sweep.batches import Known, Rounds, Tiles
-from ..orbits.sweep.limit_cycles import BATCH, LimitCycles, as_cycles, map_for_sweep, programs_for
 from .family import Family
 from .points import Grid, Points, spread_out
 from .wanted import Wanted

@@ -17,10 +17,9 @@ from .._core.pieces.run import DaskClient
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..errors import ComputationError, DefinitionError
-from ..orbits.cycle import LimitCycle
+from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..orbits.rough import rough
-from ..orbits.sweep.limit_cycles import BATCH
+from ..orbits.limit_cycles import BATCH
 from ..systems.system import HybridSystem
 from .family import Family
 from .job import Begun, SweepJob, coarse_pass

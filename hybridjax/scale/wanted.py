@@ -10,7 +10,7 @@ from .._core.results import Result
 from .._core.signal import unit_of
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..orbits.sweep.limit_cycles import LimitCycles
+from ..orbits.limit_cycles import LimitCycles
 from ..systems.structure import Structure
 
 

@@ -15,8 +15,8 @@ from .._core.precision import real
 # Subclasses of `AbstractSections` meet these two, which other layers define.
 from .._core.text import fields
 from ..engine.target import AbstractLevels as AbstractLevels
+from ..orbits.crossing import Crossing
 from ..systems.structure import Structure as Structure
-from .crossing import Crossing
 
 
 class CyclePoint(NamedTuple):

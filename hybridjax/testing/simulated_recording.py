@@ -18,7 +18,7 @@ from ..errors import DefinitionError
 from ..experiments.response_function import ResponseFunction, response_function
 from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording
-from ..sections.clock import ClockPhase
+from ..sections.families import ClockPhase
 from ..systems.output import OutputNames
 from ..systems.structure import Structure
 

@@ -11,7 +11,7 @@ import hybridjax as hj
 from hybridjax.designs.allocation import allocate, certify
 from hybridjax.designs.candidates import Candidates
 from hybridjax.designs.limits.distortion import products
-from hybridjax.maps.second_order import second_order
+from hybridjax.sections.second_order import second_order
 
 from ..conftest import APEX, OUTPUTS
 from ..toys import Field
@@ -193,7 +193,7 @@ def test_products_in_parts_and_of_a_design(two, monkeypatch):
     cosines = Candidates.of(SHORT)
     quadratic = second_order(*two[:2], ("x", "z"), two[2].inputs)
     whole = quadratic.products(cosines.f, cosines.channel)
-    monkeypatch.setattr("hybridjax.linear.quadratic._NUMBERS", 2**10)
+    monkeypatch.setattr("hybridjax.sections.second_order._NUMBERS", 2**10)
     for a, b in zip(whole, quadratic.products(cosines.f, cosines.channel), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(a).max())
     limit = Distortion(*two[:2], {"x": 0.5, "z": 2.0})

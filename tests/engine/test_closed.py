@@ -11,7 +11,7 @@ from hybridjax._core.compilation.fingerprint import IndescribableError, digest
 from hybridjax._core.precision import single, single_precision
 from hybridjax.engine.closed import close
 from hybridjax.engine.target import AbstractLevels
-from hybridjax.sections.section_list import ListLevels
+from hybridjax.orbits.crossing import ListLevels
 from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import Driven
 

@@ -7,7 +7,7 @@ import hybridjax as hj
 from hybridjax._core.compilation import compile
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.stepping import plan
-from hybridjax.maps.place import PATIENCE
+from hybridjax.sections.place import PATIENCE
 
 from ..conftest import APEX
 

@@ -82,9 +82,6 @@ def calls(t):
     yield "plot.impulse_responses", plot.impulse_responses, dict(found=t.found.responses), {
         "found": instance(t.found), "input": [None, "f", 9, 0.5, NAN, True],
     } | look  # fmt: skip
-    yield "plot.multiplier_regions", plot.multiplier_regions, dict(fit=t.fit), {
-        "fit": instance(t.rational), "plain": ["x", [NAN], Other()], "ax": AXES,
-    }  # fmt: skip
     yield "plot.phase", plot.phase, dict(found=t.phase), {"found": instance(PHASE), "ax": AXES}
     yield "plot.section_data", plot.section_data, dict(data=t.section_data), {
         "data": instance(t.record),

@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 
 import hybridjax as hj
+from hybridjax.systems.structure import Structure
 
 
 NAMES = ("x", "y")
@@ -53,7 +54,7 @@ class Things:
 
     @ft.cached_property
     def structure(self):
-        return hj.sections.Structure(self.system)
+        return Structure(self.system)
 
     @ft.cached_property
     def model(self):

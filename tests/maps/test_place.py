@@ -212,7 +212,7 @@ def test_outputs_of_any_kind_and_feedthrough(hopper_cycle, placed_isochrons, iso
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
-    monkeypatch.setattr("hybridjax.maps.place.PATIENCE", 3)
+    monkeypatch.setattr("hybridjax.sections.place.PATIENCE", 3)
     settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     cycle = dataclasses.replace(hopper_cycle, settings=settings)
     with pytest.raises(hj.ComputationError, match="max_steps.* Give them to the search for the cy"):

@@ -6,7 +6,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.compilation.lapack import is_left_to_lapack
-from hybridjax.orbits.sweep import batches, programs
+from hybridjax.orbits import batches
 
 
 ONES = np.ones(2)
@@ -122,7 +122,7 @@ def test_programs_in_threads_factorize_nothing(wheel):
     systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(wheel.system.slope * ONES)
     start, period = jax.tree_util.tree_map(lambda x: x[None], (wheel.anchor, wheel.period))
     start, period = jax.tree_util.tree_map(lambda x: jnp.repeat(x, 2, 0), (start, period))
-    for some in (programs.QUICK, programs.FULL):
+    for some in (batches.QUICK, batches.FULL):
         arguments = systems, wheel.return_map, start, period, jnp.array(True)
         assert not is_left_to_lapack(some.turn, *arguments)
 

@@ -6,6 +6,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.models.walkers import SimplestStep as Step, _heelstrike
+from hybridjax.systems.structure import Structure
 
 
 hj.enable_x64()
@@ -128,4 +129,4 @@ class Stiffly(Full):
 @pytest.mark.parametrize("system", [Full(solver={"left stands": hj.Radau(3)}), Stiffly()])
 def test_solvers_stay(system):
     walker = hj.Quotient(system, **MIRROR, translation=("x",))
-    assert hj.sections.Structure(walker).method(0).name == "Radau(3)"
+    assert Structure(walker).method(0).name == "Radau(3)"

@@ -18,10 +18,9 @@ from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Positive
 from ...errors import DefinitionError
 from ...experiments.design.design import Design
-from ...linear.quadratic import Quadratic
-from ...maps.second_order import second_order
 from ...orbits.cycle import LimitCycle
-from ...sections.section_list import FamilyLike, as_family
+from ...sections.families import FamilyLike, as_family
+from ...sections.second_order import Quadratic, second_order
 from ..candidates import Candidates
 from ..signals import Model
 

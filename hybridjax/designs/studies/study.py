@@ -11,8 +11,7 @@ from ..._core.arguments import require_same
 from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Order, Positive, Seed
-from ..._core.html.multipliers import multiplier_table
-from ..._core.html.parts import card, table, text
+from ..._core.html import card, multiplier_table, table, text
 from ..._core.progress import working
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData

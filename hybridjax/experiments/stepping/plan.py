@@ -24,8 +24,8 @@ from ...engine.search.state import Stride
 from ...engine.settings import Settings
 from ...engine.watch import watch
 from ...errors import ComputationError
-from ...maps.place import PATIENCE
-from ...maps.placed import PlacedSections
+from ...sections.place import PATIENCE
+from ...sections.placed import PlacedSections
 
 
 # Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by

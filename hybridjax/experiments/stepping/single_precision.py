@@ -17,7 +17,7 @@ from ...engine.move import move
 from ...engine.search.state import Stride
 from ...engine.settings import Settings
 from ...errors import DefinitionError
-from ...maps.placed import PlacedSections
+from ...sections.placed import PlacedSections
 from .plan import Plan, Stepping, plan_flow
 
 

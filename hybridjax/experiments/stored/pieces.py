@@ -16,9 +16,8 @@ from ..._core.results import Result
 from ..._core.signal import unit_of
 from ...engine.describe import describe as describe_system
 from ...errors import ComputationError
-from ...maps.placed import SectionsLike
-from ...orbits.cycle import LimitCycle
-from ...orbits.rough import rough
+from ...orbits.cycle import LimitCycle, rough
+from ...sections.placed import SectionsLike
 from ...systems.output import OutputNames
 from ..campaign import Campaign, prepare
 from ..design.design import Design

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...errors import DefinitionError
-from ...linear.scatter import Scatter
+from ...linear.htf import Scatter
 from .realizations import Realizations
 from .spectral_sums import SpectralSums
 

@@ -9,8 +9,7 @@ from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Complexes
-from ..._core.html.multipliers import complex_number
-from ..._core.html.parts import card, table
+from ..._core.html import card, complex_number, table
 from ...errors import DefinitionError
 
 

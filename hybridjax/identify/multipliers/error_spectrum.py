@@ -8,8 +8,8 @@ the variance $a + b / |\chi|^2$, with a and b from what numerators leave of them
 import numpy as np
 from jaxtyping import Float, Inexact
 
+from ..descent import Coefficients
 from .denominator import chi
-from .gauss_newton import Coefficients
 from .variable_projection import HTFGroup, misfit_of
 
 

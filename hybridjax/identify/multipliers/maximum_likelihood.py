@@ -5,8 +5,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..descent import Coefficients, Minimum, least_squares
 from .covariance import Covariance, sandwich
-from .gauss_newton import Coefficients, Minimum, gauss_newton
 from .variable_projection import HTFGroup, delayed_responses, misfit_of
 
 
@@ -33,7 +33,7 @@ def maximum_likelihood(
         return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
 
     start = total_least_squares(groups, order) if start is None else start
-    return gauss_newton(linearize, start, max_steps)
+    return least_squares(linearize, start, max_steps)
 
 
 def total_least_squares(groups: list[HTFGroup], order: int) -> Coefficients:

@@ -6,8 +6,7 @@ from jaxtyping import Bool, Complex, Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import PeriodCount, Probability
-from ..._core.html.multipliers import multiplier_table, unit_circle
-from ..._core.html.parts import card, text
+from ..._core.html import card, multiplier_table, text, unit_circle
 from ...errors import DefinitionError
 from .compare import MultiplierComparison, Multipliers, compare_multipliers
 

@@ -9,19 +9,18 @@ from jaxtyping import Complex, Float, Int
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
-from ..._core.html.multipliers import complex_number, unit_circle
-from ..._core.html.parts import card, table
+from ..._core.html import card, complex_number, table, unit_circle
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import ComputationError, DefinitionError
 from ...linear.htf import HTF
+from ..descent import least_squares
 from ..multipliers.compare import (
     MultiplierComparison,
     Multipliers,
     channel_index,
     compare_by_output,
 )
-from ..multipliers.gauss_newton import gauss_newton
 
 
 # Steps of the iteration of Sanathanan and Koerner from which fits are started. Doubled: twice the
@@ -289,7 +288,7 @@ def _refined(problem: _Problem, start: Float[np.ndarray, " p"], max_steps: int) 
         found = problem.project(a)
         return found.residual, found.jacobian
 
-    a, converged = gauss_newton(linearize, start, max_steps, settled_gain=_ACCURACY**2)
+    a, converged = least_squares(linearize, start, max_steps, settled_gain=_ACCURACY**2)
     found = problem.project(a)
     return _Trial(a, found.numerator, float(np.linalg.norm(found.residual)), converged)
 

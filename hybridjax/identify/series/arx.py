@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..descent import Coefficients
 from ..multipliers.denominator import multipliers_of
-from ..multipliers.gauss_newton import Coefficients
 from ..multipliers.order import refuse_invented
 from .cycle_filters import delay_cycles, lagged_inputs
 from .output_error import OutputErrorProblem, Part, in_passes

@@ -13,9 +13,9 @@ from ..._core.results import Result
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
+from ..descent import Coefficients, least_squares
 from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
 from ..multipliers.denominator import Denominator, multipliers_of
-from ..multipliers.gauss_newton import Coefficients, gauss_newton
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .gradient_covariance import gradient_covariance
 from .linearization import Linearization, linearize
@@ -201,7 +201,7 @@ def _minimize(
     def normal(c):
         return at(c).as_residuals()
 
-    c, converged = gauss_newton(normal, start, max_steps)
+    c, converged = least_squares(normal, start, max_steps)
     return c, at(c), converged
 
 

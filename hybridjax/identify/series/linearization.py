@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..multipliers.gauss_newton import Coefficients
+from ..descent import Coefficients
 from .cycle_filters import divide_by_chi
 from .output_error import OutputErrorProblem, Part, in_passes
 from .section_regression import SectionRegression, root_of

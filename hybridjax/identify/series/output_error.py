@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from ..._core.cores import core_count
 from ..._core.threads import on_all_cores
 from ...errors import DefinitionError
-from ..multipliers.gauss_newton import Coefficients
+from ..descent import Coefficients
 from .cycle_filters import lagged_inputs, start_responses
 from .cycle_grid import CycleGrid
 from .parts import Parts

@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Probability
-from ..._core.html.parts import card, table, text
-from ..._core.html.svg import COLORS, Curve, picture
+from ..._core.html import COLORS, Curve, card, picture, table, text
 from ..._core.signal import unit_of, with_unit
 from ..._core.text import p_value
 from ...errors import DefinitionError

@@ -12,7 +12,7 @@ from ..._core.boundary.checked import checked
 from ..._core.boundary.scalars import Whole
 from ..._core.progress import working
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
+from ...orbits.crossing import AtEvent, Crossing
 from ..phase.winding import Phase
 from ..recording import Recording
 from .estimation import WAVES, fit_curve, fit_rates, miscounted

@@ -12,14 +12,13 @@ from ..._core.arguments import Numbers
 from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
-from ..._core.html.parts import card, text
-from ..._core.html.svg import COLORS, Curve, picture
+from ..._core.html import COLORS, Curve, card, picture, text
 from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.signal import Signal, unit_of, with_unit
 from ..._core.text import p_value
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
+from ...orbits.crossing import AtEvent, Crossing
 from ..phase.estimation import estimate_phase
 from ..phase.winding import Phase
 from ..recording import Recording

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import DefinitionError
-from ...sections.crossing import Crossing
-from ...sections.kinematic import KinematicPhase
+from ...orbits.crossing import Crossing
+from ...sections.families import KinematicPhase
 from ..recording import Recording
 from ..smoothing import FEWEST, bridgeable, gaps, inside, spline
 from ..spikes import without_spikes

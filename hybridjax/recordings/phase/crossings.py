@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
+from ...orbits.crossing import AtEvent, Crossing
 from ..recording import Recording, Trial
 from ..smoothing import bridgeable, gaps, inside
 from .winding import LONGEST_GAP, Phase, Winding

@@ -2,8 +2,8 @@
 
 from ..._core.boundary.checked import checked
 from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
-from ...sections.kinematic import KinematicPhase
+from ...orbits.crossing import AtEvent, Crossing
+from ...sections.families import KinematicPhase
 from ..recording import Recording, signal_of
 from ..smoothing import Bandwidth
 from .angle import AngleFunction, from_angles, function_angles, kinematic_angles

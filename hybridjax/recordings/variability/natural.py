@@ -11,8 +11,7 @@ from scipy import stats
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability, Seed
 from ..._core.boundary.scalars import Whole
-from ..._core.html.multipliers import complex_number
-from ..._core.html.parts import card, table, text
+from ..._core.html import card, complex_number, table, text
 from ..._core.progress import working
 from ..data import SectionData
 from .moments import Moments, moments_of

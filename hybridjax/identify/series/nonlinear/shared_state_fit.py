@@ -94,7 +94,7 @@ def _minimize(
 ) -> tuple[SharedStateModel, bool]:
     """Gauss and Newton's iteration over A and B, and whether it came to its end.
 
-    It is not that of `gauss_newton`, since coordinates of x are free: they are chosen anew for each
+    It is not that of `least_squares`, since coordinates of x are free: they are chosen anew for each
     step, steps are those of least norm, and the Jacobian, too large to be kept, is summed up to a
     Hessian. It ends where a step is small beside its standard error.
     """

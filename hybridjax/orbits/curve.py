@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
-from ..._core.compilation.compile import quick_jit
-from ..._core.results import Result
-from ...engine.lanes import Lanes
-from ...errors import DefinitionError
-from ...systems.structure import Structure
-from ...systems.system import HybridSystem
-from ..cycle import LimitCycle
-from ..newton import newton_steps
-from ..return_map import ReturnMap, Turn, turn_product
+from .._core.compilation.compile import quick_jit
+from .._core.results import Result
+from ..engine.lanes import Lanes
+from ..errors import DefinitionError
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+from .cycle import LimitCycle
+from .newton import newton_steps
+from .return_map import ReturnMap, Turn, turn_product
 
 
 # Newton's steps before a point is given up. Doubled, hopeless ones take longer.

@@ -11,20 +11,20 @@ import jax
 import numpy as np
 from scipy.optimize import brentq
 
-from ..._core.boundary.arrays import Reals
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Count, Numbers, Share
-from ..._core.precision import require_x64
-from ..._core.progress import say, working
-from ..._core.results import Result
-from ..._core.tracing import is_traced
-from ...errors import DefinitionError
-from ..coincidence import coincident
-from ..cycle import LimitCycle
-from ..sweep.batches import front
-from ..sweep.limit_cycles import LimitCycles, without_coincidences
+from .._core.boundary.arrays import Reals
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Numbers, Share
+from .._core.precision import require_x64
+from .._core.progress import say, working
+from .._core.results import Result
+from .._core.tracing import is_traced
+from ..errors import DefinitionError
+from .batches import front
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
+from .coincidence import coincident
 from .curve import Curve, Failure, Point
+from .cycle import LimitCycle
+from .limit_cycles import LimitCycles, without_coincidences
 
 
 # A step is halved if the tangent turns by more than the angle of this cosine. (Twice the angle:

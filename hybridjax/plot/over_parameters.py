@@ -1,14 +1,15 @@
-"""Branches of limit cycles against their parameter."""
+"""Limit cycles over parameters: branches, and maps of sweeps."""
 
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.signal import Signal
 from ..errors import DefinitionError
-from ..orbits.branches.branch import KINDS, Branch
+from ..orbits.branch import KINDS, Branch
 from ..systems.structure import Structure
 from ..systems.system import unit_of_parameter
 from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
@@ -89,3 +90,28 @@ def _parts(branch: Branch) -> list[tuple[slice, bool]]:
             inside = branch.stable[a + 1 : b] if b > a + 1 else branch.stable[[a, b]]
             parts.append((slice(a, b + 1), bool(np.mean(inside) > 0.5)))
     return parts
+
+
+@checked
+def sweep(maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = None) -> Plot:
+    """Draw a quantity of a sweep: a curve over one parameter, or a map over two.
+
+    **Arguments:**
+
+    - `maps`: the dataset that `hj.sweep` returns.
+    - `name`: the quantity. Default: "spectral_radius".
+    - `ax`: Axes to draw on. Default: a new figure of one column's width.
+
+    **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
+    """
+    axes_of = {str(key): values.dims for key, values in maps.data_vars.items()}
+    if not 1 <= len(axes_of.get(name, ())) <= 2:
+        drawable = [key for key, dims in axes_of.items() if 1 <= len(dims) <= 2]
+        raise DefinitionError(
+            f"the sweep has no `{name}` over one or two parameters; it has {', '.join(drawable)}."
+        )
+    with panels(ax) as axes:
+        quantity = maps[name]
+        quantity.plot(ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {}))
+        axes[0, 0].set_title("")
+    return Plot(axes)

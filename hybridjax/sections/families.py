@@ -1,5 +1,6 @@
-"""Sections at equally spaced angles in a plane of two signals."""
+"""Sections one by one, and what else may stand for a family."""
 
+from collections.abc import Iterable, Sequence
 from typing import Annotated, ClassVar
 
 import equinox as eqx
@@ -12,6 +13,8 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, Scalar, SectionCount
 from .._core.precision import real
 from ..engine.target import AbstractLevels
+from ..errors import DefinitionError
+from ..orbits.crossing import AtEvent, Crossing, ListLevels
 from ..systems.structure import Structure
 from .abstract import (
     AbstractSections,
@@ -20,7 +23,89 @@ from .abstract import (
     as_anchor,
     check_anchor,
 )
-from .crossing import Crossing
+
+
+@checked
+class SectionList(AbstractSections):
+    """Sections one by one, in the order in which the cycle meets them.
+
+    **Fields:** `items`: a list of `Crossing` and `AtEvent`.
+    """
+
+    label: ClassVar[str] = "sections"
+    items: tuple[Crossing | AtEvent, ...]
+
+    def __init__(self, items: Iterable[Crossing | AtEvent]):
+        """**Raises:** `DefinitionError` for an empty list."""
+        self.items = tuple(items)
+        if not self.items:
+            raise DefinitionError(
+                "a list of sections needs at least one Crossing or AtEvent, but `items` is empty."
+            )
+
+    @property
+    def n_sections(self) -> int:
+        return len(self.items)
+
+    @property
+    def anchor(self) -> None:
+        return None
+
+    def check(self, s: Structure) -> None:
+        for item in self.items:
+            item.check(s)
+
+    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
+        event = [s.transition_index(x.name) if isinstance(x, AtEvent) else -1 for x in self.items]
+        some = any(isinstance(x, Crossing) for x in self.items)
+        never = jnp.full(self.n_sections, jnp.inf)
+        levels = ListLevels(self.items) if some else None
+        return BoundSections(never, jnp.array(event, jnp.int32), levels)
+
+    def describe(self, i: int) -> str:
+        return f"section {i} ({self.items[i]})"
+
+
+FamilyLike = AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+"""A family, a single section, or a list of sections."""
+
+
+def as_family(sections: FamilyLike) -> AbstractSections:
+    """A family from a family, a single section, or a list of sections."""
+    if isinstance(sections, Crossing | AtEvent):
+        return SectionList([sections])
+    return sections if isinstance(sections, AbstractSections) else SectionList(sections)
+
+
+@checked
+class ClockPhase(AbstractSections):
+    """N equally spaced phases of time: the isochrons of a clocked system (paper Sec. VI-B).
+
+    On an autonomous cycle these are equal steps of time from section 0; time has no natural
+    origin there, so one multiplier is 1.
+
+    **Fields:** `n_sections`, the number N; `anchor`, where section 0 lies: a `Crossing` on the
+    cycle, or a phase of the clock in periods.
+    """
+
+    label: ClassVar[str] = "isochron"
+    n_sections: int = eqx.field(static=True)
+    anchor: Crossing | Float[Array, ""]
+
+    def __init__(self, n_sections: SectionCount, anchor: Crossing | Scalar = 0.0):
+        self.n_sections, self.anchor = n_sections, as_anchor(anchor)
+
+    def check(self, s: Structure) -> None:
+        check_anchor(self.anchor, s)
+
+    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
+        first = point.t if isinstance(self.anchor, Crossing) else self.anchor * point.period
+        return BoundSections.at_times(
+            first + jnp.arange(self.n_sections) * (point.period / self.n_sections)
+        )
+
+    def describe(self, i: int) -> str:
+        return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
 
 
 @checked

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,6 +13,7 @@ from .._core.boundary.kinds import Scalar, SignalNames
 from .._core.executor import Definition
 from .._core.precision import real
 from .._core.text import fields
+from ..engine.target import AbstractLevels
 from ..systems.output import Output
 from ..systems.structure import Structure
 
@@ -103,3 +105,21 @@ class AtEvent(eqx.Module):
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for an event that the system does not have."""
         s.transition_index(self.name)
+
+
+class ListLevels(AbstractLevels):
+    """The level functions of the crossings among some sections."""
+
+    items: tuple[Crossing | AtEvent, ...]
+
+    def present(self, s, a):
+        return any(isinstance(x, Crossing) and x.in_chart(s, a) for x in self.items)
+
+    def level(self, s, a, i, t, q):
+        def branch(item):
+            if isinstance(item, Crossing) and item.in_chart(s, a):
+                return lambda: item.level(s, a, t, q)
+            return lambda: jnp.ones(())
+
+        branches = [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
+        return jax.lax.switch(i + 1, branches)

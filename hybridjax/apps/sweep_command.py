@@ -10,7 +10,8 @@ import numpy as np
 
 from .._core.packages import package
 from ..errors import DefinitionError
-from ..plot.look import Plot, panels, save
+from ..plot.look import save
+from ..plot.over_parameters import sweep as plot_sweep
 from ..scale.map import sweep
 from ..scale.wanted import Want
 
@@ -23,21 +24,21 @@ def run(
     scheduler: str | None,
     force: bool,
 ) -> tuple[Any, list[str]]:
-    """Sweep, and draw what is wanted beside the store. Gives the dataset, and the pictures' files.
+    """Sweep, and draw the maps beside the store. Return the dataset and the pictures' files.
 
     **Raises:** `DefinitionError` for a file without such a model, and as `sweep`.
     """
-    known = get_args(Want)
     for name in want:
-        if name not in known:
-            raise DefinitionError(f"`{name}` is nothing that a sweep keeps: {', '.join(known)}.")
+        if name not in get_args(Want):
+            kinds = ", ".join(get_args(Want))
+            raise DefinitionError(f"`{name}` is nothing that a sweep keeps: {kinds}.")
     names = [name for name, *_ in axes]
     if len(set(names)) < len(names):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
     over = {name: np.linspace(low, high, count) for name, low, high, count in axes}
-    found = _load(*model)
+    system = _load(*model)
     if scheduler is None:
-        maps = sweep(found, over, want, store=out, force=force)
+        maps = sweep(system, over, want, store=out, force=force)
     else:
         distributed = package("distributed")
         package("cloudpickle").register_pickle_by_value(sys.modules[Path(model[0]).stem])
@@ -46,32 +47,26 @@ def run(
         except (OSError, ValueError) as error:
             raise DefinitionError(f"no Dask scheduler answers at '{scheduler}'.") from error
         with client:
-            maps = sweep(found, over, want, store=out, client=client, force=force)
-    drawn = [name for name in want if maps[name].dims == tuple(names)] if len(names) <= 2 else []
-    return maps, [_draw(maps[name], f"{Path(out).with_suffix('')}-{name}") for name in drawn]
-
-
-def _draw(map: Any, path: str) -> str:
-    """A picture of a map over one or two parameters; its file."""
-    with panels(None) as axes:
-        first = {"x": map.dims[0]} if map.ndim == 2 else {}
-        map.plot(ax=axes[0, 0], **first)
-        axes[0, 0].set_title("")
-    save(path, Plot(axes), formats=("png",))
-    return f"{path}.png"
+            maps = sweep(system, over, want, store=out, client=client, force=force)
+    pictures = []
+    for name in want:
+        if maps[name].dims == tuple(names) and len(names) <= 2:
+            picture = f"{Path(out).with_suffix('')}-{name}"
+            pictures += map(str, save(picture, plot_sweep(maps, name)))
+    return maps, pictures
 
 
 def _load(file: str, name: str) -> Any:
-    """What a file of Python calls by a name."""
+    """The system, class or function of this name in a Python file."""
     path = Path(file)
     if not path.is_file():
         raise DefinitionError(f"there is no file '{file}': give the model as FILE.py:NAME.")
-    sys.path.insert(0, str(path.parent.resolve()))  # its own imports, and those of workers
+    sys.path.insert(0, str(path.parent.resolve()))  # for its own imports, and those of workers
     module = importlib.import_module(path.stem)
     if Path(module.__file__ or "").resolve() != path.resolve():
         raise DefinitionError(f"another module is called '{path.stem}': rename '{file}'.")
     try:
-        found = getattr(module, name)
+        system = getattr(module, name)
     except AttributeError as error:
         raise DefinitionError(f"'{file}' has no '{name}'.") from error
-    return found() if isinstance(found, type) else found
+    return system() if isinstance(system, type) else system

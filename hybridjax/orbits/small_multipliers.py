@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from .._core.compilation.compile import at_ease
 from .._core.executor import to_host
-from ..engine.chain import Link, links
+from ..engine.chain import Link, divergence, links
 from ..engine.move import record
 from .return_map import ReturnMap
 
@@ -70,3 +70,23 @@ def weakest(factor: Matrix, besides: int = 0) -> float:
     if len(singular) <= besides:
         return np.inf
     return singular[-1 - besides] / max(singular[0], 1.0)
+
+
+def log_determinant(map: ReturnMap) -> float:
+    """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
+    of the field, integrated over one turn.
+
+    Steps of an implicit method forget a mode that decays within them; this is how it decays.
+    """
+    map = to_host(map)
+    s, parts = map.structure, []
+
+    def flow(lanes, target, h, result):
+        u = np.zeros((s.nu, 1))
+        moved, tape = record(s, lanes, u, target, map.settings, h, result, new_input=False)
+        parts.append(divergence(s, lanes, tape))
+        return moved, None
+
+    with at_ease():
+        map.travel(map.anchor.q[:, 0], flow)
+    return float(np.sum(parts))

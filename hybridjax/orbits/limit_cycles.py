@@ -10,28 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..._core.boundary.checked import checked, checked_methods
-from ..._core.boundary.kinds import Index, Positive
-from ..._core.execution import Execution
-from ..._core.html.parts import card, table
-from ..._core.html.svg import Curve, picture, thinned
-from ..._core.memo import remembered
-from ..._core.precision import require_x64
-from ..._core.progress import working
-from ..._core.results import Result
-from ...engine.lanes import Lanes
-from ...engine.settings import SWEEP, Settings
-from ...errors import DefinitionError
-from ...sections.crossing import AtEvent, Crossing
-from ...systems.check import check_system
-from ...systems.structure import Structure
-from ...systems.system import HybridSystem
-from ..coincidence import commutes
-from ..cycle import LimitCycle
-from ..return_map import ReturnMap, turn_product
-from ..scale import given_sizes, scale_of
-from .batches import Rounds, Tiles
-from .programs import FULL, QUICK, Programs
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Index, Positive
+from .._core.execution import Execution
+from .._core.html import Curve, card, picture, table, thinned
+from .._core.memo import remembered
+from .._core.precision import require_x64
+from .._core.progress import working
+from .._core.results import Result
+from ..engine.lanes import Lanes
+from ..engine.settings import SWEEP, Settings
+from ..errors import DefinitionError
+from ..systems.check import check_system
+from ..systems.structure import Structure
+from ..systems.system import HybridSystem
+from .batches import FULL, QUICK, Programs, Rounds, Tiles
+from .coincidence import commutes
+from .crossing import AtEvent, Crossing
+from .cycle import LimitCycle
+from .return_map import ReturnMap, turn_product
+from .scale import given_sizes, scale_of
 
 
 # Up to so many systems, programs that are compiled in half the time run at most 3 s longer.

@@ -7,22 +7,21 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
 from .._core.compilation.compile import host_first
-from .._core.executor import Array, namespace, to_host
-from .._core.html.parts import card, facts
+from .._core.executor import Array, namespace, on_host, to_host
+from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
 from .._core.tracing import is_traced
-from ..engine.lanes import Lanes
+from ..engine import kernels
+from ..engine.lanes import Lanes, for_each_chart, needed, only
 from ..engine.tape import Tape
 from ..engine.target import Target
-from ..orbits.cycle import LimitCycle
-from ..orbits.picture import orbit_picture
-from ..sections.abstract import AbstractSections, BoundSections
-from ..sections.section_list import FamilyLike
+from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.output import Output, OutputNames
-from ..systems.structure import Structure
-from .outputs import observe
+from ..systems.structure import Outputs, Structure
+from .abstract import AbstractSections, BoundSections
+from .families import FamilyLike
 
 
 # A flow that does not arrive at its section gives up so many periods after the cycle itself would
@@ -207,3 +206,22 @@ def _frames(
     along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
     embed = (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2)
     return embed, select
+
+
+def observe(
+    s: Structure, z: Outputs, lanes: Lanes, u: Float[Array, "nu L"]
+) -> Float[Array, "ny L"]:
+    """Outputs of every lane, NaN where its chart does not define them."""
+    L = lanes.t.shape[0]
+
+    def work(a, here, out):
+        point = needed(here, [only(here, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
+        if on_host(here):
+            values = kernels.outputs(s, a, tuple(z.items), *point)[:, 0]
+        else:
+            values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
+        return xp.where(here, values, out)
+
+    xp = namespace(lanes.t)
+    nothing = xp.full((len(z.names), L), xp.nan)
+    return for_each_chart(s, lanes.chart, xp.ones(L, bool), work, nothing)

@@ -6,14 +6,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from ..._core.boundary.checked import checked_methods
-from ..._core.html.multipliers import complex_number
-from ..._core.html.parts import card, table
-from ..._core.html.svg import COLORS, Curve, picture
-from ..._core.memo import remembered
-from ..._core.results import Result
-from ..cycle import LimitCycle
-from ..sweep.limit_cycles import LimitCycles
+from .._core.boundary.checked import checked_methods
+from .._core.html import COLORS, Curve, card, complex_number, picture, table
+from .._core.memo import remembered
+from .._core.results import Result
+from .cycle import LimitCycle
+from .limit_cycles import LimitCycles
 
 
 # A multiplier is shown with a point if its modulus is this near to 1; critical ones are 1 to

@@ -1,0 +1,182 @@
+"""Parts of the HTML that results show in notebooks: cards, tables, multipliers, small pictures.
+
+All texts, names of users among them, are escaped here. Text and axes are drawn in the current color
+on no background, so that both light and dark themes can be read.
+"""
+
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+
+# Rows of a table, and points of a curve, that are shown. More make notebooks large: 12 rows fill
+# half a screen, and a curve of 300 pixels with 120 points looks smooth.
+_ROWS = 12
+_POINTS = 120
+
+_STYLE = (
+    "<style>.hybridjax{font-size:13px;line-height:1.4}"
+    ".hybridjax>div{display:flex;flex-wrap:wrap;gap:4px 24px;align-items:flex-start;"
+    "overflow:auto}"
+    ".hybridjax table{border-collapse:collapse;margin:4px 0;width:auto;"
+    "color:inherit;font-size:inherit}"
+    ".hybridjax th,.hybridjax td{padding:1px 10px 1px 0;border:0;text-align:left;"
+    "white-space:nowrap;background:none;vertical-align:top}"
+    ".hybridjax th{font-weight:normal;opacity:.7}"
+    ".hybridjax td{font-variant-numeric:tabular-nums}"
+    ".hybridjax pre{margin:4px 0;padding:0;background:none;color:inherit;font-size:12px;"
+    "white-space:pre-wrap}"
+    ".hybridjax svg{color:inherit;max-width:100%}</style>"
+)
+# A color of matplotlib that stands for the current color of the page.
+_INK = "#010203"
+
+COLORS = ("#2b8cc4", "#d9692b", "#12a37a", "#c46fa0", "#c99214", "#8c8c8c")
+"""Colors of curves: those of `hj.plot`, light enough for a black page and dark enough for a white
+one."""
+
+
+def card(kind: str, of: str, *parts: str) -> str:
+    """The page of a result: its kind, what it belongs to, and its parts (HTML) side by side."""
+    head = f"<strong>{escape(kind)}</strong> {escape(of)}".rstrip()
+    return f'{_STYLE}<div class="hybridjax">{head}<div>{"".join(parts)}</div></div>'
+
+
+def facts(pairs: Mapping[str, str]) -> str:
+    """A table of values by name."""
+    rows = (f"<tr><th>{escape(x)}</th><td>{escape(text)}</td></tr>" for x, text in pairs.items())
+    return f'<table class="plain">{"".join(rows)}</table>'
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """The first rows of a table, and how many more there are."""
+    rows = list(rows)
+    lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
+    if len(rows) > _ROWS:
+        lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
+    return f'<table class="plain">{"".join(lines)}</table>'
+
+
+def text(lines: str) -> str:
+    """Lines as they would be printed."""
+    return f"<pre>{escape(lines)}</pre>" if lines else ""
+
+
+def _row(cell: str, texts: Sequence[str]) -> str:
+    return f"<tr>{''.join(f'<{cell}>{escape(x)}</{cell}>' for x in texts)}</tr>"
+
+
+def complex_number(z: complex, digits: int = 6) -> str:
+    """A number such as `-0.248983 + 0.699333i`."""
+    if not z.imag:
+        return f"{z.real:.{digits}g}"
+    return f"{z.real:.{digits}g} {'-' if z.imag < 0 else '+'} {abs(z.imag):.{digits}g}i"
+
+
+def multiplier_table(
+    values: Complex[np.ndarray, " d"], half_widths: Float[np.ndarray, "d 2"] | None = None
+) -> str:
+    """The multipliers and their moduli, with the half-widths of the 95 % intervals of their real
+    and imaginary parts if these are given."""
+    if half_widths is None:
+        rows = [(complex_number(z), f"{abs(z):.6g}") for z in values]
+        return table(("multiplier", "modulus"), rows)
+    rows = [
+        (_interval(z.real, a), _interval(z.imag, b) if z.imag else "", f"{abs(z):.4g}")
+        for z, (a, b) in zip(values, half_widths, strict=True)
+    ]
+    return table(("multiplier, 95 % interval", "imaginary part", "modulus"), rows)
+
+
+def _interval(value: float, half_width: float) -> str:
+    """A text such as `-0.24898 ± 0.00012`, with two digits of the half-width."""
+    if not np.isfinite(half_width):
+        return f"{value:.4g} (unknown)"
+    if not half_width:
+        return f"{value:.6g}"
+    digits = int(np.clip(1 - np.floor(np.log10(half_width)), 0, 12))
+    return f"{value:.{digits}f} ± {half_width:.{digits}f}"
+
+
+class Curve(NamedTuple):
+    """A curve of a picture."""
+
+    x: Any
+    y: Any
+    """Broken where x or y is NaN."""
+    name: str = ""
+    color: str = COLORS[0]
+    points: bool = False
+    """Whether it is a set of points and not a line."""
+
+
+def thinned(n: int, share: float = 1.0) -> np.ndarray:
+    """Indices of the samples, of n evenly spaced ones, that are drawn of a curve, or of a part of
+    it that has this share of its points."""
+    few = max(2, int(np.ceil(share * _POINTS)))
+    return np.unique(np.linspace(0, n - 1, min(n, few)).round().astype(int))
+
+
+def unit_circle(
+    values: Complex[np.ndarray, " d"], regions: Sequence[Complex[np.ndarray, " _"]] = ()
+) -> str:
+    """A picture of multipliers, with the borders of their confidence regions."""
+    circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
+    curves = [
+        Curve(circle.real, circle.imag, color=COLORS[-1]),
+        *(Curve(np.clip(z.real, -3, 3), np.clip(z.imag, -3, 3), color=COLORS[0]) for z in regions),
+        Curve(values.real, values.imag, color=COLORS[1], points=True),
+    ]
+    return picture(curves, "real part", "imaginary part", square=True)
+
+
+def picture(
+    curves: Sequence[Curve], x: str = "", y: str = "", *, log: bool = False, square: bool = False
+) -> str:
+    """An SVG of curves on axes called `x` and `y`, or "" where nothing finite can be drawn.
+
+    **Arguments:** `log`: whether the y axis is logarithmic. `square`: whether both axes have one
+    scale.
+    """
+    shown = [np.isfinite(c.x) & np.isfinite(c.y) for c in curves]
+    if log:
+        shown = [k & (np.asarray(c.y) > 0) for k, c in zip(shown, curves, strict=True)]
+    if not any(visible.any() for visible in shown):
+        return ""
+    import matplotlib  # heavy, and needed by notebooks only
+    from matplotlib.figure import Figure
+
+    look = {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"], "font.size": 7}
+    colors = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
+    look |= {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
+    with matplotlib.rc_context(look):
+        figure = Figure(figsize=(3.2, 2.2), layout="constrained")
+        axes = figure.add_subplot(
+            xlabel=x, title=y, aspect="equal" if square else "auto",
+            yscale="log" if log else "linear",
+        )  # fmt: skip
+        axes.title.set(ha="left", x=0, size=7)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.locator_params(axis="x", nbins=5)
+        axes.minorticks_off()
+        if log:
+            axes.yaxis.set_major_formatter("{x:g}")
+        for c, visible in zip(curves, shown, strict=True):
+            k = thinned(len(visible))
+            values = np.where(visible, c.y, np.nan)[k]
+            line = {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
+            color = _INK if c.color == "currentColor" else c.color
+            axes.plot(np.asarray(c.x)[k], values, color=color, label=c.name or None, **line)
+        if any(c.name for c in curves):
+            axes.legend(frameon=False, handlelength=1, labelcolor="linecolor")
+        file = io.StringIO()
+        bare = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(file, format="svg", transparent=True, metadata=bare)
+    svg = file.getvalue()
+    svg = re.sub(r"<style.*?</style>|<!--.*?-->|\n\s*", " ", svg[svg.index("<svg") :], flags=re.S)
+    return svg.replace(_INK, "currentColor")

@@ -1,0 +1,134 @@
+"""The damped descent of all fits: Gauss-Newton steps, shortened as Levenberg and Marquardt do."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+
+Coefficients = Float[np.ndarray, " d"]
+P = TypeVar("P", bound="Point")
+
+# Damping after the first failed step, relative to the squared length of each column. Larger: short
+# steps; smaller: several attempts until a step lowers the cost.
+FIRST_DAMPING = 1e-4
+# Factors of the damping: the smallest after a step that lowers the cost (Nielsen 1999), and the
+# first after a step that fails. Closer to 1: more attempts; farther: steps too long or short.
+_LESS, _MORE = 0.1, 4.0
+# Largest damping: steps are then below 1e-8 of the full one. Larger: attempts below rounding;
+# smaller: descents stop in narrow valleys.
+_MOST_DAMPING = 1e8
+# Expected decrease of the cost, relative to it, at the minimum: coefficients are off by 1e-7 of
+# their standard errors, times the root of the residuals' number. Smaller: steps lost in rounding.
+_SETTLED_GAIN = 1e-14
+# Length of a step relative to 1 + |c| that is rounding (exact data have no other end).
+_SETTLED_STEP = 1e-12
+# If no step lowers the cost: the gain, relative to the cost, that rounding explains. Smaller:
+# minima of exact data count as not converged; larger: stalled descents count as converged.
+_STALLED_GAIN = 1e-6
+
+
+class Point(ABC):
+    """A point of a descent, with the local least-squares problem there."""
+
+    cost: float
+    """The sum of squares; infinite or NaN where it cannot be computed."""
+
+    @abstractmethod
+    def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
+        """Return a step, and the decrease of the cost that the local problem expects of it.
+
+        The squared length of each column of the Jacobian counts 1 + `damping` times.
+        """
+
+    @abstractmethod
+    def moved(self: P, step: Float[np.ndarray, " P"]) -> P:
+        """Return the point after a step; only its `cost` is needed at once."""
+
+    def accepted(self: P) -> P:
+        """Return the point from which the descent goes on, e.g. with new weights."""
+        return self
+
+    @abstractmethod
+    def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
+        """Test whether the undamped step and its expected decrease are too small to matter."""
+
+    @abstractmethod
+    def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
+        """Test whether rounding explains that no part of the undamped step lowers the cost."""
+
+
+def descend(point: P, max_steps: int, damping: float = 0.0) -> tuple[P, bool]:
+    """Descend from a point to a minimum; return the last point and whether it is a minimum.
+
+    **Arguments:** `damping`: of the first step. Default: 0, a full Gauss-Newton step; damping then
+    begins when a step fails.
+    """
+    for _ in range(max_steps):
+        whole = point.step(0.0)
+        if point.settled(*whole):
+            return point, True
+        step, gain = point.step(damping) if damping else whole
+        trial, factor = point.moved(step), _MORE
+        while not trial.cost < point.cost:
+            if damping > _MOST_DAMPING:
+                return point, point.stalled(*whole)
+            damping, factor = max(damping, FIRST_DAMPING) * factor, 2 * factor
+            step, gain = point.step(damping)
+            trial = point.moved(step)
+        damping *= max(_LESS, 1 - (2 * min((point.cost - trial.cost) / gain, 1.0) - 1) ** 3)
+        point = trial.accepted()
+    return point, False
+
+
+class Minimum(NamedTuple):
+    """The end of a descent."""
+
+    coefficients: Coefficients
+    converged: bool
+
+
+def least_squares(
+    linearize: Callable[[Coefficients], tuple[np.ndarray, np.ndarray]],
+    start: Coefficients,
+    max_steps: int,
+    settled_gain: float = 0.0,
+) -> Minimum:
+    """Minimize a sum of squares whose linear unknowns are eliminated.
+
+    **Arguments:** `linearize(c)` returns the residuals (n,) and their Jacobian (n, d).
+    `settled_gain`: a decrease of the sum that does not matter. Default: 0.
+    """
+    point, converged = descend(_Squares(linearize, start, settled_gain), max_steps)
+    return Minimum(point.c, converged)
+
+
+class _Squares(Point):
+    """A point of `least_squares`."""
+
+    def __init__(self, linearize: Callable, c: Coefficients, settled_gain: float):
+        self.c, self._linearize, self._settled_gain = c, linearize, settled_gain
+        with np.errstate(all="ignore"):
+            self.residual, self.jacobian = linearize(c)
+            self.cost = float(self.residual @ self.residual)
+
+    def step(self, damping: float) -> tuple[Coefficients, float]:
+        jacobian, residual = self.jacobian, self.residual
+        if damping:
+            size = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
+            jacobian = np.concatenate([jacobian, np.diag(size)])
+            residual = np.concatenate([residual, np.zeros(len(size))])
+        step = np.linalg.lstsq(jacobian, -residual)[0]
+        return step, float(((jacobian @ step) ** 2).sum())
+
+    def moved(self, step: Coefficients) -> "_Squares":
+        return _Squares(self._linearize, self.c + step, self._settled_gain)
+
+    def settled(self, step: Coefficients, gain: float) -> bool:
+        small = np.linalg.norm(step) <= _SETTLED_STEP * (1 + np.linalg.norm(self.c))
+        return bool(gain <= max(_SETTLED_GAIN * self.cost, self._settled_gain) or small)
+
+    def stalled(self, step: Coefficients, gain: float) -> bool:
+        return bool(gain <= _STALLED_GAIN * self.cost)

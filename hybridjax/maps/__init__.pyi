@@ -1,2 +1,0 @@
-from .placed import SectionsLike as SectionsLike
-from .section_map import Arrival as Arrival, SectionMap as SectionMap
