@@ -2,5 +2,5 @@
 
 In each iteration every lane takes aim (`aim.py`), attempts a step and lands on the zero that it
 aims at (`attempt.py`, `locate.py`); the step is accepted or rejected (`accept.py`), and events
-happen (`outcome.py`). `search.py` is the loop, `state.py` its state, `first_step.py` the first step.
+happen (`outcome.py`). `search.py` is the loop, `state.py` its state, `first_step.py` sets out.
 """
