@@ -184,18 +184,18 @@ class _ByMethod(NamedTuple):
 
 
 def _step(method: Method, field: Callable, t, q, u, h):
-    return jnp.stack(take_step(method, lambda t, q: field(t, q, u), t, q, h))
+    return jnp.stack(take_step(method, lambda t, q: field(t, q, u, h), t, q, h))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
-    at_input = lambda t, q: field(t, q, u)  # noqa: E731
+    at_input = lambda t, q: field(t, q, u, h, along)  # noqa: E731
     end = lambda q: take_step(method, at_input, t, q, h, still=at_input)  # noqa: E731
     value, tangent = jax.jvp(end, (q,), (along,))
     return jnp.stack([*value, tangent.q, tangent.error])
 
 
 def _divergence(method: Method, field: Callable, t, q, u, h):
-    return integrated_divergence(method, lambda t, q: field(t, q, u), t, q, h)
+    return integrated_divergence(method, lambda t, q: field(t, q, u, h), t, q, h)
 
 
 def _linear_step(method: Method, field: Callable, t, q, u, h):
@@ -203,8 +203,9 @@ def _linear_step(method: Method, field: Callable, t, q, u, h):
     and h, as columns of one array."""
 
     def end(t, q, u, h):
-        still = lambda t, q: field(t, q, jax.lax.stop_gradient(u))  # noqa: E731
-        step = take_step(method, lambda t, q: field(t, q, u), t, q, h, still=still)
+        fixed = jax.lax.stop_gradient((u, h))
+        still = lambda t, q: field(t, q, *fixed)  # noqa: E731
+        step = take_step(method, lambda t, q: field(t, q, u, h), t, q, h, still=still)
         return step.q, step.f1
 
     n, L = q.shape
