@@ -139,7 +139,9 @@ def of_row(x: Array, which: Index) -> Times:
     return pick(x, range(len(x)), which)
 
 
-def _crossing(some: Mask, seen: Watch, end: Watch, moved: Times, ready: Mask) -> CubicCrossing:
+def _crossing(
+    some: Mask, seen: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
+) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
     xp = namespace(ready)
 

@@ -1,12 +1,12 @@
 """One step of every lane, before it is accepted: its end, and how far it can be trusted."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ..._core.executor import cond, namespace, put
+from ..._core.executor import Array, cond, namespace, put
 from ..._core.lanes.rows import take_rows
 from ...systems.structure import Structure
-from ..arrays import AnyTimes, Mask, Padded, States, Times
+from ..arrays import AnyTimes, Mask, Padded, States
 from ..cubic import NEAR, control_points
 from ..events import width
 from ..lanes import Lanes, for_each_chart, only
@@ -16,6 +16,8 @@ from ..watch import ChartFlow, Watch, chart_flow, no_events, write
 from .locate import Landing, land
 from .state import Aim, Attempt, State, Task
 
+
+Flags = Bool[Array, "W L"]
 
 # A crossing slower than this part of the function's rate elsewhere in the step is a grazing.
 # Higher: crossings whose times are right to five digits are called grazing. Lower: derivatives of
@@ -91,7 +93,7 @@ def attempt(
 
 def _step(
     flow: ChartFlow,
-    present: Mask,
+    present: Bool[Array, ""],
     t: AnyTimes,
     q: States,
     tau: AnyTimes,
@@ -127,8 +129,16 @@ def _step(
 
 
 def _errors(
-    flow: ChartFlow, present: Mask, t, q: States, tau, step: Step, change, along, task: Task
-) -> tuple[States, Times]:
+    flow: ChartFlow,
+    present: Bool[Array, ""],
+    t,
+    q: States,
+    tau,
+    step: Step,
+    change,
+    along,
+    task: Task,
+) -> tuple[States, AnyTimes]:
     """The error that a step may have, and its error relative to that, with that of a derivative:
     a state at rest has no error of its own."""
     xp, settings, a = namespace(q), task.settings, flow.a
@@ -173,9 +183,9 @@ def _bent(
 
 
 def _clearance(
-    before: Watch, after: Watch, moved: Times, armed: Mask, chosen: Mask
-) -> tuple[Mask, Mask]:
-    """Which watched functions stay away from zero, as far as their interpolants are certain; and
+    before: Watch, after: Watch, moved: AnyTimes, armed: Flags, chosen: Flags
+) -> tuple[Flags, Mask]:
+    """Whether watched functions stay away from zero, as far as their interpolants are certain; and
     lanes that land on a `chosen` zero at a vanishing speed."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate
