@@ -18,6 +18,7 @@ from .state import Aim, Attempt, State, Task
 
 
 Flags = Bool[Array, "W L"]
+Present = Bool[Array, ""]
 
 # A crossing slower than this part of the function's rate elsewhere in the step is a grazing.
 # Higher: crossings whose times are right to five digits are called grazing. Lower: derivatives of
@@ -93,7 +94,7 @@ def attempt(
 
 def _step(
     flow: ChartFlow,
-    present: Bool[Array, ""],
+    present: Present,
     t: AnyTimes,
     q: States,
     tau: AnyTimes,
@@ -130,7 +131,7 @@ def _step(
 
 def _errors(
     flow: ChartFlow,
-    present: Bool[Array, ""],
+    present: Present,
     t,
     q: States,
     tau,
