@@ -12,7 +12,7 @@ import numpy as np
 from beartype import beartype
 
 import hybridjax as hj
-from hybridjax._core.boundary.arrays import Reals
+from hybridjax._core.boundary.values import Reals
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.kinds import Count, Index, Numbers, Order, Positive, SignalNames
 

@@ -15,10 +15,10 @@ from . import (
     sections as sections,
     testing as testing,
 )
-from ._core.compilation.compilation_cache import (
+from ._core.compilation import (
     enable_compilation_cache as enable_compilation_cache,
+    enable_loop_kernels as enable_loop_kernels,
 )
-from ._core.compilation.loop_kernels import enable_loop_kernels as enable_loop_kernels
 from ._core.execution import Execution as Execution
 from ._core.precision import enable_x64 as enable_x64
 from ._core.progress import enable_progress as enable_progress

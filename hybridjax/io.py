@@ -10,10 +10,10 @@ import os
 import typing
 from pathlib import Path
 
+from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
-from ._core.files.archive import read_module, write_module
+from ._core.executor import is_traced
 from ._core.precision import require_x64
-from ._core.tracing import is_traced
 from .errors import DefinitionError
 from .experiments.data import ExperimentData
 from .experiments.design.design import Design

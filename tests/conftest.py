@@ -27,7 +27,15 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compile, stored
+from hybridjax._core import compilation
+
+
+def pytest_xdist_auto_num_workers(config):
+    """A single process for a part of the tests: starting others takes longer than the tests."""
+    if config.args != config.getini("testpaths"):
+        config.option.dist = "no"
+        return 0
+    return None
 
 
 hj.enable_x64()
@@ -57,10 +65,9 @@ def unchecked_host():
         jaxtyping.config.update("jaxtyping_disable", False)
 
 
-compile.at_ease = unchecked_host
+compilation.at_ease = unchecked_host
 # Results of one test come from one program.
-stored._WORTH_A_PROCESS = np.inf
-stored.ONE_PROGRAM = False
+compilation._WORTH_OPTIMIZING = np.inf
 
 
 # Programs that a worker keeps, of some 5 MB each. Doubled: twice the memory.
@@ -89,8 +96,8 @@ class no_compilation:
     """A context in which nothing may be compiled, also not since the host has done it so often."""
 
     def __enter__(self):
-        self.count, self.patience = 0, compile._WORTH_COMPILING
-        compile._WORTH_COMPILING = np.inf
+        self.count, self.patience = 0, compilation._WORTH_COMPILING
+        compilation._WORTH_COMPILING = np.inf
         jax.monitoring.register_event_duration_secs_listener(self.listen)
 
     def listen(self, event, duration, **_):
@@ -98,7 +105,7 @@ class no_compilation:
 
     def __exit__(self, *_):
         jax.monitoring.unregister_event_duration_listener(self.listen)
-        compile._WORTH_COMPILING = self.patience
+        compilation._WORTH_COMPILING = self.patience
         assert not self.count, f"{self.count} programs were compiled"
 
 

@@ -153,16 +153,16 @@ UNCHECKED = {
     "made by this package": {
         "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
-        "InformationMap", "Inspection",
+        "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
         "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
-        "NaturalMultipliers", "OptimalDesign", "OutputLevels", "ParameterGuesses", "Phase",
+        "NaturalMultipliers", "OutputLevels", "ParameterGuesses", "Phase",
         "PhaseResponse",
-        "PlacedSections", "Plan", "Plot", "RandomInput",
+        "PlacedSections", "Plan", "Plot",
         "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",
-        "Winding", "WindowChoice",
+        "Winding",
     },
 }  # fmt: skip
 

@@ -1,6 +1,8 @@
 """Numbers and names, as users give them, and whether things belong together."""
 
+import importlib
 from collections.abc import Iterable, Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy.typing as npt
@@ -36,3 +38,22 @@ def require_same(
             raise DefinitionError(
                 f"{what} have different {name}: {getattr(a, name)} and {getattr(b, name)}."
             )
+
+
+def package(name: str) -> ModuleType:
+    """A library.
+
+    **Raises:** `DefinitionError` if it is not installed; extras are called like the libraries.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        extra = _EXTRAS.get(name, name)
+        raise DefinitionError(
+            f"this needs the package {name}, which is not installed: "
+            f"`pip install 'hybridjax[{extra}]'`."
+        ) from error
+
+
+# The extra of a library that is not called like it.
+_EXTRAS = {"pandas": "tables", "distributed": "scale", "zarr": "scale"}

@@ -141,3 +141,26 @@ def stop_gradient(x: Array) -> Array:
 
 def _is_definition(x: Any) -> bool:
     return isinstance(x, Definition)
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether some leaf of `trees` is a tracer, so that its value cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(trees))
+
+
+def is_inside_program() -> bool:
+    """Whether JAX is tracing a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
+    computed then becomes part of it, even a constant."""
+    return is_traced(_constant())
+
+
+@jax.jit
+def _constant():
+    return 0.0
+
+
+def on_cpu() -> bool:
+    """Whether that is the CPU: as JAX's default, or because `jax.default_device` says so."""
+    device = jax.config.jax_default_device  # a device, the name of a platform, or None
+    platform = getattr(device, "platform", device)
+    return (platform or jax.default_backend()) == "cpu"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import PrecisionError
-from .tracing import is_inside_program
+from .executor import is_inside_program
 
 
 def enable_x64() -> None:

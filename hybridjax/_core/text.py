@@ -9,8 +9,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .executor import is_traced
 from .signal import unit_of, with_unit
-from .tracing import is_traced
 
 
 # A module stands on one line if it is no wider than that, else each field on a line of its own.

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 
 from .. import __version__
 from .._core import limits
-from .._core.files.figure_formats import Format
+from .._core.writing import Format
 
 
 # Sizes of the paper's protocol, and of its short form.
@@ -271,7 +271,7 @@ def _begin(*, cache: bool) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from .._core.compilation.compilation_cache import enable_compilation_cache
+    from .._core.compilation import enable_compilation_cache
     from .._core.precision import enable_x64
 
     enable_x64()

@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib import pyplot
 
 from .. import plot
-from .._core.files.figure_formats import Format
+from .._core.writing import Format
 from ..engine.trajectory import Trajectory
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections

@@ -14,8 +14,7 @@ import numpy as np
 
 from .. import __version__, plot
 from .._core.boundary.checked import checked
-from .._core.files.figure_formats import Format
-from .._core.files.results_folder import results_folder
+from .._core.writing import Format, results_folder
 from ..io import save
 from ..linear.htf import HTF
 from ..plot import look

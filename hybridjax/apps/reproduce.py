@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import __version__
-from .._core.compilation.compilation_cache import enable_compilation_cache
-from .._core.files.figure_formats import Format
-from .._core.files.results_folder import results_folder
+from .._core.compilation import enable_compilation_cache
 from .._core.precision import enable_x64
+from .._core.writing import Format, results_folder
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..errors import ComputationError, DefinitionError

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from .._core.packages import package
+from .._core.arguments import package
 from ..errors import DefinitionError
 from ..plot.look import save
 from ..plot.over_parameters import sweep as plot_sweep

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._core.packages import package
+from .._core.arguments import package
 from ..orbits.branch import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..systems.system import unit_of_parameter

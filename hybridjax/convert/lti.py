@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.packages import package
+from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
-from .._core.tracing import is_traced
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 

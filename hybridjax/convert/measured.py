@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._core.packages import package
+from .._core.arguments import package
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record

@@ -14,8 +14,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._core.files.archive import put_together, restored, signals_in, taken_apart
-from .._core.packages import package
+from .._core.archive import put_together, restored, signals_in, taken_apart
+from .._core.arguments import package
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
 from ..linear.ldtp import LDTP

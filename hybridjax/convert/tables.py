@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from .._core.arguments import package
 from .._core.boundary.checked import checked
-from .._core.packages import package
 from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
 from ..identify.rational.fit import RationalFit
 from ..linear.htf import HTF

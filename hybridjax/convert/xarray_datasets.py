@@ -4,8 +4,8 @@ import json
 from typing import Any
 
 from .._core.boundary.checked import checked
+from .._core.executor import is_traced
 from .._core.precision import require_x64
-from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from ..io import KINDS, Saved
 from ..orbits.branch import Branch

@@ -1,59 +1,61 @@
-"""A system in words and digests, by which stored results are known again."""
+"""The description of a system, by words and digests, that stored results carry."""
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from .._core.compilation.fingerprint import IndescribableError
+from .._core.fingerprint import IndescribableError, program_digest
 from .._core.pieces.description import array_digest, digest_of
+from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from ..systems.transition import Scheduled
-from .closed import close
 
 
 def describe(system: HybridSystem) -> dict[str, Any]:
     """The class of a system, its numbers, and a digest of each of its functions.
 
-    Of functions of which there is no digest (see `_core/compilation/fingerprint.py`), the source of
-    the class stands for all.
+    If a function calls back into Python, the source of the class stands for all functions.
     """
-    return {
-        "class": type(system).__qualname__,
-        "numbers": _numbers(system),
-        "functions": _functions(system),
-    }
-
-
-def _numbers(system: HybridSystem) -> dict[str, Any]:
-    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_array))[0]
-    return {
-        ".".join(str(getattr(x, "name", x)) for x in path): float(leaf)
-        if np.ndim(leaf) == 0
-        else array_digest(leaf)
-        for path, leaf in leaves
-    }
+    numbers = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+        name = ".".join(str(getattr(x, "name", x)) for x in path)
+        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else array_digest(leaf)
+    functions = _functions(system)
+    return {"class": type(system).__qualname__, "numbers": numbers, "functions": functions}
 
 
 def _functions(system: HybridSystem) -> dict[str, str]:
+    arrays, static = eqx.partition(Structure(system), eqx.is_array)
+    s, real = eqx.combine(arrays, static), jnp.result_type(float)
+
+    def digest(a: int, function: Callable) -> str:
+        """A digest of `function(structure, t, q, u)` at a point of chart a."""
+        shapes = [jax.ShapeDtypeStruct(x, real) for x in ((), (s.dims[a],), (s.nu,))]
+        run = lambda arrays, *point: function(eqx.combine(arrays, static), *point)  # noqa: E731
+        return program_digest(run, arrays, *shapes)
+
+    digests = {}
     try:
-        closed = close(system, (), None)[0]
+        for a, name in enumerate(s.names):
+            digests[f"field of {name}"] = digest(a, lambda s, *x, a=a: s.field(a, *x))
+        for g, x in enumerate(s.transitions):
+            kinds = ["reset"] if x.enabled is None else ["reset", "enabled"]
+            if isinstance(x.guard, Scheduled):
+                digests[f"schedule of {x.name}"] = digest_of(repr(x.guard))
+            else:
+                kinds.append("guard")
+            for kind in kinds:
+                run = lambda s, *point, g=g, kind=kind: getattr(s, kind)(g, *point)  # noqa: E731
+                digests[f"{kind} of {x.name}"] = digest(s.chart_index(x.source), run)
     except IndescribableError:
         try:
             return {"source": digest_of(inspect.getsource(type(system)))}
         except OSError:
             return {}
-    found = {f"field of {x.name}": x.field.digest for x in closed.closed.charts}
-    for x, schedule in zip(closed.closed.events, closed.schedules, strict=True):
-        programs = {"guard": x.guard, "reset": x.reset, "enabled": x.enabled}
-        for name, program in programs.items():
-            if program is not None:
-                found[f"{name} of {x.name}"] = program.digest
-        if isinstance(schedule, Scheduled):
-            found[f"schedule of {x.name}"] = digest_of(repr(schedule))
-    for x in closed.closed.outputs:
-        found |= {f"output {x.name} in {chart}": p.digest for chart, p in x.functions}
     period = system.period()
-    return found | {"period": "" if period is None else digest_of(repr(float(period)))}
+    return digests | {"period": "" if period is None else digest_of(repr(float(period)))}

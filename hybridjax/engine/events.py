@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import Array, cond, namespace, on_host, put, stop_gradient
-from .._core.lanes.rows import put_rows
+from .._core.lanes import put_rows
 from .._core.precision import at_precision
 from ..systems.kinds import Kind, Member
 from ..systems.structure import Structure, stacked

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from .._core.executor import Array, namespace, on_host
-from .._core.lanes.vmap_as_lanes import vmap_to_lanes
+from .._core.lanes import vmap_to_lanes
 from ..systems.structure import Structure
 from .arrays import Index, Times
 from .chain import chain

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.lanes.per_lane import by_lane
+from .._core.lanes import by_lane
 from ..systems.kinds import Kind, Member
 from ..systems.output import Output
 from ..systems.solver import Method, Radau, as_method

@@ -5,9 +5,7 @@ import jax
 from jaxtyping import Bool
 
 from .._core.executor import Array, namespace, on_host
-from .._core.lanes.lane_jvp import lane_jvp
-from .._core.lanes.per_lane import shared
-from .._core.lanes.vmap_as_lanes import vmap_to_lanes
+from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Index, Inputs, Times

@@ -8,9 +8,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
+from .._core.boundary.values import Reals
 from .._core.executor import Array, namespace
 from .._core.precision import at_precision, real
 from .._core.text import fields

@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Float, Int
 
 from .._core.executor import Array, Definition, namespace, stop_gradient
-from .._core.lanes.per_lane import PerLane
+from .._core.lanes import PerLane
 from .._core.results import Result
 from ..systems.structure import Structure
 

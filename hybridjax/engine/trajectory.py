@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
-from .._core.compilation.compile import host_first
+from .._core.boundary.values import Reals
+from .._core.compilation import host_first
 from .._core.executor import namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.executor import Array, namespace, on_host, put
-from .._core.lanes.per_lane import shared
-from .._core.lanes.rows import pick, put_rows
+from .._core.lanes import pick, put_rows, shared
 from ..systems.solver import Method
 from ..systems.structure import Structure, stacked
 from . import kernels

@@ -8,10 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.device import on_cpu
-from .._core.execution import Execution
+from .._core.execution import Execution, in_threads
+from .._core.executor import on_cpu
 from .._core.precision import single, single_precision
-from .._core.threads import in_threads
 
 
 # Experiments of one compiled call: on CPU, where fewer share the cost of what is done once for all

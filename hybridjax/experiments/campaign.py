@@ -1,6 +1,5 @@
 """Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
 
-import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -9,8 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._core.compilation.fingerprint import IndescribableError
-from .._core.compilation.stored import Stored
+from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import Memory
@@ -28,7 +26,7 @@ from .batches import divide, in_batches, precision_of
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD
 from .events import EventList, EventTimes, in_order
-from .flow_batch import Course, IntervalEvents, closed, course, flow_batch
+from .flow_batch import Course, IntervalEvents, course, flow_batch
 from .inputs import DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
 from .options import Options, StartName
@@ -67,7 +65,7 @@ class Campaign:
     start: Start
     process_noise: ProcessNoise | None
     stepping: Stepping
-    program: Stored
+    program: TwoTiers
     record_events: bool
     execution: Execution
 
@@ -192,7 +190,7 @@ class Campaign:
         u = np.zeros((1, N, len(placed.cycle.system.inputs)))
         capacity = max(len(placed.cycle.event_sequence), 1)
         own = dataclasses.replace(self.course, outputs=())
-        return Stored(flow_batch, large=False)(
+        return TwoTiers(flow_batch, large=False)(
             own, stepping.plan, *from_host((start, u)), stepping.settings, capacity
         ).log
 
@@ -277,9 +275,9 @@ def _compose(
     if start == "steady":
         assert isinstance(begin, PeriodicStart)
         aside = dataclasses.replace(own, outputs=())
-        begin = SteadyStart(begin, aside, stepping, execution, Stored(settle_batch, large))
+        begin = SteadyStart(begin, aside, stepping, execution, TwoTiers(settle_batch, large))
     return Campaign(
-        placed, own, z, inputs, begin, process_noise, stepping, Stored(flow_batch, large),
+        placed, own, z, inputs, begin, process_noise, stepping, TwoTiers(flow_batch, large),
         record_events, execution,
     )  # fmt: skip
 
@@ -324,14 +322,10 @@ def _resolved(placed: PlacedSections, outputs: Sequence[str | Output]) -> Output
 
 
 def _course(placed: PlacedSections, outputs: Outputs, execution: Execution) -> Course:
-    """The course in the precision that is asked for; closed, if that is possible; once for the
-    same sections and outputs."""
+    """The course in the precision that is asked for, once for the same sections and outputs."""
 
     def make():
         with precision_of(execution) as convert:
-            own = convert(course(placed, outputs.items))
-            with contextlib.suppress(IndescribableError):
-                own = closed(own)
-            return own, outputs
+            return convert(course(placed, outputs.items)), outputs
 
     return _courses.recall(placed, (id(outputs), execution.precision), make)[0]

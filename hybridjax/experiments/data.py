@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.arguments import Numbers, names
-from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
+from .._core.boundary.values import Integers, Reals
 from .._core.html import COLORS, Curve, card, facts, picture, table
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit

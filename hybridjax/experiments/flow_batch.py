@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
-from ..engine.closed import close
 from ..engine.lanes import Lanes
 from ..engine.move import Moved, glide
 from ..engine.settings import Settings
@@ -77,17 +76,6 @@ def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
     return Course(
         cycle.system, tuple(outputs), placed.bound, placed.lanes, cycle.period, cycle.event_sequence
     )
-
-
-def closed(course: Course) -> Course:
-    """The course without users' functions, of which programs remain (see `engine/closed.py`).
-
-    **Raises:** `IndescribableError`.
-    """
-    system, levels = close(course.system, course.outputs, course.bound.levels)
-    names = tuple(x.name for x in system.outputs())
-    bound = dataclasses.replace(course.bound, levels=levels)
-    return dataclasses.replace(course, system=system, outputs=names, bound=bound)
 
 
 def flow_batch(

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from .._core.boundary.arrays import Reals
+from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 from .design.design import Design
 

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, NonNegative, SectionCount, Seed
+from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 
 

@@ -5,9 +5,9 @@ from typing import Annotated
 import equinox as eqx
 import numpy as np
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NonNegative, Numbers, Seed
+from .._core.boundary.values import Reals
 from .._core.results import Result
 from ..errors import DefinitionError
 from .data import ExperimentData, Simulated

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers, names
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
+from .._core.boundary.containers import Stream
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
-from .._core.boundary.scalars import Number
-from .._core.boundary.stream import Stream
+from .._core.boundary.values import Number, Reals
 from .._core.text import listed
 from ..errors import DefinitionError
 

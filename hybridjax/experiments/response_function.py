@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
+from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.text import listed
 from ..engine.settings import EXPERIMENT

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, Positive
+from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from ..engine.settings import STEADY_START, Settings
 from ..errors import DefinitionError

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar
+from .._core.boundary.values import Reals
 from .._core.text import fields, listed, value
 from ..engine.settings import Settings
 from ..errors import DefinitionError

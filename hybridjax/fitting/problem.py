@@ -9,7 +9,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..orbits.cycle import LimitCycle
 from .candidate import candidate_cycle

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.boundary.kinds import Scalar, Vector
-from .._core.compilation.compile import host_first
+from .._core.compilation import host_first
 from .._core.executor import Array, namespace, scan
 from ..errors import DefinitionError
 from .time_response import monodromy

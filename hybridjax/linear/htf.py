@@ -8,15 +8,14 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from .._core.arguments import Numbers, names, require_same
-from .._core.boundary.arrays import Complexes, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NewNames, Probability, SectionCount, Vector
-from .._core.executor import from_host
+from .._core.boundary.values import Complexes, Reals
+from .._core.executor import from_host, is_traced
 from .._core.html import COLORS, Curve, card, picture, table
 from .._core.precision import require_x64
 from .._core.signal import ratio, with_unit
 from .._core.text import listed
-from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .frequency_response import Frequencies, Harmonics, check_harmonics
 

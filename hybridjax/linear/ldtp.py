@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core.arguments import Numbers, names
-from .._core.boundary.arrays import Integers, Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, NewNames, NonNegative, PeriodCount, Vector
-from .._core.executor import from_host
+from .._core.boundary.values import Integers, Reals
+from .._core.executor import from_host, is_traced
 from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.text import listed
-from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from . import time_response
 from .frequency_response import Frequencies, Harmonics, check_harmonics, harmonic_transfer

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation.compile import host_first
+from .._core.compilation import host_first
 from .._core.executor import Array, namespace, on_host, scan
 
 

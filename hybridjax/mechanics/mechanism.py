@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.vector_math.small_matrices import solve_positive
+from .._core.vector_math.factorizations import solve_positive
 from ..systems.structure import as_vector
 
 

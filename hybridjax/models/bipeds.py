@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.vector_math.small_matrices import solve_positive
+from .._core.vector_math.factorizations import solve_positive
 from ..mechanics.mechanism import Mechanism
 from ..systems.chart import Chart
 from ..systems.output import Output

@@ -11,12 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from .._core.compilation.compile import quick_jit
-from .._core.compilation.garbage_collector import uncollected
-from .._core.compilation.lapack import is_left_to_lapack
+from .._core.compilation import is_left_to_lapack, quick_jit, uncollected
+from .._core.execution import in_threads
 from .._core.progress import working
 from .._core.results import Result
-from .._core.threads import in_threads
 from ..engine.lanes import Lanes
 from ..engine.move import move
 from ..engine.settings import TRANSIENT, Settings

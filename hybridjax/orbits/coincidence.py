@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation.compile import at_ease, host_first
+from .._core.compilation import at_ease, host_first
 from .._core.executor import namespace, to_host
 from .._core.results import Result
 from ..engine import kernels

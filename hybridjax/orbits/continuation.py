@@ -11,13 +11,13 @@ import jax
 import numpy as np
 from scipy.optimize import brentq
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Numbers, Share
+from .._core.boundary.values import Reals
+from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.results import Result
-from .._core.tracing import is_traced
 from ..errors import DefinitionError
 from .batches import front
 from .branch import KINDS, Branch, BranchEnd, BranchPoint

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..errors import DefinitionError

@@ -8,13 +8,12 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Positive
-from .._core.executor import to_host
+from .._core.executor import is_traced, to_host
 from .._core.html import COLORS, Curve, card, facts, multiplier_table, picture, thinned, unit_circle
 from .._core.memo import remembered
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
-from .._core.tracing import is_traced
 from ..engine.lanes import Lanes
 from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate

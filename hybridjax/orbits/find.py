@@ -9,11 +9,10 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.executor import to_host
+from .._core.executor import is_traced, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result
-from .._core.tracing import is_traced
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system

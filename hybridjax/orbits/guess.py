@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.compilation.compile import host_first
+from .._core.compilation import host_first
 from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
 from .._core.progress import say

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation.compile import host_first, quick_jit
+from .._core.compilation import host_first, quick_jit
 from .._core.executor import Array, on_host
 from ..engine.lanes import Lanes
 from .return_map import SINGULAR, ReturnMap, Turn

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from .._core.compilation.compile import at_ease
+from .._core.compilation import at_ease
 from .._core.executor import to_host
 from ..engine.chain import Link, divergence, links
 from ..engine.move import record

@@ -15,10 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._core.boundary.checked import checked
-from .._core.boundary.scalars import Whole
-from .._core.files.figure_formats import Format
-from .._core.files.writing import replacing
+from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
+from .._core.writing import Format, replacing
 from ..errors import DefinitionError
 
 

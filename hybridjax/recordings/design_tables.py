@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Positive, SectionCount
-from .._core.files.writing import replacing
+from .._core.boundary.values import Reals
+from .._core.writing import replacing
 from ..errors import DefinitionError, FileFormatError
 from ..experiments.design.design import Design
 from .formats.columns import Wanted

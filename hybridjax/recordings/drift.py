@@ -7,7 +7,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from ..errors import DefinitionError
 from .phase.winding import Phase
 from .recording import Recording, Trial

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.series_fit import SeriesFit

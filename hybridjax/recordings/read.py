@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .._core.archive import read_arrays
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.files.npz import read_arrays
 from ..errors import DefinitionError, FileFormatError
 from .formats.arrow import read_arrow
 from .formats.bag import read_bag

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solveh_banded
 
-from .._core.boundary.scalars import Number
+from .._core.boundary.values import Number
 from ..errors import DefinitionError
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.compilation.fingerprint import IndescribableError, digest
+from .._core.fingerprint import IndescribableError, program_digest
 from .._core.pieces.description import digest_of, function_digest
 from .._core.precision import require_x64
 from ..engine.describe import describe
@@ -90,7 +90,7 @@ class Family:
 
         try:
             given = {name: jnp.asarray(x) for name, x in values.items()}
-            return digest_of(digest(jax.make_jaxpr(numbers)(given)))
+            return digest_of(program_digest(numbers, given))
         except IndescribableError:
             return function_digest(self.model)
 

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from scipy.stats import qmc
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
+from .._core.boundary.values import Reals
 from .._core.pieces.layout import Constant
 from ..errors import DefinitionError
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, Scalar, SectionCount
+from .._core.boundary.values import Reals
 from .._core.precision import real
 from ..engine.target import AbstractLevels
 from ..errors import DefinitionError

@@ -7,12 +7,11 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.compilation.compile import at_ease, host_first
-from .._core.executor import Array, namespace, on_host, to_host
-from .._core.lanes.per_lane import by_lane
+from .._core.compilation import at_ease, host_first
+from .._core.executor import Array, is_inside_program, is_traced, namespace, on_host, to_host
+from .._core.lanes import by_lane
 from .._core.progress import working
 from .._core.results import Result
-from .._core.tracing import is_inside_program, is_traced
 from ..engine import kernels
 from ..engine.jacobian import tape_jacobian
 from ..engine.lanes import for_each_chart, only

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation.compile import at_ease, host_first, quick_jit
-from .._core.executor import Array, namespace, on_host, put, scan, stop_gradient, to_host
-from .._core.lanes.per_lane import by_lane
+from .._core.compilation import at_ease, host_first, quick_jit
+from .._core.executor import Array, is_traced, namespace, on_host, put, scan, stop_gradient, to_host
+from .._core.lanes import by_lane
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.tracing import is_traced
 from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import Lanes, for_each_chart, only

@@ -6,13 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
-from .._core.compilation.compile import host_first
-from .._core.executor import Array, namespace, on_host, to_host
+from .._core.compilation import host_first
+from .._core.executor import Array, is_traced, namespace, on_host, to_host
 from .._core.html import card, facts
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import number
-from .._core.tracing import is_traced
 from ..engine import kernels
 from ..engine.lanes import Lanes, for_each_chart, needed, only
 from ..engine.tape import Tape

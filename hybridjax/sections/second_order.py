@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.compilation.compile import quick_jit
+from .._core.compilation import quick_jit
 from .._core.executor import from_host, to_host
 from ..engine.replay import replay
 from ..linear.time_response import monodromy, periodic_states

@@ -6,14 +6,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
-from .._core.compilation.compile import host_first
-from .._core.executor import namespace, put
+from .._core.boundary.values import Reals
+from .._core.compilation import host_first
+from .._core.executor import is_traced, namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
-from .._core.tracing import is_traced
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle

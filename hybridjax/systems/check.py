@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.tracing import is_traced
+from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .quotient import Quotient
 from .solver import ByChart

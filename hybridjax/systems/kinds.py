@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from .._core.compilation.fingerprint import jaxprs
 from .._core.executor import Array
+from .._core.vector_math.rewrite import jaxprs
 from .transition import Scheduled, Transition
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import SignalNames
-from .._core.tracing import is_traced
+from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from .._core.compilation.kernel import kernel
+from .._core.compilation import kernel
 from .._core.executor import Array
-from .._core.lanes.per_lane import PerLane, by_lane, one_lane, shared
+from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError

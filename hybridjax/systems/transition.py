@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers
+from .._core.boundary.values import Reals
 from .._core.executor import Array, namespace
 from .._core.precision import real
 from .._core.text import fields

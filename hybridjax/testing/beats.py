@@ -6,9 +6,9 @@ from typing import Annotated
 import numpy as np
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import NonNegative, Positive, Seed
+from .._core.boundary.values import Reals
 from ..errors import DefinitionError
 from ..recordings.recording import Recording
 

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import Numbers
-from .._core.boundary.arrays import Reals
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
+from .._core.boundary.values import Reals
 from .._core.limits import SECTIONS
 from .._core.signal import unit_of
 from ..engine.settings import EXPERIMENT

@@ -16,13 +16,10 @@ import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
-from hybridjax._core.boundary.annotations import kind_of
-from hybridjax._core.boundary.arrays import Complexes, Integers, Reals
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.containers import Names
-from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames
-from hybridjax._core.boundary.misfit import Misfit
-from hybridjax._core.boundary.scalars import Number
+from hybridjax._core.boundary.kinds import Count, Numbers, Positive, Scalar, SignalNames, kind_of
+from hybridjax._core.boundary.values import Complexes, Integers, Misfit, Number, Reals
 
 
 NAN, INF = float("nan"), float("inf")

@@ -95,7 +95,7 @@ def test_users_say_where_it_is_shown(capsys, monkeypatch, shown):
 
 
 def test_programs_are_said_to_be_compiled_while_they_are():
-    from hybridjax._core.compilation.compile import quick_jit
+    from hybridjax._core.compilation import quick_jit
 
     seen = []
     with progress.working("call") as call:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.lanes.per_lane import by_lane
+from hybridjax._core.lanes import by_lane
 from hybridjax._core.vector_math.rewrite import vectorized
 
 

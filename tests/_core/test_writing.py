@@ -8,8 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import hybridjax as hj
-from hybridjax._core.files.results_folder import results_folder
-from hybridjax._core.files.writing import made_folder, replacing
+from hybridjax._core.writing import made_folder, replacing, results_folder
 
 
 LIST = ".hybridjax-report.json"

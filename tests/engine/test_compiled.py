@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 import hybridjax as hj
-from hybridjax._core.compilation import compile
+from hybridjax._core import compilation
 
 from ..conftest import APEX, OUTPUTS
 
@@ -42,7 +42,7 @@ def compiled():
 
 def test_no_operation_outside_of_programs_compiles_one(monkeypatch):
     # (However much the host has done in tests before.)
-    monkeypatch.setattr(compile, "_WORTH_COMPILING", np.inf)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", np.inf)
     u = np.full((EXPERIMENTS, PERIODS * SECTIONS, 1), 1e-3)
     with compiled() as names:
         cycle = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))

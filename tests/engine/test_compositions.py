@@ -14,7 +14,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import compiler_options
+from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
 
 from ..conftest import APEX

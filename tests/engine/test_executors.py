@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compile
-from hybridjax._core.compilation.compile import quick_jit
+from hybridjax._core import compilation
+from hybridjax._core.compilation import quick_jit
 from hybridjax._core.executor import from_host, on_host, to_host
 from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import record
@@ -88,13 +88,13 @@ def test_both_agree_on_random_systems(name):
 @pytest.fixture(scope="module")
 def compiled(hopper_cycle):
     """The hopper's cycle, and what is linearized along it, by compiled programs only."""
-    patience = compile._WORTH_COMPILING
-    compile._WORTH_COMPILING = -1.0
+    patience = compilation._WORTH_COMPILING
+    compilation._WORTH_COMPILING = -1.0
     try:
         cycle = hj.find_limit_cycle(hopper_cycle.system)
         return cycle, hj.linearize(cycle, KINEMATIC, OUTPUTS)
     finally:
-        compile._WORTH_COMPILING = patience
+        compilation._WORTH_COMPILING = patience
 
 
 def test_both_find_the_same_cycle(hopper_cycle, compiled):
@@ -179,7 +179,7 @@ def test_plain_numbers_are_part_of_the_program(slope):
 
 def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
     quick = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
-    monkeypatch.setattr(compile, "_WORTH_COMPILING", -1.0)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", -1.0)
     compiled = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
     assert [e.name for e in quick.events] == [e.name for e in compiled.events]
     np.testing.assert_allclose(quick.t, compiled.t, rtol=1e-13)
@@ -188,6 +188,6 @@ def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
 
 def test_the_host_leaves_a_long_job_to_the_compiled_program(monkeypatch):
     """While it is at work: one call that would take it longer than compiling does."""
-    monkeypatch.setattr(compile, "_WORTH_COMPILING", 0.1)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", 0.1)
     found = hj.simulate(Decay(level=0.8), "x", [0.9], 100.0)
     assert len(found.events) == 1 + int((100 - np.log(0.9 / 0.8)) / np.log(1 / 0.8))

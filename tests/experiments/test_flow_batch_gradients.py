@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import compiler_options
+from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.flow_batch import course, flow_batch
 from hybridjax.experiments.stepping.plan import make_plan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import compile
+from hybridjax._core import compilation
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.stepping import plan
 from hybridjax.sections.place import PATIENCE
@@ -29,7 +29,7 @@ def test_host_and_program_try_the_same_ways(name, monkeypatch):
     sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
     scale = np.concatenate([np.full((7, 1), float(cycle.period)), sizes], axis=1)
     host = plan._try_ways(placed, settings)
-    monkeypatch.setattr(compile, "_WORTH_COMPILING", -1.0)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", -1.0)
     xla = plan._try_ways(placed, settings)
     after = np.roll(scale, -1, axis=0).T[:, None]
     np.testing.assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hybridjax._core.compilation.compile import quick_jit
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import quick_jit
+from hybridjax._core.compilation import quick_jit
 from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move, record
 from hybridjax.engine.settings import Settings

@@ -255,24 +255,22 @@ def designs(t):
     noise = [3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]
     noise += [{"y0": lambda f: "x"}, {"y0": lambda f: f * NAN}, {"y0": lambda f: f - 1}]
     yield "optimal_design", hj.optimal_design, dict(
-        model=t.model, design=t.design, goal=ask, max_steps=1
+        model=t.model, design=t.design, goal=ask
     ), {
         "model": instance(t.design), "design": [3, t.model, t.one_input, np.zeros((1, 9, 2))],
         "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
         "limit": [*limits, distorted], "noise": optional(noise),
-        "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
-        "max_steps": COUNT, "robust": WORD,
+        "largest": optional(amplitudes), "seed": SEED, "robust": WORD,
     }  # fmt: skip
     yield "Multipliers", hj.designs.Multipliers, {}, {
-        "which": optional(WHOLE), "part": WORD, "criterion": WORD, "estimator": WORD,
+        "which": optional(WHOLE), "part": WORD, "estimator": WORD,
         "weights": optional(weights),
         "harmonics": optional(HARMONICS), "overhang": optional(WHOLE),
     }  # fmt: skip
     yield "Parameters", hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",)), {
         "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],
         "free": [None, 3, (), (3,), ("x", "x"), Other()],
-        "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "criterion": WORD,
-        "harmonics": HARMONICS, "weights": optional(weights),
+        "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "harmonics": HARMONICS,
     }  # fmt: skip
     band = [None, 3, "x", (1,), (1, NAN), (2.0, 1.0), (-1.0, 1.0), (0, 1, 2), Other()]
     yield "FrequencyResponse", hj.designs.FrequencyResponse, dict(band=(0.1, 1.0)), {

@@ -110,7 +110,7 @@ class Things:
     @ft.cached_property
     def plan(self):
         goal = hj.designs.Multipliers(harmonics=0, overhang=6)
-        return hj.optimal_design(self.model, self.design, goal=goal, max_steps=1)
+        return hj.optimal_design(self.model, self.design, goal=goal)
 
     @ft.cached_property
     def decaying(self):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import compiler_options
+from hybridjax._core.compilation import compiler_options
 
 from ..conftest import APEX
 

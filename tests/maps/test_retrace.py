@@ -3,7 +3,7 @@
 import numpy as np
 
 import hybridjax as hj
-from hybridjax._core.compilation import compile
+from hybridjax._core import compilation
 
 from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS, no_compilation
 
@@ -16,7 +16,7 @@ def analyze(cycle):
 
 def test_another_hopper_compiles_nothing(monkeypatch):
     """On the host, where no program takes over, whatever other tests have done."""
-    monkeypatch.setattr(compile, "_WORTH_COMPILING", np.inf)
+    monkeypatch.setattr(compilation, "_WORTH_COMPILING", np.inf)
     analyze(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.05)))
     with no_compilation():
         analyze(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.1, M=2.02)))

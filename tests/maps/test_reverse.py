@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax._core.compilation.compile import compiler_options
+from hybridjax._core.compilation import compiler_options
 
 
 # Compiled in a third of the time, to slower programs.

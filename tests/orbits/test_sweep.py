@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation.lapack import is_left_to_lapack
+from hybridjax._core.compilation import is_left_to_lapack
 from hybridjax.orbits import batches
 
 

@@ -10,11 +10,10 @@ from typing import Annotated, Any, TypeVar
 import jax
 
 from ...errors import DefinitionError
+from ..executor import is_inside_program, is_traced
 from ..memo import Memory
-from ..tracing import is_inside_program, is_traced
-from .annotations import kind_of
-from .kind import Kind
-from .misfit import Misfit
+from .kinds import kind_of
+from .values import Kind, Misfit
 
 
 Thing = TypeVar("Thing", bound=Callable)

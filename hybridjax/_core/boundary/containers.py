@@ -1,16 +1,14 @@
 """Kinds that are made of others: choices, sequences, tables, objects of a class."""
 
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
 from ..signal import Signal
-from .kind import Kind
-from .misfit import Misfit, listed, show, with_article
-from .scalars import Text, refuse_traced
+from .values import Kind, Misfit, Text, listed, refuse_traced, show, with_article
 
 
 class Either(Kind):
@@ -218,3 +216,37 @@ def _rebuilt(given: Any, taken: Any) -> Any:
     if all(a is b for a, b in zip(before, items, strict=True)):
         return given
     return taken if isinstance(given, list | Mapping) else tuple(taken)
+
+
+class Stream(Kind):
+    """Any iterable of objects of a class. A sequence is checked at once; what comes from elsewhere
+    is checked when it comes, and named as `argument`."""
+
+    def __init__(self, cls: type, argument: str):
+        self.item, self.argument = Instance(cls), argument
+        self.allowed = f"an iterable of items, each {self.item.allowed}"
+
+    def take(self, value):
+        if isinstance(value, Sequence):
+            return Items(self.item).take(value)
+        others = np.ndarray | jax.Array | Mapping
+        if isinstance(value, others) or not isinstance(value, Iterable):
+            raise self.refused(value)
+        once = iter(value) is value
+        return self.checked(value) if once else _Again(self, value)
+
+    def checked(self, value: Iterable) -> Iterator[Any]:
+        for i, item in enumerate(value):
+            if not isinstance(item, self.item.cls):
+                raise self.item.refused(item).inside(i).of(self.argument)
+            yield item
+
+
+class _Again:
+    """What can be iterated over more than once, checked each time."""
+
+    def __init__(self, stream: Stream, value: Iterable):
+        self._stream, self._value = stream, value
+
+    def __iter__(self) -> Iterator[Any]:
+        return self._stream.checked(self._value)

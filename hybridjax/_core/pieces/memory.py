@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..packages import package
+from ..arguments import package
 from .layout import Layout
 
 

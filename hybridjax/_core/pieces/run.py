@@ -2,7 +2,7 @@
 
 from typing import Any, Protocol, runtime_checkable
 
-from ..packages import package
+from ..arguments import package
 from ..progress import counted
 from .job import Job
 from .layout import Store

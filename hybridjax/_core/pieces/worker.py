@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from distributed import Reschedule, Worker, WorkerPlugin
 
-from ..compilation.compilation_cache import enable_compilation_cache
+from ..compilation import enable_compilation_cache
 from .allocator import keep_freed_memory
 from .zarr_store import ZarrStore
 

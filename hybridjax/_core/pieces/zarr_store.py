@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DefinitionError, FileFormatError
-from ..packages import package
+from ..arguments import package
 from ..progress import counted
 from .blocks import Blocks
 from .description import difference

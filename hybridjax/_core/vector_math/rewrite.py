@@ -2,8 +2,8 @@
 
 A function that a user has written with `jnp` is traced, and in its program (a jaxpr) the equations
 for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `trigonometry`, and
-the factorizations behind `jnp.linalg` by those of `small_matrices` and `factorizations`;
-docs/vector-math.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
+the factorizations behind `jnp.linalg` by those of `factorizations`;
+docs/how-to/speed-up.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
 Where a later JAX has another name for what is looked for here, nothing is replaced, and all is as
 slow as it would be without.
 """
@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax.extend.core import primitives
 
 from ..boundary.checked import checked
-from ..device import on_cpu
-from . import factorizations, small_matrices
+from ..executor import on_cpu
+from . import factorizations
 from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
 
 
@@ -33,10 +33,11 @@ _TRIGONOMETRY = {
     primitives.asin_p: arcsin,
     primitives.acos_p: arccos,
 }
-_FACTORIZATIONS = (
-    *(primitives.cholesky_p, primitives.triangular_solve_p, primitives.lu_p),
-    *(primitives.qr_p, primitives.eigh_p, primitives.svd_p),
-)
+_FACTORIZATIONS = {
+    primitives.cholesky_p: factorizations.cholesky,
+    primitives.triangular_solve_p: factorizations.triangular_solve,
+    primitives.lu_p: factorizations.lu,
+}
 # With up to so many of our functions behind it, a vector is concatenated from its numbers. Twice as
 # many: XLA makes a loop without vector instructions of a field with two sines.
 _TOGETHER = 1
@@ -56,7 +57,7 @@ def enable_vector_math(enabled: bool = True) -> None:
 
     On CPU, `jnp.sin` and its relatives take 8 to 22 ns for every number in double precision; what
     replaces them takes 2 to 3 ns and is accurate to 1.5 to 3.3 units in the last place (see
-    docs/vector-math.md). Factorizations are LAPACK's: 150 ns for 3 equations in place of 10.
+    docs/how-to/speed-up.md). Factorizations are LAPACK's: 150 ns for 3 equations in place of 10.
     Switched off, users' functions are computed as they are written.
 
     What JAX compiled under the other setting is dropped, all of this process's programs.
@@ -72,7 +73,7 @@ def is_enabled() -> bool:
 
 
 def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
-    """`function` with the functions of `small_matrices`, and if wanted with those of
+    """`function` with the functions of `factorizations`, and if wanted with those of
     `trigonometry`, in place of those of `jnp`.
 
     It is traced anew at every call, so it may close over tracers. What is written with `jax.lax`
@@ -112,8 +113,15 @@ def _number(eqn: jex.JaxprEqn) -> int:
 
 def _inner(eqn: jex.JaxprEqn) -> list[jex.JaxprEqn]:
     """The equations of the programs in an equation."""
-    items = [x for value in eqn.params.values() for x in _as_tuple(value)]
-    return [e for x in items if isinstance(x, jex.ClosedJaxpr) for e in x.jaxpr.eqns]
+    return [inner for program in jaxprs(eqn.params) for inner in program.eqns]
+
+
+def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
+    """Return the programs among the parameters of an equation, or in tuples of these.
+    (`jax.extend.core` has a function for it since JAX 0.10.)"""
+    values = [x for value in params.values() for x in _as_tuple(value)]
+    programs = [x.jaxpr if isinstance(x, jex.ClosedJaxpr) else x for x in values]
+    return [x for x in programs if isinstance(x, jex.Jaxpr)]
 
 
 def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
@@ -166,7 +174,7 @@ def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
 
 def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
     if eqn.primitive in _FACTORIZATIONS:
-        ours = _factorization(eqn, trigonometry)
+        ours = _factorization(eqn)
     elif eqn.primitive.name == "custom_jvp_call":
         ours = _with_own_derivative(eqn, trigonometry)
     else:
@@ -198,11 +206,11 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
     (left, last), batch = product.params["dimension_numbers"]
     n, axes = matrix.aval.shape[-1], right.aval.ndim
     shared = matrix.aval.ndim == 2 and (tuple(left), tuple(last)) == ((1,), (axes - 1,))
-    if not shared or batch != ((), ()) or n > small_matrices.LARGEST_PIVOTED:
+    if not shared or batch != ((), ()) or n > factorizations.UNROLLED_PIVOTED:
         return None
     if product.invars != times.jaxpr.invars:
         return None
-    new = _equation(small_matrices.solve, (matrix.aval, right.aval))
+    new = _equation(factorizations.solve, (matrix.aval, right.aval))
     return new.replace(invars=[matrix, right], outvars=eqn.outvars, source_info=eqn.source_info)
 
 
@@ -222,30 +230,16 @@ def _trigonometric(eqn: jex.JaxprEqn) -> _Ours | None:
     return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if same else None
 
 
-def _factorization(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
-    avals, name, given = _avals(eqn), eqn.primitive.name, eqn.params
+def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:
+    avals, given = _avals(eqn), eqn.params
     rows, columns = avals[0].shape[-2:]
-    size = max(rows, columns)
-    if not jnp.issubdtype(avals[0].dtype, jnp.floating) or not min(rows, columns):
+    if not jnp.issubdtype(avals[0].dtype, jnp.floating) or not 0 < rows <= factorizations.IN_LOOPS:
         return None
-    other = given.get("pivoting") or given.get("subset_by_index") is not None
-    if size > factorizations.LARGEST_IN_LOOPS or other or (name == "lu" and rows != columns):
+    if rows != columns:
         return None
-    some = lambda *names: tuple((name, given[name]) for name in names)  # noqa: E731
-    if name in ("cholesky", "triangular_solve"):
-        form = small_matrices if size <= small_matrices.LARGEST else factorizations
-        names = ("left_side", "lower", "transpose_a", "unit_diagonal")
-        return _Ours(getattr(form, name), avals, () if name == "cholesky" else some(*names))
-    if name == "lu":
-        return _Ours(factorizations.lu, avals)
-    if name == "qr":
-        return _Ours(factorizations.qr, avals, some("full_matrices"))
-    if name == "eigh":
-        ours = ft.partial(factorizations.eigh, **dict(some("lower")))
-    else:
-        ours = ft.partial(factorizations.svd, **dict(some("full_matrices", "compute_uv")))
-    theirs = ft.partial(eqn.primitive.bind, **given)
-    return _Ours(_derived_as(theirs, ours, trigonometry), avals)
+    names = ("left_side", "lower", "transpose_a", "unit_diagonal")
+    options = tuple((name, given[name]) for name in names if name in given)
+    return _Ours(_FACTORIZATIONS[eqn.primitive], avals, options)
 
 
 def _with_own_derivative(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:

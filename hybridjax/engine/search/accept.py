@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..._core.executor import Array, cond, namespace
-from ..._core.lanes.rows import pick
+from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..arrays import Index, Mask, Times

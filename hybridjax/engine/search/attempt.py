@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..._core.executor import Array, cond, namespace, put
-from ..._core.lanes.rows import take_rows
+from ..._core.lanes import take_rows
 from ...systems.structure import Structure
 from ..arrays import AnyTimes, Mask, Padded, States
 from ..cubic import NEAR, control_points

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from ..._core.executor import namespace
-from ..._core.lanes.rows import pick
+from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ..arrays import Mask, States, Times
 from ..cubic import root_near_end

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from jaxtyping import Bool
 
 from ..._core.executor import Array, cond, namespace, while_loop
-from ..._core.lanes.per_lane import shared
+from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Index, Inputs, Mask, Times

@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 
 from ..._core import limits
 from ..._core.arguments import Numbers, names
-from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
 from ..._core.boundary.containers import Names
 from ..._core.boundary.kinds import (
@@ -25,6 +24,7 @@ from ..._core.boundary.kinds import (
     SignalNames,
     Vector,
 )
+from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import check_sharing, is_real, meets_itself, regular
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.boundary.scalars import Number
-from ..._core.compilation.compile import at_ease, host_first
+from ..._core.boundary.values import Number
+from ..._core.compilation import at_ease, host_first
 from ..._core.executor import Array, from_host, namespace, to_host
 from ..._core.memo import Memory
 from ..._core.results import Result

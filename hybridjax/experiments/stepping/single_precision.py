@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.compilation.compile import quick_jit
+from ..._core.compilation import quick_jit
 from ..._core.executor import from_host
 from ..._core.memo import Memory
 from ..._core.precision import single, single_precision

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..._core.compilation import stored
 from ..._core.execution import Execution
 from ..._core.pieces.blocks import Blocks
 from ..._core.pieces.description import array_digest, definition_digest, digest_of, versions
@@ -98,9 +97,7 @@ def prepare_pieces(
     given = Execution() if options.execution is None else options.execution
     # (Batches as for one thread: their size does not depend on the machine.)
     alone = dataclasses.replace(options, execution=dataclasses.replace(given, workers=1))
-    campaign = prepare(
-        cycle, sections, design, outputs, alone, chunk, one_program=stored.ONE_PROGRAM
-    )
+    campaign = prepare(cycle, sections, design, outputs, alone, chunk, one_program=True)
     S = len(campaign.inputs)
     return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
 

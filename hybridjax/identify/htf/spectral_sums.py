@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ..._core.boundary.stream import Stream
+from ..._core.boundary.containers import Stream
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.partition import check_sharing, meets_itself, regular

@@ -17,9 +17,9 @@ from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Complexes
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order
+from ..._core.boundary.values import Complexes
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData, Simulated
 from ...experiments.design.partition import line_class

@@ -3,9 +3,9 @@
 from typing import Annotated, Literal
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Integers
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Order, StepCount
+from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData

@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.arguments import require_same
-from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index
+from ..._core.execution import one_blas_thread
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Complexes
+from ..._core.boundary.values import Complexes
 from ..._core.html import card, complex_number, table
 from ...errors import DefinitionError
 

@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, StepCount
+from ..._core.execution import one_blas_thread
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF

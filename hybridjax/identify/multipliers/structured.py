@@ -6,9 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, Scalar, StepCount, Vector
+from ..._core.execution import one_blas_thread
 from ..._core.results import Result
 from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics

@@ -5,9 +5,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.blas import one_blas_thread
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Index, Order, StepCount
+from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ...errors import DefinitionError

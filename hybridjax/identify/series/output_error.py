@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.cores import core_count
-from ..._core.threads import on_all_cores
+from ..._core.execution import core_count, on_all_cores
 from ...errors import DefinitionError
 from ..descent import Coefficients
 from .cycle_filters import lagged_inputs, start_responses

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..._core.arguments import Numbers, names
-from ..._core.boundary.arrays import Integers, Reals
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Order, SignalNames
+from ..._core.boundary.values import Integers, Reals
 from ..._core.precision import require_x64
 from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics

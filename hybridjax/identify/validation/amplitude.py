@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.arguments import Numbers, require_same
-from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Positive
+from ..._core.boundary.values import Reals
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...linear.ldtp import LDTP

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked
-from ..._core.boundary.scalars import Whole
+from ..._core.boundary.values import Reals, Whole
 from ..._core.progress import working
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing

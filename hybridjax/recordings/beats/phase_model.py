@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..._core.threads import on_all_cores
+from ..._core.execution import on_all_cores
 from .intervals import Intervals
 
 

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float
 from scipy import stats
 
 from ..._core.arguments import Numbers
-from ..._core.boundary.arrays import Reals
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability
+from ..._core.boundary.values import Reals
 from ..._core.html import COLORS, Curve, card, picture, text
 from ..._core.progress import say, working
 from ..._core.results import Result

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..._core import limits
-from ..._core.files.npz import damaged
+from ..._core.archive import damaged
 from ...errors import FileFormatError
 from ..headers import split_header
 from .columns import Columns, Wanted, belongs, missing_library, no_such_signal

@@ -6,7 +6,7 @@ import zipfile
 from pathlib import Path
 
 from ..._core import limits
-from ..._core.files.npz import damaged
+from ..._core.archive import damaged
 from ...errors import FileFormatError
 from .columns import Columns, Wanted, missing_library
 from .text.layouts import read_plain

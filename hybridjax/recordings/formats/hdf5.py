@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..._core import limits
-from ..._core.files.npz import damaged
+from ..._core.archive import damaged
 from ...errors import FileFormatError
 from .columns import Columns, Wanted, missing_library
 from .tree import Leaf, Place, read_tree, refuse_structs

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..._core import limits
-from ..._core.files.npz import damaged
+from ..._core.archive import damaged
 from ...errors import FileFormatError
 from .columns import Columns, Wanted
 from .hdf5 import read_matlab_hdf5

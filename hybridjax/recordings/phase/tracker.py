@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Positive
-from ..._core.boundary.scalars import Number
+from ..._core.boundary.values import Number
 from ...errors import DefinitionError
 
 

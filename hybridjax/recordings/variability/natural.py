@@ -10,7 +10,7 @@ from scipy import stats
 
 from ..._core.boundary.checked import checked, checked_methods
 from ..._core.boundary.kinds import Probability, Seed
-from ..._core.boundary.scalars import Whole
+from ..._core.boundary.values import Whole
 from ..._core.html import card, complex_number, table, text
 from ..._core.progress import working
 from ..data import SectionData

@@ -1,0 +1,268 @@
+"""Equinox modules in npz files with a JSON header, written whole or not at all.
+
+One array per array field, named like the field (`outer.inner` where a field is a module itself),
+and the array `header`. Nothing in a file is ever executed: there is no pickle, and a reader builds
+only the kinds that it asks for, by their own checked constructors.
+"""
+
+import dataclasses
+import inspect
+import io
+import json
+import math
+import os
+import reprlib
+import textwrap
+import types
+import typing
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import jaxtyped
+
+from .. import __version__
+from ..errors import DefinitionError, FileFormatError, HybridJaxError
+from . import limits
+from .signal import Signal
+from .writing import replacing
+
+
+_FORMAT, _VERSION = "hybridjax", 2
+_HEADER = "header"
+
+
+def write_module(path: Path, thing: eqx.Module, part: str = "") -> None:
+    """Write a module whose fields are arrays, modules, `None`, or static values of JSON.
+
+    `part`: which part of a larger whole it is.
+
+    **Raises:** `DefinitionError` if a field is not what its annotation says, or the file cannot be
+    written.
+    """
+    kind = type(thing).__name__
+    if (wrong := _wrong_field(thing)) is not None:
+        raise DefinitionError(f"this {kind} cannot be saved: {wrong}.")
+    static, arrays = taken_apart(thing)
+    header = {
+        "format": _FORMAT,
+        "format_version": _VERSION,
+        "package_version": __version__,
+        "kind": kind,
+        "part": part,
+        "static": static,
+        "units": {str(name): name.unit for name in signals_in(static)},
+        "arrays": {name: f"{array.dtype}{list(array.shape)}" for name, array in arrays.items()},
+        "conventions": inspect.cleandoc(type(thing).__doc__ or ""),
+    }
+    text = json.dumps(header, indent=1, default=lambda x: x.item())
+    with replacing(path) as temporary, open(temporary, "xb") as file:
+        np.savez(file, allow_pickle=False, **{_HEADER: np.array(text)}, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) -> Any:
+    """Read a module of one of these kinds; `part`: as it was written with, if that matters.
+
+    **Raises:** `DefinitionError` if the file cannot be read; `FileFormatError` if it is damaged, of
+    another format or version, or holds something else.
+    """
+    try:
+        members = read_arrays(path)
+    except OSError as error:
+        raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
+    header = _read_header(path, members.pop(_HEADER, None), kinds)
+    kind = kinds[header["kind"]]
+    if part is not None and part != header.get("part"):
+        raise FileFormatError(
+            f"'{path}' was replaced by another file: delete it, and make it again."
+        )
+    static = restored(header["static"], header["units"])
+    if set(header["arrays"]) != set(members):
+        raise damaged(path, "its arrays are not those that its header lists")
+    try:
+        thing = put_together(kind, static, members)
+    except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
+        reason = textwrap.shorten(str(error), 200)
+        raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
+    if (wrong := _wrong_field(thing)) is not None:
+        raise damaged(path, wrong)
+    return thing
+
+
+def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Static fields and arrays; a module among the fields becomes a dictionary of its own static
+    fields, and arrays with its name before theirs."""
+    static, arrays = {}, {}
+    for field in dataclasses.fields(thing):
+        value = getattr(thing, field.name)
+        if field.metadata.get("static", False):
+            static[field.name] = value
+        elif isinstance(value, eqx.Module):
+            static[field.name], inner = taken_apart(value)
+            arrays |= {f"{field.name}.{name}": array for name, array in inner.items()}
+        elif value is not None:
+            arrays[field.name] = np.asarray(value)
+    return static, arrays
+
+
+def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+    """The module that `taken_apart` took apart. Fields that are not there are `None`, or have
+    their defaults where they are static."""
+    other = ValueError(f"its fields are not those of {kind.__name__}")
+    if not isinstance(static, dict):
+        raise other
+    static, arrays, values = dict(static), dict(arrays), {}
+    for field in dataclasses.fields(kind):
+        name, inner = field.name, _module_in(field.type)
+        if field.metadata.get("static", False):
+            if name in static:
+                values[name] = static.pop(name)
+                if not _matches(values[name], field.type) or not _moderate(values[name]):
+                    raise ValueError(f"{name} is {reprlib.repr(values[name])}")
+            elif field.default is dataclasses.MISSING:
+                raise other
+        elif inner is not None and name in static:
+            own = {k: arrays.pop(k) for k in list(arrays) if k.startswith(f"{name}.")}
+            own = {k.removeprefix(f"{name}."): array for k, array in own.items()}
+            values[name] = put_together(inner, static.pop(name), own)
+        else:
+            values[name] = arrays.pop(name, None)
+    if static or arrays:
+        raise other
+    return kind(**values)
+
+
+def _module_in(hint: Any) -> type | None:
+    """The kind of module that a field of this type may hold."""
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    return next((x for x in options if isinstance(x, type) and issubclass(x, eqx.Module)), None)
+
+
+def _read_header(path: Path, array: np.ndarray | None, kinds: Mapping[str, type]) -> dict[str, Any]:
+    try:
+        if array is None or array.nbytes > limits.TEXT:
+            raise ValueError
+        header = json.loads(array.item())
+        name, version = header["format"], header["format_version"]
+    except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
+        name = None
+    if name != _FORMAT:
+        raise FileFormatError(f"'{path}' was not written by hybridjax.save.")
+    if version != _VERSION:
+        raise FileFormatError(
+            f"'{path}' has format version {version} (hybridjax {header.get('package_version')}), "
+            f"but hybridjax {__version__} reads version {_VERSION}: use a matching hybridjax."
+        )
+    kind = header.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise FileFormatError(f"'{path}' holds a {kind!r}; load knows {', '.join(kinds)}.")
+    header.setdefault("units", {})  # (files written before units were kept)
+    if not all(isinstance(header.get(part), dict) for part in ("static", "arrays", "units")):
+        raise damaged(path, "its header is incomplete")
+    return header
+
+
+def signals_in(value: Any) -> Iterator[Signal]:
+    """All names with a unit."""
+    if isinstance(value, Signal) and value.unit:
+        yield value
+    elif isinstance(value, dict | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from signals_in(part)
+
+
+def restored(value: Any, units: Mapping[str, str]) -> Any:
+    """JSON's lists as the tuples that they were, and names with their units."""
+    if isinstance(value, dict):
+        return {key: restored(part, units) for key, part in value.items()}
+    if isinstance(value, list):
+        return tuple(restored(part, units) for part in value)
+    return Signal(value, str(units[value])) if isinstance(value, str) and value in units else value
+
+
+def _moderate(value: Any) -> bool:
+    """Whether no whole number in it is larger than a header may declare."""
+    if isinstance(value, tuple):
+        return all(map(_moderate, value))
+    return not isinstance(value, int) or abs(value) <= limits.DECLARED
+
+
+def _wrong_field(thing: eqx.Module) -> str | None:
+    """The first field that is not what its annotation says; array axes of one name must agree."""
+    with jaxtyped("context"):
+        for field in dataclasses.fields(thing):
+            value = getattr(thing, field.name)
+            if not _matches(value, field.type):
+                what = f"{value.dtype}{value.shape}" if hasattr(value, "dtype") else repr(value)
+                return f"{field.name} is {what}"
+            if isinstance(value, eqx.Module) and (wrong := _wrong_field(value)) is not None:
+                return f"{field.name}.{wrong}"
+    return None
+
+
+def _matches(value: Any, hint: Any) -> bool:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return _matches(value, arguments[0])
+    if origin is types.UnionType or origin is typing.Union:
+        return any(_matches(value, option) for option in arguments)
+    if origin is tuple:  # tuple[X, ...], the only form in use
+        return isinstance(value, tuple) and all(_matches(x, arguments[0]) for x in value)
+    if hint is int:
+        return isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return isinstance(value, hint)
+
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays by name. Members are read whole, so that their checksums are checked.
+
+    **Raises:** `OSError` if the file cannot be read; `FileFormatError` if it is damaged, no npz
+    file, holds Python objects, or declares more than `limits` allow.
+    """
+    with open(path, "rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise FileFormatError(f"'{path}' is not an npz file, or is damaged.")
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                _check_sizes(members, path.stat().st_size)
+                return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+        except Exception as error:  # whatever broken bytes make zipfile and numpy stumble over
+            raise damaged(path, str(error) or type(error).__name__) from error
+
+
+def damaged(path: Path, reason: str) -> FileFormatError:
+    return FileFormatError(f"'{path}' is damaged: {reason.rstrip('.')}.")
+
+
+def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
+    size, most = sum(m.file_size for m in members), limits.unpacked(packed)
+    if size > most:
+        raise ValueError(f"it declares arrays of {size} bytes, but packs them into {packed}")
+    if len({m.filename for m in members}) < len(members):
+        raise ValueError("two of its arrays have one name")
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(member) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in _HEADERS:
+            raise ValueError(f"an array is of version {version}")
+        shape, _, dtype = _HEADERS[version](stream)
+        declared = stream.tell() + math.prod(shape) * dtype.itemsize
+    if dtype.hasobject:
+        raise ValueError(f"'{member.filename}' holds Python objects")
+    if declared != member.file_size or math.prod(shape) > member.file_size:
+        raise ValueError(f"'{member.filename}' declares the shape {shape}, and is not that large")
+    return np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)

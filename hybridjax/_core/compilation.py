@@ -1,0 +1,464 @@
+"""Compile functions of users and of this package: which options, which tier, what is kept on disk.
+
+- `quick_jit` compiles with few optimizations: for functions that run a few times.
+- `host_first` runs a function on the host until compiling it is worth its time.
+- `TwoTiers` compiles the experiments twice: a quick executable for the first answer, and the fully
+  optimized one in a thread beside it.
+- `kernel` compiles single functions of users for code that runs on the host.
+- `enable_compilation_cache` switches JAX's own cache on; nothing else is kept between processes.
+"""
+
+import collections
+import contextlib
+import functools as ft
+import gc
+import hashlib
+import os
+import pathlib
+import stat
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import ComputationError, DefinitionError
+from .boundary.checked import checked
+from .boundary.kinds import Path
+from .executor import (
+    OutOfTimeError,
+    at_most,
+    from_host,
+    is_inside_program,
+    is_traced,
+    on_cpu,
+    to_host,
+)
+from .progress import say_compiling
+from .vector_math import rewrite
+
+
+# No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
+# the time. Options that an XLA does not have are left out.
+_QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+# Seconds of host time after which a function is compiled, which takes about as long. Less: programs
+# are compiled that are not used again. More: repeated calls stay slow for longer.
+_WORTH_COMPILING = 3.0
+# Seconds in a quick executable after which the optimized one is compiled. Less: threads compile
+# for jobs that are done already. More: repeated calls stay slow for longer.
+_WORTH_OPTIMIZING = 0.5
+# XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
+# is 1024.
+_LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+# Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
+_KEPT = 1024
+
+
+@checked
+def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
+    """Keep compiled programs on disk (JAX's persistent compilation cache), so that the next process
+    starts faster.
+
+    From then on XLA prints no messages about programs that it loads.
+
+    **Arguments:** `folder`: where programs are kept. Loading a program executes it, so the folder
+    must belong to this user, and other users must not be able to write to it. Default:
+    `$HYBRIDJAX_CACHE`, or `hybridjax` in the user's cache folder (`$XDG_CACHE_HOME` or `~/.cache`).
+
+    **Returns:** the folder in use.
+
+    **Raises:** `DefinitionError` if the folder cannot be made, or other users can write to it.
+    """
+    if folder is None:
+        base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        folder = os.environ.get("HYBRIDJAX_CACHE") or pathlib.Path(base) / "hybridjax"
+    folder = pathlib.Path(folder)
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about = folder.stat()
+    except OSError as error:
+        raise DefinitionError(
+            f"cannot keep compiled programs in '{folder}' ({error.strerror}): set HYBRIDJAX_CACHE "
+            "to another folder."
+        ) from error
+    foreign = hasattr(os, "geteuid") and about.st_uid != os.geteuid()
+    if foreign or about.st_mode & stat.S_IWOTH:
+        raise DefinitionError(
+            f"cannot keep compiled programs in '{folder}', because other users can write to it and "
+            "loading a program executes it: set HYBRIDJAX_CACHE to a folder of your own."
+        )
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Also the smallest programs: those of users' functions are the first that a process needs.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # XLA prints two errors, a page each, for each program that it loads on a processor with
+    # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
+    level = jax.config.jax_logging_level
+    jax.config.update("jax_logging_level", "CRITICAL")
+    jax.config.update("jax_logging_level", level)
+    return folder
+
+
+def enable_loop_kernels() -> None:
+    """Have XLA compile each loop on CPU into one function of machine code, for this process.
+
+    XLA otherwise makes a function of every few operations in a loop, and calls one after the other
+    in each iteration, which takes up to half of the time of an experiment. With whole loops,
+    experiments run 1.3 to 1.5 times as fast; programs compile 1.1 to 2.4 times as long (figures:
+    docs/benchmarks.md). So it pays for long studies. Results are the same up to rounding. (The XLA
+    of JAX 0.12 compiles whole loops by default.)
+
+    Call it before JAX computes anything: XLA reads its options once. The option is set in the
+    environment variable `XLA_FLAGS`, so it holds for all programs of JAX in this process and in
+    those that it starts. On other devices than CPU it changes nothing.
+
+    **Raises:** `ComputationError`, on CPU, if XLA has read its options already, or does not have
+    this one.
+    """
+    before = os.environ.get("XLA_FLAGS")
+    words = (before or "").split()
+    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*words, _LOOP_KERNELS]))
+    if jax.default_backend() == "cpu" and not _loops_are_kernels():
+        os.environ.pop("XLA_FLAGS")
+        if before is not None:
+            os.environ["XLA_FLAGS"] = before
+        raise ComputationError(
+            "XLA does not make single kernels of loops: it has read its options already (call "
+            "`enable_loop_kernels()` before JAX computes anything), or it is of another version."
+        )
+
+
+def _loops_are_kernels() -> bool:
+    """Whether XLA makes one kernel of a loop above its own limit."""
+
+    def loop(x, count):
+        return jax.lax.fori_loop(0, count, lambda _, x: x * x[0], x)
+
+    program = jax.jit(loop).lower(jnp.ones(1000), 9).compile()
+    return "xla_cpu_small_call" in program.as_text()
+
+
+@ft.cache
+def compiler_options() -> dict[str, int | bool]:
+    """Return XLA's options for quick compilation."""
+
+    def accepted(options):
+        try:
+            jax.jit(lambda: 0, compiler_options=options)()
+        except Exception:  # the type depends on the version of XLA
+            return False
+        return True
+
+    if accepted(_QUICK):
+        return _QUICK
+    return {name: value for name, value in _QUICK.items() if accepted({name: value})}
+
+
+class _Uncollected:
+    """A context in which Python's collector of cyclic garbage rests; threads may share it.
+
+    Tracing makes hundreds of thousands of objects that live until the program is compiled, and the
+    collector would visit all of them repeatedly: an eighth of the time of a first limit cycle.
+    """
+
+    def __init__(self):
+        self._lock, self._inside, self._was_on = threading.Lock(), 0, False
+
+    def __enter__(self):
+        with self._lock:
+            if self._inside == 0:
+                self._was_on = gc.isenabled()
+                gc.disable()
+            self._inside += 1
+
+    def __exit__(self, *_):
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0 and self._was_on:
+                gc.enable()
+
+
+uncollected = _Uncollected()
+
+
+@contextlib.contextmanager
+def _compiling() -> Iterator[None]:
+    say_compiling(True)
+    try:
+        with uncollected:
+            yield
+    finally:
+        say_compiling(False)
+
+
+def quick_jit(function: Callable) -> Callable:
+    """`equinox.filter_jit`, compiled with few optimizations, for functions that run a few times.
+
+    Finding a cycle or linearizing it takes milliseconds, and compiling the program for it seconds.
+    Inside of another transformation of JAX this is `filter_jit`: there the outer program decides.
+    """
+
+    @ft.wraps(function)
+    def traced(*arguments):
+        say_compiling(True)
+        return function(*arguments)
+
+    plain = eqx.filter_jit(traced)
+
+    @ft.cache
+    def quick():
+        return eqx.filter_jit(traced, compiler_options=compiler_options())
+
+    @ft.wraps(function)
+    def call(*arguments):
+        with uncollected:
+            # JAX allows options of the compiler at the top level only, and refuses them elsewhere
+            # after it has traced the function.
+            if not on_cpu() or is_traced(arguments) or is_inside_program():
+                return plain(*arguments)
+            result = quick()(*arguments)
+            say_compiling(False)
+            return result
+
+    call.lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)
+    return call
+
+
+def host_first(function: Callable) -> Callable:
+    """A function of few lanes, run on the host (see `executor.py`) while that is faster in total;
+    compiled by `quick_jit` once the host has spent as much on arguments of the same kind as
+    compiling takes. Both give the same result up to rounding.
+
+    Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
+    """
+    compiled = quick_jit(function)
+    spent = collections.defaultdict(float)
+
+    @ft.wraps(function)
+    def call(*arguments):
+        if not on_cpu() or is_traced(arguments) or is_inside_program():
+            return compiled(*arguments)
+        key, begin = kind(arguments), time.thread_time()
+        left = _WORTH_COMPILING - spent[key]
+        if left <= 0:
+            return compiled(*arguments)
+        try:
+            with uncollected, at_ease(), at_most(left):
+                return from_host(function(*to_host(arguments)))
+        except OutOfTimeError:
+            return compiled(*arguments)
+        finally:
+            spent[key] += time.thread_time() - begin
+
+    return call
+
+
+def at_ease() -> contextlib.AbstractContextManager:
+    """A context in which NumPy, like JAX, does not warn of infinite and undefined numbers. (Tests
+    replace it, to skip checks of types.)"""
+    return np.errstate(all="ignore")
+
+
+def kind(arguments) -> tuple:
+    """All of the arguments that a program is compiled for: everything but the values of arrays."""
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    return structure, *((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
+
+
+class TwoTiers:
+    """`function(*arguments)` for one job, all of which is done by one executable.
+
+    A job that is `large` waits for the fully optimized executable, so its results do not depend on
+    time. Another job uses it if it is there, and else the one that compiles in a third of the time;
+    after `_WORTH_OPTIMIZING` seconds of use a thread compiles the optimized one for later jobs.
+    """
+
+    def __init__(self, function: Callable, large: bool):
+        self._function, self.large = function, large
+        self._chosen: dict[Hashable, tuple[_Program, jax.stages.Compiled]] = {}
+
+    def __call__(self, *arguments: Any) -> Any:
+        if not _is_simple() or is_traced(arguments) or is_inside_program():
+            return _one_tier(self._function, self.large)(*arguments)
+        key = self._function, _settings(), kind(arguments)
+        arrays, static = eqx.partition(arguments, _is_array)
+        leaves, structure = jax.tree_util.tree_flatten(arrays)
+        if key not in self._chosen:
+            run = lambda x: self._function(*eqx.combine(structure.unflatten(x), static))  # noqa: E731
+            with _choosing, _compiling():
+                program = _lowered(key, run, leaves)
+                self._chosen[key] = program, program.choose(self.large)
+        program, executable = self._chosen[key]
+        return program.run(executable, leaves)
+
+
+_choosing = threading.Lock()
+_by_kind: dict[Hashable, "_Program"] = {}
+_by_text: dict[Hashable, "_Program"] = {}
+
+
+def _lowered(key: Hashable, run: Callable, leaves: list) -> "_Program":
+    """The program for arguments of this kind. Objects that hold the same functions written anew
+    (an `Output` with a `lambda`) are of other kinds, but have the same text and share executables.
+    """
+    if key not in _by_kind:
+        if len(_by_kind) >= _KEPT:
+            _by_kind.clear()
+            _by_text.clear()
+        lowered = jax.jit(run).lower(leaves)
+        text = lowered.as_text()
+        digest = key[0], hashlib.sha256(text.encode()).digest()
+        _by_kind[key] = _by_text.setdefault(digest, _Program(lowered, _calls_lapack(text)))
+    return _by_kind[key]
+
+
+@ft.lru_cache(_KEPT)
+def _one_tier(function: Callable, large: bool) -> Callable:
+    return eqx.filter_jit(function) if large else quick_jit(function)
+
+
+class _Program:
+    """A program that is lowered, and its executables."""
+
+    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
+        self._lowered, self._alone = lowered, alone
+        self._quick: jax.stages.Compiled | None = None
+        self._full: jax.stages.Compiled | None = None
+        self._seconds, self._lock = 0.0, threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def choose(self, large: bool) -> jax.stages.Compiled:
+        if large and self._thread is not None:
+            self._thread.join()
+        if large or self._full is not None:
+            return self._optimize()
+        if self._quick is None:
+            self._quick = self._lowered.compile(compiler_options=compiler_options())
+        return self._quick
+
+    def _optimize(self) -> jax.stages.Compiled:
+        self._full = self._full or self._lowered.compile()
+        return self._full
+
+    def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
+        begin = time.perf_counter()
+        with in_turn(self._alone):
+            results = jax.block_until_ready(executable(leaves))
+        if executable is self._quick and self._thread is None:
+            with self._lock:
+                self._seconds += time.perf_counter() - begin
+                if self._seconds > _WORTH_OPTIMIZING and self._thread is None:
+                    self._thread = threading.Thread(target=self._optimize)
+                    self._thread.start()
+        return results
+
+
+def _is_simple() -> bool:
+    """Whether JAX computes on the first CPU, and runs programs as they are."""
+    device = jax.config.jax_default_device
+    first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
+    names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
+    return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
+
+
+def _settings() -> tuple:
+    """Settings by which the same function becomes another program."""
+    names = "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion"
+    return rewrite.is_enabled(), *(getattr(jax.config, name) for name in names)
+
+
+# XLA hands factorizations that are left in a program (`vector_math/rewrite.py`) to LAPACK, on the
+# threads of its pool. Two such programs in threads of their own can wait for each other for ever.
+_turn = threading.Lock()
+
+
+@contextlib.contextmanager
+def in_turn(alone: bool) -> Iterator[None]:
+    """A context in which one thread is at a time, if it must be `alone`."""
+    with _turn if alone else contextlib.nullcontext():
+        yield
+
+
+def is_left_to_lapack(program: Callable, *arguments: Any) -> bool:
+    """Whether a program of `quick_jit` or `equinox.filter_jit` calls LAPACK for such arguments."""
+    key = program, kind(arguments)
+    if key not in _left_to_lapack:
+        _left_to_lapack[key] = _calls_lapack(program.lower(*arguments).lowered.as_text())
+    return _left_to_lapack[key]
+
+
+_left_to_lapack: dict[Hashable, bool] = {}
+
+
+def _calls_lapack(text: str) -> bool:
+    return "@lapack_" in text
+
+
+def kernel(
+    function: Callable, form: Callable, static: tuple[Hashable, ...], trees: Any, lanes: int
+) -> Callable:
+    """`function(*static, *trees, *point)` of single points, brought to lanes by a `form` and
+    compiled, as a function of NumPy's arrays.
+
+    `form(function, *trees)` is a function of arrays with lanes on their last axis, as its result
+    is (see `engine/kernels.py`). An argument may have one lane where others have more. Where only
+    `some` lanes are needed (a mask), the other lanes get the results of one of these. `function`
+    and `form` belong to modules, so that they are the same objects in each call.
+
+    One program serves everything of the same structure: the same classes, static fields, functions,
+    and shapes and types of arrays. The arrays themselves are arguments.
+
+    The program is for this number of `lanes`: more are done in several calls, fewer are filled up.
+    (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
+    hands larger ones to another thread, which takes longer than they do.)
+    """
+    leaves, structure = jax.tree_util.tree_flatten(trees)
+    arrays = jax.device_put([x for x in leaves if _is_array(x)])
+    # (1, 1.0 and True are equal, and not the same.)
+    others = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
+    program = _kernel_program(function, form, static, structure, others, lanes)
+
+    def call(*arguments, some=None):
+        if some is not None:
+            values = call(*(x[..., some] if x.shape[-1] == len(some) else x for x in arguments))
+            return values[..., np.maximum(np.cumsum(some) - 1, 0)]
+        L = max(x.shape[-1] for x in arguments)
+        if L == lanes == 1:
+            return np.asarray(program(arrays, *arguments))
+        filled = -(-L // lanes) * lanes
+        arguments = [_fill(x, L, filled) for x in arguments]
+        if filled == lanes:
+            return np.asarray(program(arrays, *arguments))[..., :L]
+        blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
+        parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
+        return np.concatenate(parts, axis=-1)[..., :L]
+
+    return call
+
+
+@ft.lru_cache(_KEPT)
+def _kernel_program(function, form, static, structure, others, lanes):
+    def run(arrays, *arguments):
+        arrays = iter(arrays)
+        leaves = [next(arrays) if x is None else x[1] for x in others]
+        trees = jax.tree_util.tree_unflatten(structure, leaves)
+        return form(ft.partial(function, *static), *trees)(*arguments)
+
+    # (One for each number of lanes, as it is for arrays of one shape.)
+    return jax.jit(run, compiler_options=compiler_options())
+
+
+def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
+    """x with so many lanes, those beyond L copies of its first."""
+    if x.shape[-1] == 1:
+        return x.repeat(filled, axis=-1)
+    if filled == L:
+        return x
+    return np.concatenate([x, np.repeat(x[..., :1], filled - L, axis=-1)], axis=-1)
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray | np.generic)

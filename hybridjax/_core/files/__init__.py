@@ -1,1 +1,0 @@
-"""Reading and writing files: nothing of a user is lost, and no file is believed."""

@@ -1,0 +1,243 @@
+"""Many lanes: functions of single states brought to them, `vmap` as more lanes, derivatives.
+
+Lanes stand on the last axis of an array. What all lanes share (a system's parameters, say) is
+passed as it is; where each lane has its own, it is marked by `PerLane`.
+"""
+
+import functools as ft
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from .executor import Array, namespace, on_host
+from .vector_math.rewrite import vectorized
+
+
+# From this number of lanes on, trigonometric functions are computed for several at once. Twice as
+# many: batches of 8 to 15 lanes wait for the C library's functions.
+_VECTOR_LANES = 8
+
+
+class PerLane(eqx.Module):
+    """A pytree, some of whose arrays have one entry for each lane, on their last axis."""
+
+    tree: Any
+    own: tuple[bool, ...] = eqx.field(static=True)
+    """Which of the tree's arrays, in the order of its leaves."""
+
+    def axes(self) -> Any:
+        """Where the lanes are, in the form that `jax.vmap` takes: -1 or None for each array."""
+        arrays = eqx.filter(self.tree, eqx.is_array)
+        structure = jax.tree_util.tree_structure(arrays)
+        return structure.unflatten([-1 if own else None for own in self.own])
+
+
+def shared(tree: Any) -> Any:
+    """The tree itself, of what may be marked as `PerLane`."""
+    return tree.tree if isinstance(tree, PerLane) else tree
+
+
+def one_lane(tree: Any) -> Any:
+    """What a single lane has of a tree: shapes in place of its arrays."""
+    arrays, rest = eqx.partition(shared(tree), eqx.is_array)
+    leaves, structure = jax.tree_util.tree_flatten(arrays)
+    own = tree.own if isinstance(tree, PerLane) else (False,) * len(leaves)
+    shapes = [
+        jax.ShapeDtypeStruct(x.shape[:-1] if o else x.shape, x.dtype)
+        for x, o in zip(leaves, own, strict=True)
+    ]
+    return eqx.combine(structure.unflatten(shapes), rest)
+
+
+def by_lane(function: Callable, *trees: Any) -> Callable:
+    """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
+
+    Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
+    others have more is the same for all of them, and what depends on nothing else is computed once.
+    """
+    arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
+    axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
+
+    def one(arrays, *arguments):
+        return function(*eqx.combine(arrays, rest), *arguments)
+
+    @ft.cache
+    def program(common: tuple[bool, ...], many: bool):
+        in_axes = (axes, *[None if c else -1 for c in common])
+        work = vectorized(one, trigonometry=many)
+        # Traced once, however often it is called: a Runge-Kutta step has ten stages.
+        return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
+
+    def call(*arguments):
+        lanes = max(x.shape[-1] for x in arguments)
+        common = tuple(x.shape[-1] < lanes for x in arguments)
+        arguments = [x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)]
+        return program(common, lanes >= _VECTOR_LANES)(arrays, *arguments)
+
+    return call
+
+
+def vmap_to_lanes(function: Callable[[tuple, Any], Any]) -> Callable[[tuple, Any], Any]:
+    """Make `function(common, lanes)` treat an axis that is mapped by `jax.vmap` as more lanes.
+
+    `common` is a tuple of pytrees, each shared by all lanes or a `PerLane`; `lanes` and the result
+    are pytrees whose arrays have the lanes on their last axis. No derivatives.
+    """
+
+    def call(common, lanes):
+        arrays, rest = eqx.partition((common, lanes), eqx.is_array)
+
+        @jax.custom_batching.custom_vmap
+        def run(arrays):
+            return function(*eqx.combine(arrays, rest))
+
+        @run.def_vmap
+        def rule(size, batched, arrays):
+            (batched,) = batched
+            common, lanes = eqx.combine(arrays, rest)
+            L = jax.tree_util.tree_leaves(lanes)[0].shape[-1]
+            joined = tuple(
+                _join_common(tree, mapped, size, L)
+                for tree, mapped in zip(common, batched[0], strict=True)
+            )
+            join = lambda x, mapped: _join(x, mapped, True, size, L)  # noqa: E731
+            out = call(joined, jax.tree_util.tree_map(join, lanes, batched[1]))
+            split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, L), -2, 0)  # noqa: E731
+            out = jax.tree_util.tree_map(split, out)
+            return out, jax.tree_util.tree_map(lambda _: True, out)
+
+        return run(arrays)
+
+    return call
+
+
+def _join(x, mapped: bool, own: bool, size: int, L: int):
+    """Join a mapped axis (the first, if there is one) with the lanes' (the last, if there)."""
+    x = jnp.moveaxis(x, 0, -2 if own else -1) if mapped else (x[..., None, :] if own else x)
+    x = x if own else x[..., None]
+    return jnp.broadcast_to(x, (*x.shape[:-2], size, L)).reshape(*x.shape[:-2], size * L)
+
+
+def _join_common(tree, mapped, size: int, L: int):
+    mapped = jax.tree_util.tree_leaves(mapped)
+    own = tree.own if isinstance(tree, PerLane) else (False,) * len(mapped)
+    if not any(own) and not any(mapped):
+        return tree
+    arrays, rest = eqx.partition(shared(tree), eqx.is_array)
+    leaves, structure = jax.tree_util.tree_flatten(arrays)
+    flags = zip(leaves, mapped, own, strict=True)
+    joined = [_join(x, m, o, size, L) if m or o else x for x, m, o in flags]
+    own = tuple(m or o for m, o in zip(mapped, own, strict=True))
+    return PerLane(eqx.combine(structure.unflatten(joined), rest), own)
+
+
+# Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
+# a Jacobian of 64 columns takes longer than the reverse mode that it spares.
+_JACOBIAN_COLUMNS = 32
+
+
+def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any]) -> tuple[Any, Any]:
+    """`function(lane, shared)` and its tangent; `lane` and `shared` are pairs (primal, tangent).
+
+    Arrays of `lane`, and of the result, have the lanes on their last axis; all lanes share those of
+    `shared`. Tangents are `None` where there are none.
+
+    Where few numbers have tangents, the function's Jacobian is computed first, forwards, and then
+    applied to them. Reverse mode then only transposes a product of small matrices: transposing the
+    function itself would store and read again all that happens in it. And where JAX asks for
+    several tangents, they all use one Jacobian.
+    """
+    moving = eqx.is_inexact_array
+    has = [
+        jax.tree_util.tree_map(lambda x, t: t is not None and moving(x), x, t, is_leaf=_none)
+        for x, t in (lane, shared)
+    ]
+    own, fixed_lane = eqx.partition(lane[0], has[0])
+    common, fixed_shared = eqx.partition(shared[0], has[1])
+    t_own, t_common = (eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1])))
+
+    def of(own, common):
+        return function(eqx.combine(own, fixed_lane), eqx.combine(common, fixed_shared))
+
+    leaves = jax.tree_util.tree_leaves
+    sizes = [math.prod(x.shape[:-1]) for x in leaves(own)] + [x.size for x in leaves(common)]
+    if not sizes or sum(sizes) > _JACOBIAN_COLUMNS:
+        return jax.jvp(of, (own, common), (t_own, t_common))
+
+    basis, start = [], 0
+    total = sum(sizes)
+    for x, size in zip([*leaves(own), *leaves(common)], sizes, strict=True):
+        directions = jnp.zeros((total, size)).at[start : start + size].set(jnp.eye(size))
+        by_lane = len(basis) < len(leaves(own))
+        shape = x.shape[:-1] if by_lane else x.shape
+        directions = directions.reshape(total, *shape)
+        if by_lane:
+            directions = jnp.broadcast_to(directions[..., None], (total, *x.shape))
+        basis.append(directions.astype(x.dtype))
+        start += size
+    basis = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure((own, common)), basis)
+    push = jax.vmap(lambda tangent: jax.jvp(of, (own, common), tangent), out_axes=(None, 0))
+    end, columns = push(basis)
+
+    # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
+    rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_own)]
+    rows += [jnp.broadcast_to(t.reshape(-1, 1), (t.size, 1)) for t in leaves(t_common)]
+    lanes = max(x.shape[-1] for x in leaves(columns))
+    weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
+
+    def contract(column):
+        w = weights.reshape(total, *[1] * (column.ndim - 2), lanes)
+        return jnp.sum(column * w, axis=0)
+
+    return end, jax.tree_util.tree_map(contract, columns)
+
+
+def _none(x):
+    return x is None
+
+
+# Up to so many rows are selected one by one. Twice as many: programs of eight contacts compile for
+# longer, and run a little faster.
+_FEW = 8
+
+
+def take_rows(x: Array, rows: Sequence[int]) -> Array:
+    """Some rows of x (W, L)."""
+    if list(rows) == list(range(len(x))):
+        return x
+    if on_host(x) or len(rows) > _FEW:
+        return x[np.array(rows)]
+    return namespace(x).stack([x[row] for row in rows])
+
+
+def put_rows(x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array) -> Array:
+    """x (W, L) with these rows replaced by those of `new` for the lanes `here`."""
+    xp = namespace(x)
+    if list(rows) == list(range(len(x))):
+        return xp.where(here, new, x)
+    place = np.full(len(x), -1)
+    place[np.array(rows, int)] = np.arange(len(rows))
+    if on_host(x) or len(x) > _FEW:
+        return xp.where(here & (place >= 0)[:, None], new[place], x)
+    return xp.stack([x[r] if k < 0 else xp.where(here, new[k], x[r]) for r, k in enumerate(place)])
+
+
+def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:
+    """Each lane's entry in the row of its function `which` of x, whose rows are those of the
+    functions `rows`; 0 where it is not among them."""
+    xp = namespace(x)
+    if on_host(x) or len(rows) > _FEW:
+        place = np.full(max(rows, default=0) + 2, -1)  # the last for -1
+        place[np.array(rows, int)] = np.arange(len(rows))
+        k = xp.asarray(place)[xp.minimum(which, len(place) - 1)]
+        return xp.where(k >= 0, x[k, np.arange(x.shape[1])], 0.0)
+    out = xp.zeros_like(x[0])
+    for k, row in enumerate(rows):
+        out = xp.where(which == row, x[k], out)
+    return out

@@ -1,0 +1,192 @@
+"""Files and folders that appear complete or not at all, and folders of results.
+
+A folder of results has a list `.hybridjax-KIND.json`
+with the name and the digest of each result.
+Only a file that is on the list, and has not changed since, may be replaced or removed.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from ..errors import DefinitionError
+from . import limits
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name in the folder of `path`, for a file that takes the place of `path` at the end.
+
+    **Raises:** `DefinitionError` if the file cannot be written, or `path` is a link.
+    """
+    if path.is_symlink():
+        raise DefinitionError(
+            f"'{path}' is a link, and nothing is written through links: choose another name."
+        )
+    temporary = path.parent / temporary_name()
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise DefinitionError(f"cannot write '{path}': {error.strerror or error}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+@contextlib.contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """The folder exists and can be written. If it was made for this, and something is raised while
+    it is empty, it goes again, as do those above it that were made with it.
+
+    **Raises:** `DefinitionError` if it cannot be made or written.
+    """
+    new = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise DefinitionError(
+                f"cannot write to '{folder}': {error.strerror or error}."
+            ) from error
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for one in new:
+                one.rmdir()
+        raise
+
+
+def temporary_name() -> str:
+    return f".hybridjax-{uuid.uuid4().hex[:12]}"
+
+
+Format = Literal["png", "pdf", "svg"]
+
+
+Digests = dict[str, list[str]]
+"""By name, which contents a file may have if it is one of ours."""
+
+
+@contextlib.contextmanager
+def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterator[Path]:
+    """A new folder for results of this kind, which are put into `folder` when all are there.
+
+    Results of the same kind that are there already are replaced or removed. After an error `folder`
+    is as it was before.
+
+    **Arguments:** `names`: of results to come, with slashes, so that a refusal comes early.
+
+    **Raises:** `DefinitionError` if `folder` cannot be written, or holds a file of one of the names
+    of the results that is a link, not on the list, or changed since.
+    """
+    with made_folder(folder):
+        _refuse_others(folder, names, _listed(folder, kind))
+        new = folder / temporary_name()
+        try:
+            new.mkdir()
+            yield new
+            _put(new, folder, kind)
+        except OSError as error:
+            raise DefinitionError(
+                f"cannot write to '{folder}': {error.strerror or error}."
+            ) from error
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+
+
+def _put(new: Path, folder: Path, kind: str) -> None:
+    files = (path for path in new.rglob("*") if path.is_file())
+    digests = {path.relative_to(new).as_posix(): [_digest(path)] for path in files}
+    before = _listed(folder, kind)
+    _refuse_others(folder, digests, before)
+    # First a list of both, so that whoever is interrupted finds all of them on it.
+    either = {name: before.get(name, []) + digests.get(name, []) for name in before | digests}
+    _write_list(folder, kind, either)
+    for name in digests:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(new / name, folder / name)
+    for name in before.keys() - digests.keys():
+        if _is_own(folder, name, before):
+            (folder / name).unlink()
+    _write_list(folder, kind, digests)
+
+
+def _refuse_others(folder: Path, names: Iterable[str], own: Digests) -> None:
+    for name in names:
+        for above in list(PurePosixPath(name).parents)[:-1]:
+            if os.path.lexists(folder / above) and not _is_folder(folder / above):
+                raise _other(folder / above)
+        if os.path.lexists(folder / name) and not _is_own(folder, name, own):
+            raise _other(folder / name)
+
+
+def _other(path: Path) -> DefinitionError:
+    return DefinitionError(
+        f"'{path}' is in the way, and was not written by hybridjax or was changed since: choose "
+        "another folder, or take it away."
+    )
+
+
+def _is_own(folder: Path, name: str, own: Digests) -> bool:
+    path = folder / name
+    above = list(PurePosixPath(name).parents)[:-1]
+    return (
+        all(_is_folder(folder / one) for one in above)
+        and path.is_file()
+        and not path.is_symlink()
+        and _digest(path) in own.get(name, ())
+    )
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _listed(folder: Path, kind: str) -> Digests:
+    path = _list(folder, kind)
+    if not os.path.lexists(path):
+        return {}
+    try:
+        if path.is_symlink() or path.stat().st_size > limits.TEXT:
+            raise ValueError
+        return {_name(name): list(map(str, digests)) for name, digests in _items(path)}
+    except (OSError, ValueError, TypeError, RecursionError):
+        raise _other(path) from None
+
+
+def _items(path: Path):
+    listed = json.loads(path.read_text())
+    if not isinstance(listed, Mapping):
+        raise ValueError
+    return listed.items()
+
+
+def _name(text: str) -> str:
+    """A name inside of the folder."""
+    name = PurePosixPath(text)
+    if name.is_absolute() or ".." in name.parts or not name.parts:
+        raise ValueError
+    return text
+
+
+def _write_list(folder: Path, kind: str, digests: Digests) -> None:
+    with replacing(_list(folder, kind)) as path:
+        path.write_text(json.dumps(digests, indent=1))
+
+
+def _list(folder: Path, kind: str) -> Path:
+    return folder / f".hybridjax-{kind}.json"
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,319 @@
+"""Which executable runs, where it may be used, and what is kept on disk."""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import threading
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax._core import compilation
+from hybridjax._core.compilation import (
+    TwoTiers,
+    in_turn,
+    is_left_to_lapack,
+    kernel,
+    quick_jit,
+    uncollected,
+)
+from hybridjax._core.executor import is_inside_program
+from hybridjax._core.lanes import PerLane, by_lane
+
+
+@quick_jit
+def double(x):
+    return 2 * x
+
+
+@quick_jit
+def wrong(x):
+    raise ValueError("compiler_options are not to blame")
+
+
+X = jnp.arange(3.0)
+WAYS = {
+    "plain": lambda f: f(X),
+    "jit": lambda f: jax.jit(f)(X),
+    "jit without arguments": lambda f: jax.jit(lambda: f(X))(),
+    "cond": lambda f: jax.lax.cond(True, lambda: f(X), lambda: X),
+    "vmap": lambda f: jax.vmap(f)(X),
+    "jvp": lambda f: jax.jvp(f, (X,), (X,))[1],
+    "gradient over something else": lambda f: jax.grad(lambda z: z * f(X).sum())(1.0) * X / 3,
+    "no jit": lambda f: jax.disable_jit()(f)(X),
+}
+
+
+@pytest.mark.parametrize("function", [double, TwoTiers(lambda x: 2 * x, False)])
+@pytest.mark.parametrize("way", WAYS)
+def test_programs_work_wherever_they_are_called(way, function):
+    np.testing.assert_array_equal(WAYS[way](function), 2 * X)
+
+
+def test_errors_of_the_function_come_through():
+    for call in (wrong, jax.jit(wrong), TwoTiers(wrong, False)):
+        with pytest.raises(ValueError, match="not to blame"):
+            call(X)
+    assert gc.isenabled()
+
+
+def test_inside_of_a_program():
+    inside = []
+    look = lambda: inside.append(is_inside_program())  # noqa: E731
+    look()
+    jax.jit(look)()
+    jax.vmap(lambda x: (look(), x)[1])(X)
+    assert inside == [False, True, False]
+
+
+class Pair(NamedTuple):
+    sum: jax.Array
+    nothing: None
+
+
+@pytest.fixture
+def tiers(monkeypatch):
+    """The options of all programs that are compiled, which begin with none."""
+    compiled, compile = [], jax.stages.Lowered.compile
+
+    def count(self, compiler_options=None):
+        compiled.append("quick" if compiler_options else "full")
+        return compile(self, compiler_options)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", count)
+    compilation._by_kind.clear()
+    compilation._by_text.clear()
+    return compiled
+
+
+def total(x, make, k):
+    return Pair(make(x).sum() + k, None)
+
+
+def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
+    monkeypatch.setattr(compilation, "_WORTH_OPTIMIZING", -1.0)
+    job = TwoTiers(total, large=False)
+    assert job(X, jnp.sin, 1) == Pair(jnp.sin(X).sum() + 1, None)
+    for program in compilation._by_kind.values():
+        program._thread.join()
+    assert tiers == ["quick", "full"]
+    job(X + 1, jnp.sin, 1)
+    (program,) = compilation._by_kind.values()
+    assert [x[1] for x in job._chosen.values()] == [program._quick]  # one program for one job
+    later = TwoTiers(total, large=False)
+    np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
+    assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
+
+
+def test_a_large_job_waits_for_the_optimized_program(tiers):
+    TwoTiers(total, large=False)(X, jnp.sin, 1)
+    TwoTiers(total, large=True)(X, jnp.sin, 1)
+    assert tiers == ["quick", "full"]
+
+
+def test_functions_that_are_written_anew_share_a_program(tiers):
+    job = TwoTiers(total, large=False)
+    for _ in range(3):
+        job(X, lambda x: 2 * x, 1)
+    assert tiers == ["quick"]
+    values = [job(X, lambda x: 3 * x, 1), job(X[:2], lambda x: 2 * x, 1), job(X, jnp.cos, 4)]
+    np.testing.assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
+    assert len(tiers) == 4
+
+
+def test_threads_share_one_program(tiers):
+    job, results = TwoTiers(total, large=False), []
+    work = lambda: results.append(job(X, jnp.cos, 0).sum)  # noqa: E731
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(map(float, results))) == 1 and tiers == ["quick"]
+
+
+def test_vector_math_that_is_switched_off_makes_another_program(tiers):
+    job = TwoTiers(total, large=False)
+    job(X, by_lane(jnp.sin), 1)
+    try:
+        hj.enable_vector_math(False)
+        job(X, by_lane(jnp.sin), 1)
+    finally:
+        hj.enable_vector_math()
+    assert len(compilation._by_kind) == 2
+
+
+def point(power, tree, x, y):
+    return tree["k"] * 3.0 * jnp.sin(x) ** power + y
+
+
+def plain(function, *trees):
+    return by_lane(function, *trees)
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 4, 8])
+def test_a_kernel_of_any_number_of_lanes(lanes):
+    x, y = np.linspace(0.0, 1.0, 4)[None], np.ones((1, 1))
+    before = compilation._kernel_program.cache_info().misses
+    for k in (1.0, 2.0):
+        values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
+        np.testing.assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
+    assert compilation._kernel_program.cache_info().misses == before + 1
+    some = np.array([False, True, False, True])
+    values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(x, y, some=some)
+    expected = (3 * np.sin(x) ** 2 + y)[:, some]
+    np.testing.assert_allclose(values[:, some], expected, rtol=1e-15)
+
+
+def test_a_kernel_with_a_number_for_each_lane():
+    k = np.linspace(1.0, 2.0, 4)
+    own = PerLane({"k": jnp.asarray(k)}, (True,))
+    values = kernel(point, plain, (1,), (own,), 4)(k[None], np.zeros((1, 1)))
+    np.testing.assert_allclose(values, k * 3 * np.sin(k[None]), rtol=1e-15)
+
+
+def test_programs_that_call_lapack_take_turns():
+    A = np.eye(2)
+    assert is_left_to_lapack(eqx.filter_jit(lambda A: jnp.linalg.eigvals(A)), A)
+    assert not is_left_to_lapack(eqx.filter_jit(lambda A: A @ A), A)
+    inside, counts, met = [], [], threading.Barrier(2)
+
+    def work():
+        met.wait(10.0)
+        for _ in range(100):
+            with in_turn(True):
+                inside.append(1)
+                counts.append(len(inside))
+                inside.pop()
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts == [1] * 200
+
+
+def test_garbage_is_collected_again_after_the_last_thread():
+    entered, leave = threading.Event(), threading.Event()
+
+    def other():
+        with uncollected:
+            entered.set()
+            leave.wait(10.0)
+
+    thread = threading.Thread(target=other)
+    with pytest.raises(KeyError), uncollected:
+        thread.start()
+        entered.wait(10.0)
+        raise KeyError
+    assert not gc.isenabled()
+    leave.set()
+    thread.join()
+    assert gc.isenabled()
+
+
+def test_a_cache_that_others_can_write_to_is_refused(tmp_path):
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        assert hj.enable_compilation_cache(tmp_path / "mine") == tmp_path / "mine"
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "mine")
+        assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o700
+        (tmp_path / "mine").chmod(0o777)
+        with pytest.raises(hj.DefinitionError, match="other users can write to it"):
+            hj.enable_compilation_cache(tmp_path / "mine")
+    finally:
+        hj.enable_compilation_cache(before)
+
+
+LATE = """
+import jax, os, hybridjax as hj
+from hybridjax._core.compilation import _loops_are_kernels
+always = _loops_are_kernels()
+try:
+    hj.enable_loop_kernels()
+    print("done", always)
+except hj.ComputationError as error:
+    print(os.environ.get("XLA_FLAGS"), error)
+"""
+EARLY = """
+import json, os, numpy as np, hybridjax as hj
+hj.enable_loop_kernels()
+hj.enable_loop_kernels()
+hj.enable_x64()
+flags = os.environ["XLA_FLAGS"]
+cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+u = 0.01 * np.random.default_rng(0).standard_normal((40, 64, 1))
+data = hj.run_experiments(cycle, hj.ClockPhase(32), u, ("yM", "vM"), discard=0)
+print(json.dumps([flags, data.y.tolist()]))
+"""
+LAPACK = """
+import equinox as eqx, jax.numpy as jnp, numpy as np, hybridjax as hj
+hj.enable_x64()
+
+class Decay(hj.Chart):
+    states = ("x", "y")
+    def field(self, t, q, u):
+        return -q[0] + u[0], -2 * q[1] + 0.0 * jnp.sin(2 * jnp.pi * t)
+
+class Kicked(hj.HybridSystem):
+    kick: hj.Parameter = hj.parameter(1.0)
+    def charts(self):
+        return {"a": Decay()}
+    def transitions(self):
+        def reset(t, q, u):
+            A = jnp.array([[2.0, q[0]], [-1.0, 1.0]])  # its eigenvalues are left to LAPACK
+            B = (2 + q[0] ** 2) * jnp.eye(33)  # and so is a system of so many equations
+            x = jnp.linalg.eigvals(A).real.sum() + jnp.linalg.solve(B, jnp.ones(33))[0]
+            return 0.1 * x + self.kick, 0.5 * q[1] + 0.2
+        return [hj.Transition("kick", "a", "a", hj.Scheduled(1.0), reset=reset)]
+    def period(self):
+        return 1.0
+
+two = hj.Execution(workers=2, batch=250)
+cycle = hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.5, 0.1), 0.5))
+kicks = eqx.filter_vmap(lambda k: Kicked(kick=k))(jnp.linspace(0.5, 1.5, 500))
+print(hj.find_limit_cycles(kicks, cycle, execution=two).summary())
+u = 1e-3 * np.random.default_rng(0).normal(size=(500, 12, 1))
+print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), discard=0, execution=two).summary())
+"""
+
+
+def run(code: str, **environment: str) -> str:
+    before = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    environment = before | {"JAX_PLATFORMS": "cpu"} | environment
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_loop_kernels_that_come_too_late_are_refused():
+    """The options stay as they were; unless XLA makes whole loops by default."""
+    printed = run(LATE)
+    if printed.strip() == "done True":
+        pytest.skip("this XLA makes single kernels of loops by default")
+    assert printed.startswith("None ") and "before JAX computes anything" in printed
+
+
+@pytest.mark.slow
+def test_loop_kernels_give_the_same_experiments(hopper_cycle):
+    u = 0.01 * np.random.default_rng(0).standard_normal((40, 64, 1))
+    data = hj.run_experiments(hopper_cycle, hj.ClockPhase(32), u, ("yM", "vM"), discard=0)
+    flags, y = json.loads(run(EARLY, XLA_FLAGS="--xla_cpu_enable_fast_math=false"))
+    assert flags.startswith("--xla_cpu_enable_fast_math=false --xla_backend_extra_options=")
+    assert len(flags.split()) == 2
+    np.testing.assert_allclose(y, data.y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_two_workers_with_lapack_do_not_wait_for_each_other():
+    printed = run(LAPACK)
+    assert "500/500 found" in printed and "500/500 ok" in printed

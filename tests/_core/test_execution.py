@@ -1,0 +1,85 @@
+"""Work on all cores, and none of BLAS beside it."""
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybridjax._core import execution
+from hybridjax._core.execution import Library, on_all_cores, one_blas_thread, thread_count
+from hybridjax._core.executor import on_cpu
+
+
+def test_the_default_device_counts_more_than_the_backend(monkeypatch):
+    """A CPU that is asked for on a machine with a GPU is a CPU."""
+    assert on_cpu()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not on_cpu() and thread_count(None) == 1
+    with jax.default_device("cpu"):
+        assert on_cpu() and jnp.ones(1).devices() == {jax.devices("cpu")[0]}
+    assert not on_cpu()
+
+
+@pytest.fixture
+def library(monkeypatch):
+    """One that uses four threads."""
+    count = [4]
+    library = Library(lambda: count[0], lambda n: count.__setitem__(0, n))
+    monkeypatch.setattr(execution, "libraries", lambda: [library])
+    return library
+
+
+def test_the_libraries_of_numpy_and_scipy_use_one_thread():
+    libraries = execution.libraries()
+    if not libraries:
+        pytest.skip("NumPy has another BLAS here")
+    before = [x.get() for x in libraries]
+    with one_blas_thread():
+        assert [x.get() for x in libraries] == [1] * len(libraries)
+    assert [x.get() for x in libraries] == before
+
+
+def test_threads_come_back(library):
+    """After an error, and when the last of several has ended."""
+    with pytest.raises(ZeroDivisionError), one_blas_thread():
+        1 / 0  # noqa: B018
+    assert library.get() == 4
+    entered, leave = threading.Event(), threading.Event()
+
+    @one_blas_thread()
+    def other():
+        entered.set()
+        leave.wait(10.0)
+
+    thread = threading.Thread(target=other)
+    with one_blas_thread():
+        thread.start()
+        entered.wait(10.0)
+    assert library.get() == 1
+    leave.set()
+    thread.join()
+    assert library.get() == 4
+
+
+@pytest.mark.parametrize(("blas", "cores"), [("1", 2), ("2", 1), (None, 1), ("known", 2)])
+def test_cores_are_left_to_blas_unless_it_has_one_thread(monkeypatch, library, blas, cores):
+    """In order, under the caller's treatment of overflow."""
+    monkeypatch.setattr(execution, "core_count", lambda: 2)
+    monkeypatch.setattr(execution, "libraries", lambda: [library] if blas == "known" else [])
+    if blas is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", blas)
+    met = threading.Barrier(cores)
+
+    def work(k):
+        met.wait(10.0)  # until as many are at work
+        return k, np.float64(1e308) * k
+
+    with np.errstate(over="ignore"):
+        results = on_all_cores(work, range(4))
+    assert results == [(0, 0.0), (1, 1e308), (2, np.inf), (3, np.inf)]
+    with pytest.raises(ZeroDivisionError):
+        on_all_cores(lambda k: 1 / k, [1, 0] * cores)
