@@ -6,7 +6,6 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hybridjax._core.compilation.compile import quick_jit
 
 import hybridjax as hj
 from hybridjax._core.compilation import quick_jit
