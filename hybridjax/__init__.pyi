@@ -65,7 +65,7 @@ from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
-from .scale.map import sweep as sweep
+from .scale.sweep import sweep as sweep
 from .sections.families import (
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,

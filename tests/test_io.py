@@ -10,6 +10,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
 
 
 def same(a, b):
@@ -71,8 +72,8 @@ def test_failed_experiments_and_cycle_outputs(folder):
     y[1, 3:] = np.nan
     data = hj.ExperimentData(
         np.zeros((2, 6, 1)), y, n_sections=3, periods=1, result=[0, hj.Result.GRAZING],
-        simulated=hj.experiments.Simulated(np.array([-1, 3])),
-        cycle_outputs=np.arange(3.0)[:, None], label="by hand",
+        simulated=Simulated(np.array([-1, 3]), label="by hand"),
+        cycle_outputs=np.arange(3.0)[:, None],
     )  # fmt: skip
     object.__setattr__(data, "periods", np.int64(1))  # as where nobody checks annotations
     back = trip(folder, data)

@@ -38,7 +38,7 @@ def test_every_public_name_is_in_the_reference_once():
 GIVEN = UNCHECKED["made by this package"] | {
     "AbstractLevels", "AbstractObservation", "Arrival", "BranchEnd", "BranchPoint", "Coincidence",
     "ComputationError", "CyclePoint", "Design", "Event", "ExperimentEvent", "FamilyLike",
-    "FileFormatError", "HTF", "HasRecords", "HeldOut", "IntervalEvents", "LDTP",
+    "FileFormatError", "HTF", "HeldOut", "IntervalEvents", "LDTP",
     "MultiplierEstimate", "PhaseDefinition", "PrecisionError", "Response", "SectionsLike",
     "Simulated", "StoredExperiments", "Structure",
 }  # fmt: skip

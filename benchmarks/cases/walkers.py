@@ -10,8 +10,7 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax.experiments import campaign
-from hybridjax.experiments.campaign import prepare
-from hybridjax.experiments.options import Options
+from hybridjax.experiments.campaign import Options, prepare
 
 from .problems import first_and_later
 

@@ -18,7 +18,7 @@ from ..sections.placed import PlacedSections, observe, section_target
 from ..systems.output import Output
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .stepping.plan import Plan
+from .plan import Plan
 
 
 # The error that rounding alone may leave at a section, relative to the states' scales. Twice as

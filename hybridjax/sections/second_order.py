@@ -18,7 +18,7 @@ from ..systems.structure import Structure
 from .families import FamilyLike
 from .linearize import inputs_of
 from .place import as_placed
-from .placed import PlacedSections
+from .placed import PlacedSections, observe
 
 
 # Complex numbers in the largest array of responses to pairs of cosines. Doubled: twice the memory,

@@ -206,12 +206,12 @@ def test_pairs_cancel_even_distortion(model):
     design = LINES.realizations(3).with_negatives()
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P)
-    estimate = hj.estimate_htf(hj.experiments.odd_part(bent))
+    estimate = hj.estimate_htf(bent.odd_part())
     assert estimate.error(model.htf(estimate.f)).max() < 1e-12
     with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
-        hj.experiments.odd_part(realized(model, 2))
+        realized(model, 2).odd_part()
     with pytest.raises(hj.DefinitionError, match="one has no partner"):
-        hj.experiments.odd_part(hj.ExperimentData(data.u[:3], data.y[:3], n_sections=N, periods=P))
+        hj.ExperimentData(data.u[:3], data.y[:3], n_sections=N, periods=P).odd_part()
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import linalg
 
 import hybridjax as hj
+from hybridjax.experiments.record import HasRecords
 from hybridjax.identify.series.arx import delayed_outputs
 from hybridjax.identify.series.gradient_covariance import gradient_covariance
 from hybridjax.identify.series.linearization import each_part, linearize
@@ -272,7 +273,7 @@ def test_all_data_are_made_of_records(small, experiments):
     for fit in fits[1:]:
         np.testing.assert_array_equal(fit.coefficients, fits[0].coefficients)
     whole = record(small, 100, first_section=1)
-    assert whole.records == (whole,) and isinstance(data, hj.experiments.HasRecords)
+    assert whole.records == (whole,) and isinstance(data, HasRecords)
     part = whole.part(10, 20)
     assert part.first_section == 3 and part.outputs == whole.outputs
     np.testing.assert_array_equal(part.y, whole.y[10:20])

@@ -7,7 +7,7 @@ from ..._core.boundary.checked import checked
 from ...errors import DefinitionError
 from ...experiments.data import ExperimentData
 from ...experiments.design.design import Design
-from ...experiments.linear_model import simulate_experiments
+from ...experiments.noise import simulate_experiments
 from ...linear.frequency_response import Harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP

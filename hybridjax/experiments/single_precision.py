@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.compilation import quick_jit
-from ..._core.executor import from_host
-from ..._core.memo import Memory
-from ..._core.precision import single, single_precision
-from ..._core.results import Result
-from ...engine.move import move
-from ...engine.search.state import Stride
-from ...engine.settings import Settings
-from ...errors import DefinitionError
-from ...sections.placed import PlacedSections
+from .._core.compilation import quick_jit
+from .._core.executor import from_host
+from .._core.memo import Memory
+from .._core.precision import single, single_precision
+from .._core.results import Result
+from ..engine.move import move
+from ..engine.search.state import Stride
+from ..engine.settings import Settings
+from ..errors import DefinitionError
+from ..sections.placed import PlacedSections
 from .plan import Plan, Stepping, plan_flow
 
 

@@ -13,19 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.boundary.values import Number
-from ..._core.compilation import at_ease, host_first
-from ..._core.executor import Array, from_host, namespace, to_host
-from ..._core.memo import Memory
-from ..._core.results import Result
-from ...engine.jacobian import tape_jacobian
-from ...engine.move import move
-from ...engine.search.state import Stride
-from ...engine.settings import Settings
-from ...engine.watch import watch
-from ...errors import ComputationError
-from ...sections.place import PATIENCE
-from ...sections.placed import PlacedSections
+from .._core.boundary.values import Number
+from .._core.compilation import at_ease, host_first
+from .._core.executor import Array, from_host, namespace, to_host
+from .._core.memo import Memory
+from .._core.results import Result
+from ..engine.jacobian import tape_jacobian
+from ..engine.move import move
+from ..engine.search.state import Stride
+from ..engine.settings import Settings
+from ..engine.watch import watch
+from ..errors import ComputationError
+from ..sections.place import PATIENCE
+from ..sections.placed import PlacedSections
 
 
 # Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
