@@ -36,7 +36,7 @@ from hybridjax.identify.joint.prediction.problem import SeriesProblem
 from hybridjax.identify.joint.prediction.series_part import SeriesPart
 from hybridjax.identify.multipliers.bound import MultiplierBound
 from hybridjax.identify.multipliers.denominator import multipliers_of
-from hybridjax.identify.series.cycle_grid import CycleGrid
+from hybridjax.identify.series.records import CycleGrid
 
 
 CYCLES, SENSOR, COLOR, GROWTH = 300, 0.1, 0.8, 1.145

@@ -20,7 +20,7 @@ from .experiments.design.design import Design
 from .experiments.record import Record
 from .identify.multipliers.structured import StructuredFit
 from .identify.rational.fit import RationalFit
-from .identify.series.series_fit import SeriesFit
+from .identify.series.fit import SeriesFit
 from .linear.htf import HTF
 from .linear.ldtp import LDTP
 

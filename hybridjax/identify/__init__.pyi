@@ -17,8 +17,8 @@ from .multipliers.order import OrderSelection as OrderSelection
 from .multipliers.structured import StructuredFit as StructuredFit
 from .rational.aaa import AAAFit as AAAFit, fit_aaa as fit_aaa
 from .rational.fit import RationalFit as RationalFit
+from .series.fit import SeriesFit as SeriesFit
 from .series.realization import realize as realize
-from .series.series_fit import SeriesFit as SeriesFit
 from .validation.amplitude import (
     AmplitudeSweep as AmplitudeSweep,
     amplitude_sweep as amplitude_sweep,

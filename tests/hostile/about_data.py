@@ -162,7 +162,7 @@ def series(t):
     order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
     yield "fit_series", hj.fit_series, dict(data=t.record, order=2), {
         "data": data, "order": order, "overhang": optional([*WHOLE, 10**6]), "start": WORD,
-        "errors": WORD, "distortion": optional(FLAG), "check": FLAG, "max_steps": COUNT,
+        "errors": WORD, "check": FLAG, "max_steps": COUNT,
     }  # fmt: skip
     yield "SeriesFit.impulse_response", t.fit.impulse_response, dict(n_lags=3), {
         "n_lags": LIMITED,
