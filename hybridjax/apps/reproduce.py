@@ -29,7 +29,7 @@ from ..identify.multipliers import StructuredFit, fit_multipliers
 from ..identify.rational import RationalFit, fit_rational
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from ..models.hopper import VerticalHopper
+from ..models.hoppers import VerticalHopper
 from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from hypothesis import assume, given, settings, strategies as st
 
-from hybridjax.engine.hermite import first_crossing
+from hybridjax.engine.cubic import first_crossing
 
 
 number = st.floats(-4.0, 4.0).map(lambda x: round(x, 3))

@@ -13,19 +13,15 @@ from .._core.precision import at_precision
 
 
 # An extremum within this part of the guard's values at the step's ends (in double and in single
-# precision) is a touch. Twice as much calls more flights past a guard grazing.
+# precision) is a touch. Higher: passing near a guard is called grazing. Lower: grazing is missed.
 TOUCH = 1e-10, 1e-6
-# An extremum within this part of them is a near miss, which a shorter step must settle. Twice as
-# much shortens more steps; half of it may miss a guard that dips below zero within one.
+# An extremum within this part of them is a near miss, for which the step is halved. Higher: more
+# steps. Lower: a guard that dips below zero within a step is missed.
 NEAR = 1e-2
-# Steps to the zero of a cubic within a bracket: guards that fall almost together are told apart.
-_BRACKETED_STEPS = 10
-# Newton's steps to the zero of a cubic from the end of the step, where it is near.
-_NEWTON_STEPS = 4
 
 
 class CubicCrossing(NamedTuple):
-    """What a guard does within a step."""
+    """Zeros and extrema of a guard within a step."""
 
     position: Float[Array, "*shape"]
     """The first falling zero, as a fraction of the step; infinity if there is none."""
@@ -35,13 +31,11 @@ class CubicCrossing(NamedTuple):
     """It comes so close to zero without crossing that the interpolant cannot be trusted."""
 
 
-def first_crossing(
-    v0: Float[Array, "*shape"],
-    v1: Float[Array, "*shape"],
-    d0: Float[Array, "*shape"],
-    d1: Float[Array, "*shape"],
-    armed: Bool[Array, "*shape"],
-) -> CubicCrossing:
+Values = Float[Array, "*shape"]
+Flags = Bool[Array, "*shape"]
+
+
+def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags) -> CubicCrossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 
     A guard that is not armed at the start counts only after it has become positive.
@@ -70,10 +64,10 @@ def first_crossing(
     third = (vb > 0) & (v1 <= 0) & (sb < 1)
     lo = xp.where(first, 0.0, xp.where(second, sa, sb))
     hi = xp.where(first, sa, xp.where(second, sb, 1.0))
-    found = first | second | third
+    crosses = first | second | third
 
     s = 0.5 * (lo + hi)
-    for _ in range(_BRACKETED_STEPS):  # kept inside the shrinking bracket
+    for _ in range(10):  # Newton's steps within a bracket that shrinks, to rounding
         value = cubic(s)
         lo, hi = xp.where(value > 0, s, lo), xp.where(value > 0, hi, s)
         guess = s - _divide(value, slope(s))
@@ -86,7 +80,7 @@ def first_crossing(
         dips = before & (node < 1) & (b + 3 * c * node > 0)
         touch = touch | (dips & (xp.abs(value) <= small))
         near = near | (dips & (value > small) & (value < NEAR * scale))
-    return CubicCrossing(xp.where(found, s, xp.inf), touch, near & ~found)
+    return CubicCrossing(xp.where(crosses, s, xp.inf), touch, near & ~crosses)
 
 
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
@@ -95,7 +89,7 @@ def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     b = 3 * rise - 2 * d0 - d1
     c = d0 + d1 - 2 * rise
     s = xp.ones_like(v1)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(4):
         value = v0 + s * (d0 + s * (b + s * c))
         s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
     return s
@@ -103,7 +97,7 @@ def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
 
 def interpolate(x, h, q0, q1, f0, f1):
     """The cubic at fraction x of a step of length h, from the states at its ends and the fields
-    there. (Of NumPy's arrays as of JAX's.)"""
+    there, for arrays of either executor."""
     return (
         q0 * (1 + 2 * x) * (1 - x) ** 2
         + q1 * x**2 * (3 - 2 * x)
