@@ -1,4 +1,4 @@
-"""Experiments designed for the question: which cosines answer it in the fewest strides."""
+"""Experiments that estimate a quantity of interest in the fewest strides."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-r"""The powers that give the smallest variance within limits.
+r"""The powers that give the smallest variance within limits, and their division into experiments.
 
 For a given estimator the variance of a goal is $\sum_k a_k^2 / p_k$, with $a_k^2 = p_k^2 s_k$ at
 the powers for which it is the best one, and sensitivities $s_k = -\partial \Psi / \partial p_k$.
@@ -10,63 +10,76 @@ to be monotone).
 *Proof of optimality.* $\Psi$ is convex and $\Psi(tp) = \Psi(p)/t$, so that for every q within the
 limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_k$, a linear program
 (the general equivalence theorem; Pronzato and Pazman, *Design of Experiments in Nonlinear Models*,
-2013). With one limit e is the largest sensitivity per unit of what is limited, 1 at the optimum.
+2013). With one limit e is the largest sensitivity per unit of the limit, 1 at the optimum.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linprog
 
-from .limits.limits import PowerLimits
-from .questions.question import AbstractQuestion, Answer
+from ..experiments.design.design import Design
+from ..experiments.design.partition import line_class
+from .candidates import Candidates, Powers
+from .criterion import Bound, Criterion
+from .limits import PowerLimits
 
 
-# Powers never fall below this part of the largest one while they are looked for, so that numerators
-# stay defined at all lines. Ten times more: variances are larger by as little as it is.
+# Powers never fall below this part of the largest one during the search, so that numerators stay
+# determined at all lines. Larger: variances are larger by as little. Smaller: rounding errors.
 _FLOOR = 1e-9
-# Excess of the certificate at which powers are good enough. Doubled: strides may be 4 % more than
-# necessary (in fact a tenth of that), in half of the time.
+# Excess of the certificate at which powers are accepted. Larger: more strides than necessary (by a
+# tenth of it, typically). Smaller: many more steps for a gain that no experiment shows.
 _ENOUGH = 0.02
-# Steps between two looks at the certificate; of the iteration for several limits.
-_LOOK, _PRICES = 5, 8
-# Steps are tried at a multiple of their logarithm that grows by this factor, and halved where they
-# raise the criterion. Larger: more steps are in vain.
+# Largest number of steps. Fewer: several limits end with a certificate above 1.02.
+_MAX_STEPS = 300
+# Steps between two certificates, and of the iteration for the prices of several limits. Fewer of
+# the latter: the limits are not met, and the criterion may rise.
+_CHECK, _PRICES = 5, 8
+# Factor by which the length of steps (the multiple of their logarithm) grows; it is halved where a
+# step raises the criterion. Larger: more steps in vain. Smaller: more steps.
 _LONGER = 1.15
 # The smallest multiple. (The criterion falls for sure at 1, but for the worst of several models and
-# the choice of an order, which the sum only approximates.) Half of it: some of these end closer to
-# the optimum.
+# the choice of an order, which the sum only approximates.) Larger: these stop too early.
 _SHORTEST = 1 / 16
-# Relative rise of the criterion that is left to rounding, and to weak cosines on their floor. Ten
-# times more: of the worst of several models shorter steps are missed.
+# Relative rise of the criterion that counts as rounding, or as that of weak cosines on their
+# floor. Larger: steps that are too long for the worst of several models are accepted.
 _RISE = 1e-6
+# Sweeps by which experiments are brought to the same power. Fewer: they differ by more than 1e-6.
+_SWEEPS = 100
+# Remaining share of a cosine in an experiment, relative to its largest share, that is dropped.
+# Larger: experiments differ in power. Smaller: cosines without effect occupy experiments.
+_WEAK = 1e-4
 
 
 class Certificate(NamedTuple):
-    """How much better other powers within the limits can be."""
+    """A bound of the improvement by other powers within the limits."""
 
     excess: float
-    """e: with none can the criterion be smaller than a part 1/e of what it is."""
-    relative: Float[np.ndarray, " K"]
-    """Sensitivities, relative to what a cosine's power costs: 1 on the average over the power, and
-    e at most. NaN where no limit that is reached holds for a cosine."""
+    """e: no other powers can make the criterion smaller than a part 1/e of its value."""
+    relative: Powers
+    """Sensitivities, relative to the price of a cosine's power: 1 on the average over the power,
+    and e at most. NaN where no active limit applies to a cosine."""
 
 
 def certify(
-    found: Answer,
-    power: Float[np.ndarray, " K"],
+    bound: Bound,
+    power: Powers,
     limits: PowerLimits,
     level: Float[np.ndarray, " O"] | float = 1.0,
 ) -> Certificate:
-    """**Arguments:** `found`, the answer with these powers; `level`, as of `PowerLimits.at`."""
+    """Return the certificate of powers with this bound.
+
+    **Arguments:** `level`: as in `PowerLimits.tangent`.
+    """
     # In units of the power that each cosine may have alone, since the solver's tolerances are
     # absolute.
-    limits = limits.at(power, level)
+    limits = limits.tangent(power, level)
     alone = 1 / np.abs(limits.cost).max(axis=0)
-    gain = alone * found.sensitivity / (power @ found.sensitivity)
+    gain = alone * bound.sensitivity / (power @ bound.sensitivity)
     best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
-    if best.x is None:  # a quadratic form may let some powers grow as far as it knows here
+    if best.x is None:  # the tangent of a quadratic limit may leave some powers unbounded
         return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
     relative = gain / gain.max() / np.where(price > 0, price, np.nan)
@@ -74,60 +87,150 @@ def certify(
 
 
 class Allocation(NamedTuple):
-    """Powers, and how good they are."""
+    """Powers, with their bound and certificate."""
 
-    power: Float[np.ndarray, " K"]
-    answer: Answer
+    power: Powers
+    bound: Bound
     certificate: Certificate
 
 
 def allocate(
-    question: AbstractQuestion, limits: PowerLimits, start: Float[np.ndarray, " K"], max_steps: int
+    criterion: Criterion, limits: PowerLimits, start: Powers, max_steps: int = _MAX_STEPS
 ) -> Allocation:
-    """The best powers within limits, from others.
+    """Return the best powers within limits, starting from others.
 
-    **Raises:** `DefinitionError` as `question.answer`.
+    **Raises:** `DefinitionError` as `Criterion.bound`.
     """
-    power = limits.within(np.maximum(start, _FLOOR * start.max()))
+
+    def floored(power: Powers) -> Powers:
+        return limits.scaled(np.maximum(power, _FLOOR * power.max()))
+
+    def step_towards(target: Powers, length: float) -> tuple[Powers, Bound]:
+        trial = floored(limits.scaled(power * (floored(target) / power) ** length))
+        return trial, criterion.bound(trial)
+
+    power = floored(start)
     shares = len(limits.use(power))
-    prices, longer = np.full(shares, 1 / shares), _LONGER
-    now = question.answer(power)
+    prices, length = np.full(shares, 1 / shares), _LONGER
+    now = criterion.bound(power)
     for step in range(max_steps + 1):
-        if step % _LOOK == 0 or step == max_steps:
+        if step % _CHECK == 0 or step == max_steps:
             certificate = certify(now, power, limits)
             if certificate.excess <= 1 + _ENOUGH or step == max_steps:
                 break
-        short, prices = _cheapest(power * np.sqrt(now.sensitivity), limits.at(power), prices)
-        trial = _along(power, short, longer, limits)
-        found = question.answer(trial)
-        if found.criterion > now.criterion:
-            surely = longer > 1
-            longer = max(longer / 2, 1.0 if surely else _SHORTEST)
-            trial = _along(power, short, 1.0 if surely else longer, limits)
-            found = question.answer(trial)
-        if found.criterion <= now.criterion * (1 + _RISE):
-            power, now, longer = trial, found, longer * _LONGER
+        target, prices = _cheapest(power * np.sqrt(now.sensitivity), limits.tangent(power), prices)
+        trial, bound = step_towards(target, length)
+        if bound.criterion > now.criterion:
+            shortest = 1.0 if length > 1 else _SHORTEST
+            length = max(length / 2, shortest)
+            trial, bound = step_towards(target, 1.0 if shortest == 1 else length)
+        if bound.criterion <= now.criterion * (1 + _RISE):
+            power, now, length = trial, bound, length * _LONGER
     return Allocation(power, now, certificate)
 
 
-def _along(
-    power: Float[np.ndarray, " K"],
-    short: Float[np.ndarray, " K"],
-    longer: float,
-    limits: PowerLimits,
-) -> Float[np.ndarray, " K"]:
-    """Powers on the way to others, or beyond them, within limits."""
-    short = limits.within(np.maximum(short, _FLOOR * short.max()))
-    power = limits.within(power * (short / power) ** longer)
-    return limits.within(np.maximum(power, _FLOOR * power.max()))
-
-
 def _cheapest(
-    a: Float[np.ndarray, " K"], limits: PowerLimits, prices: Float[np.ndarray, " L"]
-) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " L"]]:
-    r"""The powers within limits that minimize $\sum a_k^2/p_k$: $a_k / \sqrt{(W^T \mu)_k}$, with
-    prices $\mu$ of the limits, which rise where a limit is exceeded."""
+    a: Powers, limits: PowerLimits, prices: Float[np.ndarray, " L"]
+) -> tuple[Powers, Float[np.ndarray, " L"]]:
+    r"""Return the powers within limits that minimize $\sum a_k^2/p_k$:
+    $a_k / \sqrt{(W^T \mu)_k}$, with prices $\mu$ of the limits, which rise where a limit is
+    exceeded."""
     for _ in range(_PRICES):
         power = a / np.sqrt(limits.price(prices))
         prices = prices * limits.use(power) ** 2
-    return limits.within(power), prices
+    return limits.scaled(power), prices
+
+
+def worthwhile(
+    cosines: Candidates, gain: Powers, experiments: int, negligible: float
+) -> Bool[np.ndarray, " K"]:
+    """Return the cosines that matter, and that so many experiments can hold: of each class of lines
+    that interfere with each other the best ones.
+
+    **Arguments:** `gain` of each; `negligible`: the part of the total gain that is left out.
+    """
+    order = np.argsort(gain)
+    kept = np.empty(len(gain), bool)
+    kept[order] = np.cumsum(gain[order]) > negligible * gain.sum()
+    classes = line_class(cosines.line, cosines.periods)
+    for number in np.unique(classes):
+        members = np.flatnonzero(kept & (classes == number))
+        weakest = members[np.argsort(gain[members])]
+        kept[weakest[: max(len(members) - experiments, 0)]] = False
+    return kept
+
+
+def occurrences(
+    cosines: Candidates, use: Powers, need: Powers, experiments: int
+) -> Int[np.ndarray, " K"]:
+    """Return the number of experiments that hold each cosine. No two of one class share an
+    experiment, and all experiments are used: strong cosines occur in several.
+
+    **Arguments:** `use`: the share of the limits that each takes; `need`: the number that each
+    needs for its largest amplitude. Where a class needs more than there are, strong ones get fewer:
+    numerators need all lines.
+    """
+    classes = line_class(cosines.line, cosines.periods)
+    counts = np.maximum(np.ceil(need - _WEAK), 1).astype(int)
+    for number in np.unique(classes):
+        members = np.flatnonzero(classes == number)
+        count = counts[members]
+        while count.sum() > experiments:
+            count[np.argmax(np.where(count > 1, count - need[members], -np.inf))] -= 1
+        while count.sum() < experiments:
+            count[np.argmax(use[members] / count)] += 1
+        counts[members] = count
+    return counts
+
+
+def to_design(
+    cosines: Candidates,
+    power: Powers,
+    use: Powers,
+    counts: Int[np.ndarray, " K"],
+    largest: Powers,
+    experiments: int,
+    usual: Design,
+    seed: int,
+) -> Design:
+    """Return experiments in which each cosine has this power on the average, and which all take the
+    same share of the limits.
+
+    **Arguments:** `use` and `counts`: as in `occurrences`; `largest`: the amplitude that no cosine
+    exceeds in an experiment.
+    """
+    rng = np.random.default_rng(seed)
+    # Part of its power that a cosine may have in one experiment.
+    most = largest**2 / (2 * experiments * power)
+    classes = line_class(cosines.line, cosines.periods)
+    share = np.zeros((len(power), experiments))
+    for number in np.unique(classes):
+        members = np.flatnonzero(classes == number)
+        order = rng.permutation(experiments)[: counts[members].sum()]
+        share[np.repeat(members, counts[members]), order] = 1.0
+    share *= (use / counts)[:, None]
+    even = share
+    for _ in range(_SWEEPS):
+        share = share * (use.sum() / experiments / share.sum(axis=0))
+        share *= (use / share.sum(axis=1))[:, None]
+    # As far from even shares as the largest amplitudes allow.
+    room, more = (use * most)[:, None] - even, share - even
+    part = np.min(np.divide(room, more, out=np.full(even.shape, np.inf), where=more > 0), axis=1)
+    share = even + np.clip(part, 0, 1)[:, None] * more
+    share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
+    member, experiment = np.nonzero(share)
+    order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
+    member, experiment = member[order], experiment[order]
+    part = share[member, experiment] / share.sum(axis=1)[member]
+    amplitude = np.sqrt(2 * experiments * power[member] * part)
+    return Design(
+        experiment=experiment,
+        line=cosines.line[member],
+        channel=cosines.channel[member],
+        amplitude=np.minimum(amplitude, largest[member]),
+        phase=rng.uniform(0, 2 * np.pi, len(member)),
+        n_sections=cosines.n_sections,
+        periods=cosines.periods,
+        experiments=experiments,
+        input_names=usual.input_names,
+    )

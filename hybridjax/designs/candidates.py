@@ -1,17 +1,44 @@
-"""The cosines among which power is divided."""
+"""The cosines among which power is divided: the signals that they cause, and their measurement."""
 
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive, Seed
+from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.partition import is_half_integer
+from ..identify.joint.ldtp_fit import LDTPFit
+from ..identify.joint.noise import noise_spectrum
+from ..identify.multipliers import StructuredFit
+from ..linear.frequency_response import Harmonics
+from ..linear.htf import HTF
+from ..linear.ldtp import LDTP
+
+
+Model = LDTP | StructuredFit
+Powers = Float[np.ndarray, " K"]
+Kept = Int[np.ndarray, " k"]
+"""Indices of the cosines that remain, in ascending order."""
+Squares = dict[str, Powers]
+"""Mean square of each signal, by name, per unit of each cosine's power."""
+NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]] | LDTP | LDTPFit
+
+# Default noise, relative to the rms of the output in the usual design: 20 dB. It scales all
+# standard errors; the optimal powers depend only on the ratios of the outputs.
+_NOISE = 0.1
+# Draws for each model that is wanted. More: estimates that are nearly unstable are accepted, whose
+# stable draws represent the confidence region poorly. Less: estimates with slow modes are rejected.
+_TRIES = 20
 
 
 class Candidates(NamedTuple):
-    """The K cosines of a design: which line at which input."""
+    """The K cosines of a design, each a line at an input."""
 
     line: Int[np.ndarray, " K"]
     """j, so that f = j / periods."""
@@ -24,18 +51,21 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, design: Design) -> "Candidates":
-        """**Raises:** `DefinitionError` for multiples of 1/2, and for lines that excite several
-        inputs in one experiment."""
+        """Return the cosines of a design.
+
+        **Raises:** `DefinitionError` for multiples of 1/2, and for lines that excite several inputs
+        in one experiment.
+        """
         half = is_half_integer(design.line, design.periods)
         if half.any():
             raise DefinitionError(
                 f"f = {design.f[half][0]:g} is a multiple of 1/2, which is measured in two "
-                "experiments that belong together: take a `design` without such lines."
+                "experiments that belong together: use a `design` without such lines."
             )
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
             raise DefinitionError(
-                "the `design` excites several inputs with one line of one experiment: take one "
+                "the `design` excites several inputs with one line of one experiment: use one "
                 "with division='random' or 'disjoint'."
             )
         line, channel = np.unique(np.stack([design.line, design.channel]), axis=1)
@@ -43,20 +73,187 @@ class Candidates(NamedTuple):
         return cls(line, channel, design.periods, design.n_sections, strides)
 
     @property
-    def f(self) -> Float[np.ndarray, " K"]:
+    def f(self) -> Powers:
+        """Frequencies, cycles per period."""
         return self.line / self.periods
 
-    def only(self, some: Int[np.ndarray, " k"]) -> "Candidates":
-        return self._replace(line=self.line[some], channel=self.channel[some])
+    def only(self, kept: Kept) -> "Candidates":
+        return self._replace(line=self.line[kept], channel=self.channel[kept])
 
     def places(self, design: Design) -> Int[np.ndarray, " L"]:
-        """Which of these each line of a design is."""
-        key = self.line * (self.channel.max() + 1) + self.channel
+        """Return the index of the cosine that each line of a design is."""
+        inputs = self.channel.max() + 1
+        key = self.line * inputs + self.channel
         order = np.argsort(key)
-        wanted = design.line * (self.channel.max() + 1) + design.channel
+        wanted = design.line * inputs + design.channel
         return order[np.searchsorted(key, wanted, sorter=order)]
 
-    def power_of(self, design: Design) -> Float[np.ndarray, " K"]:
-        """Mean square of each cosine in a design, over all of its experiments."""
+    def powers_in(self, design: Design) -> Float[np.ndarray, "E K"]:
+        """Return the mean square of each cosine in each experiment of a design."""
+        power = np.zeros((design.experiments, len(self.line)))
+        square = np.asarray(design.amplitude) ** 2 / 2
+        np.add.at(power, (design.experiment, self.places(design)), square)
+        return power
+
+    def power_of(self, design: Design) -> Powers:
+        """Return the mean square of each cosine over all experiments of a design."""
         square = np.asarray(design.amplitude) ** 2 / 2
         return np.bincount(self.places(design), square, len(self.line)) / design.experiments
+
+
+def rate_of(name: str) -> str:
+    return f"rate of {name}"
+
+
+def mean_squares(model: Model, cosines: Candidates) -> Squares:
+    """Return the mean squares of inputs, outputs, rates of inputs, and states.
+
+    The rate is the change from one section to the next: a cosine of f changes by
+    $2 \\sin(\\pi f / N)$ times its amplitude. States are those whose names no output has; at a
+    section without a state its deviation is zero.
+    """
+    inputs = {n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)}
+    change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
+    rates = {rate_of(name): square * change for name, square in inputs.items()}
+    squares = {**inputs, **_responses(model, cosines), **rates}
+    if isinstance(model, LDTP) and model.coordinates is not None:
+        states = sorted({x for names in model.coordinates for x in names} - set(model.outputs))
+        C = np.zeros((model.n_sections, len(states), model.A.shape[-1]))
+        for n, names in enumerate(model.coordinates):
+            for k, name in enumerate(names):
+                if name in states:
+                    C[n, states.index(name), k] = 1.0
+        if states:
+            dims = np.asarray(model.dims)
+            shown = LDTP(model.A, model.B, C, dims=dims, inputs=model.inputs, outputs=states)
+            squares |= _responses(shown, cosines)
+    return squares
+
+
+def _responses(model: Model, cosines: Candidates) -> Squares:
+    H = np.asarray(model.htf(cosines.f).H)
+    squares = (np.abs(H) ** 2).sum(axis=0)[np.arange(len(cosines.f)), :, cosines.channel]
+    return dict(zip(model.outputs, squares.T, strict=True))
+
+
+def rms_of(squares: list[Squares], names: list[str], power: Powers) -> dict[str, float]:
+    """Return rms values of signals; of several models the root of the mean square."""
+    return {n: float(np.sqrt(np.mean([each[n] @ power for each in squares]))) for n in names}
+
+
+class Noise(NamedTuple):
+    """Noise of the outputs that are measured."""
+
+    outputs: Int[np.ndarray, " ny"]
+    """Indices of these outputs."""
+    spectrum: Callable[[Float[np.ndarray, " F"], tuple[int, ...]], Float[np.ndarray, "M F ny"]]
+    """The variance of white noise with the same spectral density as at the harmonics m of f."""
+
+
+def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> Noise:
+    """Return the noise that the argument `noise` of `optimal_design` describes.
+
+    **Arguments:** `rms`: values of the outputs in the usual design, for the default.
+
+    **Raises:** `DefinitionError` for outputs that do not exist, and spectra that are not positive.
+    """
+    outputs, N = model.outputs, model.n_sections
+    if isinstance(noise, LDTP | LDTPFit):
+        if noise.n_sections != N or any(name not in outputs for name in noise.outputs):
+            raise DefinitionError(
+                f"`noise` has {noise.n_sections} sections and the outputs {listed(noise.outputs)}, "
+                f"the model {N} and {listed(outputs)}."
+            )
+        fitted = isinstance(noise, LDTPFit)
+        spectrum = noise.noise_spectrum if fitted else functools.partial(noise_spectrum, noise)
+        return Noise(np.array([outputs.index(name) for name in noise.outputs]), spectrum)
+    if noise is None:
+        noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
+    unknown = [name for name in noise if name not in outputs]
+    if unknown or not noise:
+        problem = f"names '{unknown[0]}'" if unknown else "names no output"
+        raise DefinitionError(f"`noise` {problem}; the outputs are {', '.join(outputs)}.")
+    measured = {name: noise[name] for name in outputs if name in noise}
+
+    def spectrum_by_name(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
+        shifted = f + np.array(harmonics)[:, None]
+        folded = np.abs((shifted + N / 2) % N - N / 2)
+        return np.stack([_level(*item, folded) for item in measured.items()], axis=2) ** 2
+
+    return Noise(np.array([outputs.index(name) for name in measured]), spectrum_by_name)
+
+
+def _level(
+    name: str, level: float | Callable[[np.ndarray], np.ndarray], f: Float[np.ndarray, "M F"]
+) -> Float[np.ndarray, "M F"]:
+    value = np.asarray(level(f) if callable(level) else level)
+    if value.dtype.kind not in "fiu" or value.shape not in ((), f.shape):
+        raise DefinitionError(f"`noise` of {name} must return a real number for each frequency.")
+    if not ((value > 0) & np.isfinite(value)).all():
+        raise DefinitionError(f"`noise` of {name} must be positive at all frequencies.")
+    return np.broadcast_to(value, f.shape).astype(float)
+
+
+class Measured(NamedTuple):
+    """The HTFs from one input to the measured outputs."""
+
+    htf: HTF
+    """With the variances at power 1."""
+    cosines: Int[np.ndarray, " F"]
+    """Indices of the candidates at these frequencies."""
+    channel: int
+
+
+def measured_htfs(
+    model: Model, cosines: Candidates, harmonics: Harmonics | None, noise: Noise
+) -> Iterator[Measured]:
+    r"""Yield the HTFs of each input that is used.
+
+    The variance is $v = 4 S / (N P \sum a^2)$ (`Design.expected_variance`), where the sum of
+    a^2/2 over all experiments is the power times their number, and S the noise's spectrum at the
+    harmonic.
+    """
+    for i in np.unique(cosines.channel):
+        members = np.flatnonzero(cosines.channel == i)
+        htf = model.htf(cosines.f[members], harmonics)
+        spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
+        variance = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
+        yield Measured(with_variance(htf, model, noise, variance, int(i)), members, int(i))
+
+
+def with_variance(
+    htf: HTF, model: Model, noise: Noise, variance: Float[np.ndarray, "M F ny 1"], channel: int
+) -> HTF:
+    """Return the HTFs from one input to the measured outputs, with these variances."""
+    H = np.asarray(htf.H)[:, :, noise.outputs, channel : channel + 1]
+    outputs = tuple(model.outputs[k] for k in noise.outputs)
+    return HTF(
+        htf.f, H, htf.harmonics, htf.n_sections, (model.inputs[channel],), outputs,
+        variance=variance,
+    )  # fmt: skip
+
+
+@checked
+def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
+    """Draw stable models from the confidence region of an estimate, for `optimal_design`.
+
+    The draws are Gaussian with the covariance of the fit; those with a multiplier of modulus one or
+    more are discarded.
+
+    **Arguments:** `fit`: from `fit_ldtp`. `count`: number of models. `seed` of the draws.
+    Default: 0.
+
+    **Raises:** `DefinitionError` if hardly any are stable.
+    """
+    rng, models = np.random.default_rng(seed), []
+    for _ in range(_TRIES * count):
+        step = fit._root @ rng.normal(size=fit._root.shape[1])
+        moved = fit._coordinates.moved(step)
+        if np.abs(np.linalg.eigvals(moved.monodromy())).max() < 1:
+            models.append(moved.to_ldtp(fit._scale, fit.inputs, fit.outputs))
+        if len(models) == count:
+            return models
+    raise DefinitionError(
+        f"only {len(models)} of {_TRIES * count} models in the confidence region of this estimate "
+        "are stable: measure more before a design is made."
+    )

@@ -1,4 +1,4 @@
-"""What one wants to know."""
+"""The quantities of interest for which a design is optimized."""
 
 from typing import Literal
 
@@ -13,30 +13,30 @@ from ..orbits.cycle import LimitCycle
 from ..sections.families import FamilyLike, as_family
 
 
-Criterion = Literal["A", "D"]
+_FEW = (-2, -1, 0, 1, 2)
 
 
 @checked
 class Multipliers(eqx.Module):
-    """The Floquet multipliers.
+    """The Floquet multipliers: the sum of their variances.
 
     **Arguments:**
 
-    - `which`: index of the only multiplier to ask for, as `model.multipliers` has them; None asks
-      for all, a conjugate pair once.
-    - `part`: `"position"`, real and imaginary parts, or `"modulus"`.
-    - `criterion`: `"A"`, the sum of the variances, or `"D"`, the volume of the ellipsoid.
-    - `weights`: of the wanted quantities in a sum that is asked for instead of themselves (the
-      c-criterion), in the order of `OptimalDesign.names` without them.
-    - `estimator`: the function that will find them. `"fit_multipliers"` leaves all numerators
-      free, `"fit_ldtp"` the matrices of a model of this model's (minimal) dimensions.
-    - `harmonics`: those of the fit; None means -2 to 2 for `fit_multipliers`, all for `fit_ldtp`.
-      `overhang`: of `fit_multipliers`.
+    - `which`: index of a single multiplier, in the order of `model.multipliers`. Default: all of
+      them, each conjugate pair once.
+    - `part`: `"position"`, real and imaginary parts, or `"modulus"`. Default: `"position"`.
+    - `weights`: coefficients of a weighted sum of the quantities that replaces them (the
+      c-criterion), in the order of `OptimalDesign.names` without weights.
+    - `estimator`: the function that will estimate them. `"fit_multipliers"` leaves all numerators
+      free, `"fit_ldtp"` the matrices of a model with this model's (minimal) dimensions.
+      Default: `"fit_multipliers"`.
+    - `harmonics`: harmonics that the estimator uses. Default: -2 to 2 for `fit_multipliers`, all
+      for `fit_ldtp`.
+    - `overhang`: argument of `fit_multipliers`.
     """
 
     which: Index | None = eqx.field(static=True, default=None)
     part: Literal["position", "modulus"] = eqx.field(static=True, default="position")
-    criterion: Criterion = eqx.field(static=True, default="A")
     weights: tuple[float, ...] | None = eqx.field(static=True, default=None)
     estimator: Literal["fit_multipliers", "fit_ldtp"] = eqx.field(
         static=True, default="fit_multipliers"
@@ -45,49 +45,50 @@ class Multipliers(eqx.Module):
     overhang: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        _check_weights(self.weights)
-        if self.harmonics is not None:
-            _check_harmonics(self.harmonics)
+        if self.weights is not None and not any(self.weights):
+            raise DefinitionError("`weights` of a goal must not all be zero.")
+        _check_harmonics(self.harmonics)
+
+    @property
+    def fitted_harmonics(self) -> Harmonics:
+        """Harmonics of `fit_multipliers`."""
+        return _FEW if self.harmonics is None else self.harmonics
 
 
 @checked
 class Parameters(eqx.Module):
-    """Physical parameters, as `fit_model` finds them from HTFs: their relative errors.
+    """Physical parameters, estimated by `fit_model` from HTFs: their relative errors.
 
     The derivatives are exact, through the limit cycle and its sections; they compile at the first
     call, for a minute or so.
 
     **Arguments:**
 
-    - `cycle`: of the system whose parameters are looked for; `sections`: the family.
-    - `free`: names of all parameters that are unknown; `wanted`: those one asks for, None for all.
-    - `criterion` and `weights`: as for `Multipliers`; a difference of two relative errors is that
-      of a ratio of parameters. `harmonics`: those of the HTFs.
+    - `cycle`: limit cycle of the system with these parameters; `sections`: the family of sections.
+    - `free`: names of all unknown parameters. `wanted`: those whose errors matter. Default: all.
+    - `harmonics`: harmonics of the HTFs. Default: -2 to 2.
     """
 
     cycle: LimitCycle
     sections: FamilyLike
     free: SignalNames = eqx.field(static=True)
     wanted: SignalNames | None = eqx.field(static=True, default=None)
-    criterion: Criterion = eqx.field(static=True, default="A")
-    weights: tuple[float, ...] | None = eqx.field(static=True, default=None)
-    harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
+    harmonics: Harmonics = eqx.field(static=True, default=_FEW)
 
     def __check_init__(self):
-        _check_weights(self.weights)
         _check_harmonics(self.harmonics)
         as_family(self.sections)
 
 
 @checked
 class FrequencyResponse(eqx.Module):
-    """Harmonic transfer functions in a band, as `fit_ldtp` finds them with the model's dimensions.
+    """Harmonic transfer functions in a band, estimated by `fit_ldtp` with the model's dimensions.
 
-    The mean of the variance over the band, relative to the mean square there of each output's
-    transfer functions (all the harmonics asked for).
+    The criterion is the mean of the variance over the band, relative to the mean square there of
+    each output's transfer functions (of all wanted harmonics).
 
-    **Arguments:** `band`, frequencies of the input, cycles per period; `wanted`, the harmonics one
-    asks for; `harmonics`, those of the fit, None for all.
+    **Arguments:** `band`: frequencies of the input, cycles per period. `wanted`: the harmonics of
+    interest. Default: 0. `harmonics`: those that the estimator uses. Default: all.
     """
 
     band: tuple[NonNegative, Positive] = eqx.field(static=True)
@@ -98,43 +99,42 @@ class FrequencyResponse(eqx.Module):
         if not self.band[0] < self.band[1]:
             raise DefinitionError(f"`band` must rise, not {self.band}.")
         _check_harmonics(self.wanted)
-        if self.harmonics is not None:
-            _check_harmonics(self.harmonics)
+        _check_harmonics(self.harmonics)
 
 
 @checked
 class ImpulseResponse(eqx.Module):
-    """Responses to a push of one section, as `fit_ldtp` finds them with the model's dimensions.
+    """Responses to an input at one section, estimated by `fit_ldtp` with the model's dimensions.
 
-    The mean of the variance over all sections of the output, relative to the mean square of each
-    output's response.
+    The criterion is the mean of the variance over all sections of the output, relative to the mean
+    square of each output's response.
 
-    **Arguments:** `lags`, how many sections after the push are asked for, from 0 on; `harmonics`,
-    those of the fit, None for all.
+    **Arguments:** `lags`: number of sections after the input, from 0 on. `harmonics`: those that
+    the estimator uses. Default: all.
     """
 
     lags: Count = eqx.field(static=True)
     harmonics: Harmonics | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.harmonics is not None:
-            _check_harmonics(self.harmonics)
+        _check_harmonics(self.harmonics)
 
 
 @checked
 class Order(eqx.Module):
-    """Whether there are as many multipliers as the model has, or fewer.
+    """The decision between as many multipliers as the model has, and fewer.
 
-    The misfit of the best model with fewer (T-optimality: Atkinson and Fedorov, Biometrika 62,
-    1975), as large as possible in units of the noise's variance: all numerators are free, as in
-    `fit_multipliers`. The standard error is relative to the misfit: one over its root.
+    The misfit of the best model with fewer multipliers, in units of the noise's variance, is made
+    as large as possible (T-optimality: Atkinson and Fedorov, Biometrika 62, 1975). All numerators
+    are free, as in `fit_multipliers`. The standard error is relative to the misfit: one over its
+    root.
 
-    **Arguments:** `fewer`, the number of multipliers of the rival; `harmonics` and `overhang`:
-    those of the fit.
+    **Arguments:** `fewer`: number of multipliers of the rival model. `harmonics` of the fit.
+    Default: -2 to 2. `overhang`: argument of `fit_multipliers`.
     """
 
     fewer: Index = eqx.field(static=True)
-    harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
+    harmonics: Harmonics = eqx.field(static=True, default=_FEW)
     overhang: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -144,14 +144,10 @@ class Order(eqx.Module):
 Goal = Multipliers | Parameters | FrequencyResponse | ImpulseResponse | Order
 
 
-def _check_weights(weights: tuple[float, ...] | None) -> None:
-    """**Raises:** `DefinitionError` where all are zero, or there are none."""
-    if weights is not None and not any(weights):
-        raise DefinitionError("`weights` of a goal must not all be zero.")
-
-
-def _check_harmonics(harmonics: Harmonics) -> None:
+def _check_harmonics(harmonics: Harmonics | None) -> None:
     """**Raises:** `DefinitionError` for harmonics that no number of sections has."""
+    if harmonics is None:
+        return
     given = [harmonics] if isinstance(harmonics, int) else list(harmonics)
     if not given or len(set(given)) < len(given):
         raise DefinitionError(f"`harmonics` must be distinct and at least one: {harmonics}.")

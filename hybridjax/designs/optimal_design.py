@@ -1,27 +1,49 @@
-"""What an optimal design is, and what it is worth."""
+r"""The result of `optimal_design`, and random sequences with the spectrum of a design.
+
+A Gaussian sequence may have any spectrum. The sign of a Gaussian sequence with the correlation
+$\rho$ has the correlation $\frac{2}{\pi} \arcsin \rho$ (Van Vleck and Middleton, Proc. IEEE 54,
+1966). For a binary sequence the correlation of the Gaussian is therefore
+$\sin(\frac{\pi}{2} \rho)$, where this is a correlation at all; else its spectrum is negative
+somewhere, where it is replaced by zero, and the result reports the spectrum of the binary sequence,
+which differs from the wanted one.
+"""
 
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import PeriodCount, Positive, Seed
-from .._core.html import card, table, text
+from .._core.text import fields
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from .sequences import RandomInput, random_sequence
+from .candidates import Powers
 
 
-# Strides saved by a factor above this are worth another design. Doubled: more designs are said to
-# be nearly optimal already.
+# Ratio of strides from which on `advice` recommends the design. Larger: designs that save a third
+# are called nearly optimal. Smaller: savings within the uncertainty of the model are advertised.
 _WORTH_IT = 1.5
+
+
+class RandomInput(eqx.Module):
+    """A random input for a recording.
+
+    **Fields:** `u` (n, nu), at the sections, from section 0 on; `power` (K,), the mean square of
+    such sequences around each cosine of the plan.
+    """
+
+    u: Float[np.ndarray, "n nu"]
+    power: Powers
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 @checked_methods
 class OptimalDesign(eqx.Module):
-    """A design that answers a question in the fewest strides, beside the one it was made from.
+    """A design that needs the fewest strides, and the design that it improves.
 
     Standard errors are Cramer-Rao bounds: a fit that uses all of the data reaches them where noise
     is white and responses are linear.
@@ -29,25 +51,25 @@ class OptimalDesign(eqx.Module):
     **Fields:**
 
     - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
-    - `usual`: the design with which it is compared, scaled to the same limits.
-    - `names` (g,) of the wanted quantities; `variances` (g,) with `design`, `usual_variances` with
-      `usual`.
-    - `criterion` and `usual_criterion`: what was made small, in units of a variance.
+    - `usual`: the design that it improves, scaled to the same limits.
+    - `names` (g,) of the quantities of interest; `variances` (g,) with `design`, `usual_variances`
+      with `usual`.
+    - `criterion` and `usual_criterion`: the minimized function, in units of a variance.
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
-      to that of this one; with one limit the largest sensitivity of a line per unit of what is
-      limited. No design needs fewer strides than 1/e of this one's. 1 at the optimum, but for
-      peaks, which are taken as no larger than rms values. Where distortion is limited, it compares
+      to that of this one; with one limit the largest sensitivity of a line per unit of the limit.
+      No design needs fewer strides than 1/e of this one's. It is 1 at the optimum, except with
+      peaks, which are treated as no larger than rms values. With limited distortion it compares
       with designs whose convex bound of the distortion is no larger than the limit, or this one's.
-    - `for_peaks`: how many times the strides limits of peaks cost, beside the same limits of the
+    - `for_peaks`: the ratio of strides with limits of peaks to those with the same limits of the
       rms; 1 where no peak is limited.
-    - `frequencies` (K,) and `channels` (K,) of all cosines that were allowed; `power` and
-      `usual_power` (K,), the mean square of each over all experiments; `sensitivity` (K,), by
-      which more power in a cosine makes the criterion smaller, divided by what it costs: 1 where
-      power belongs, less elsewhere.
+    - `frequencies` (K,) and `channels` (K,) of all allowed cosines; `power` and `usual_power` (K,),
+      the mean square of each over all experiments; `sensitivity` (K,), the decrease of the
+      criterion by more power in a cosine, divided by its price: 1 where the optimum has power, less
+      elsewhere.
     - `limited`: names of the limits that are reached: of rms values by their signals, of rates,
       peaks and distortions.
-    - `rms`, `usual_rms`: of all signals, by name, as the model predicts them; of `distortion of y`
-      where it is limited, expected for random phases (of the phases that were chosen for a peak).
+    - `rms`, `usual_rms`: predicted rms values of all signals, by name; of `distortion of y` where
+      it is limited, expected for random phases (with a limited peak, for the optimized phases).
     """
 
     design: Design
@@ -59,23 +81,23 @@ class OptimalDesign(eqx.Module):
     usual_criterion: float
     certificate: float
     for_peaks: float
-    frequencies: Float[np.ndarray, " K"]
+    frequencies: Powers
     channels: np.ndarray
-    power: Float[np.ndarray, " K"]
-    usual_power: Float[np.ndarray, " K"]
-    sensitivity: Float[np.ndarray, " K"]
+    power: Powers
+    usual_power: Powers
+    sensitivity: Powers
     limited: tuple[str, ...] = eqx.field(static=True)
     rms: dict[str, float]
     usual_rms: dict[str, float]
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " g"]:
-        """Of the wanted quantities, with one run of `design`."""
+        """Standard errors of the quantities of interest, with one run of `design`."""
         return np.sqrt(self.variances)
 
     @property
     def usual_standard_errors(self) -> Float[np.ndarray, " g"]:
-        """The same with one run of `usual`."""
+        """Standard errors with one run of `usual`."""
         return np.sqrt(self.usual_variances)
 
     @property
@@ -85,13 +107,13 @@ class OptimalDesign(eqx.Module):
 
     @property
     def saved(self) -> float:
-        """How many strides of `usual` one stride of `design` replaces."""
+        """Number of strides of `usual` that one stride of `design` replaces."""
         ratio = self.usual.cycles(0) / self.strides
         return self.usual_criterion / self.criterion * ratio
 
     def strides_for(self, standard_error: Positive) -> int:
-        """Strides after which no wanted quantity has a larger standard error, with repeats of
-        `design`."""
+        """Return the strides, with repeats of `design`, after which no quantity has a larger
+        standard error."""
         return int(np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2))
 
     def sequence(
@@ -100,39 +122,50 @@ class OptimalDesign(eqx.Module):
         kind: Literal["gaussian", "binary"] = "gaussian",
         seed: Seed = 0,
     ) -> RandomInput:
-        """A random input with the spectrum of `design`, for a recording (`fit_series`).
+        """Return a random input with the spectrum of `design`, for a recording (`fit_series`).
 
-        **Arguments:** `cycles`, its length; `kind`: normal values, or two values of the same
-        size, whose spectrum is close to that of the design at best: `RandomInput.power` says which.
+        **Arguments:** `cycles`: its length. `kind`: Gaussian values, or two values of the same
+        size, whose spectrum only approximates that of the design: `RandomInput.power` has it.
+        Default: `"gaussian"`.
 
         **Raises:** `DefinitionError` for an odd number of samples, and for fewer cycles than the
-        periods of the design, which do not tell its lines apart.
+        periods of the design, which do not resolve its lines.
         """
         N, P = self.design.n_sections, self.design.periods
         if cycles < P:
             raise DefinitionError(
-                f"{cycles} cycles do not tell lines apart that differ by 1/{P}: take {P} or more."
+                f"{cycles} cycles do not resolve lines that differ by 1/{P}: take {P} or more."
             )
         if N * cycles % 2:
             raise DefinitionError(f"{cycles} cycles of {N} sections are an odd number of samples.")
+        # Each line has the frequencies of the sequence that are nearest to it.
+        nearest = np.rint(np.arange(N * cycles // 2 + 1) * P / cycles).astype(int)
         lines = np.rint(self.frequencies * P).astype(int)
-        shape = N, P, cycles, len(self.design.input_names)
-        return random_sequence(lines, self.channels, self.power, shape, kind, seed)
+        rng, inputs, power = np.random.default_rng(seed), [], np.zeros(len(lines))
+        for i in range(len(self.design.input_names)):
+            members = self.channels == i
+            wanted = np.zeros(max(nearest.max(), lines.max()) + 1)
+            wanted[lines[members]] = self.power[members]
+            u, spectrum = random_sequence(wanted, nearest, kind, rng)
+            inputs.append(u)
+            power[members] = np.bincount(nearest, spectrum, len(wanted))[lines[members]]
+        return RandomInput(np.stack(inputs, axis=1), power)
 
     @property
     def advice(self) -> str:
-        """Which case this is, in a sentence."""
-        rest = [n for n in self.limited if n.startswith(("rate of ", "peak of ", "distortion of "))]
-        rms = " and ".join(n for n in self.limited if n not in rest)
-        what = " and ".join([f"rms of {rms}"] * bool(rms) + rest)
+        """The worth of this design, in a sentence."""
+        prefixes = ("rate of ", "peak of ", "distortion of ")
+        special = [n for n in self.limited if n.startswith(prefixes)]
+        rms = " and ".join(n for n in self.limited if n not in special)
+        limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         if self.saved > _WORTH_IT:
             return (
-                f"With the {what} limited it matters where the power is: one stride does "
+                f"With the {limits} limited it matters where the power is: one stride does "
                 f"the work of {self.saved:.3g}."
             )
         return (
-            f"With the {what} limited the usual design is nearly optimal (one stride does "
-            f"the work of {self.saved:.3g}): what is left to gain lies in the estimator."
+            f"With the {limits} limited the usual design is nearly optimal (one stride does "
+            f"the work of {self.saved:.3g}): only a better estimator would gain more."
         )
 
     def __repr__(self) -> str:
@@ -157,9 +190,51 @@ class OptimalDesign(eqx.Module):
         ]
         return "\n".join([*rows, f"  {self.design!r}".replace("\n", "\n  ")])
 
-    def _repr_html_(self) -> str:
-        errors = zip(self.names, self.usual_standard_errors, self.standard_errors, strict=True)
-        shown = [(name, f"{a:.2e}", f"{b:.2e}") for name, a, b in errors]
-        head = ("standard error", "usual", "optimal")
-        about = f"{self.advice}\ncertificate {self.certificate:.3f} (1 at the optimum)"
-        return card("OptimalDesign", "", table(head, shown), text(about))
+
+def random_sequence(
+    wanted: Float[np.ndarray, " lines"],
+    nearest: Int[np.ndarray, " n"],
+    kind: Literal["gaussian", "binary"],
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, " length"], Float[np.ndarray, " n"]]:
+    """Return a sequence, and its spectrum: mean squares at the frequencies of its discrete Fourier
+    transform.
+
+    **Arguments:** `wanted`: mean square around each line; `nearest`: the line of each frequency.
+    """
+    length, total = 2 * (len(nearest) - 1), wanted.sum()
+    if not total:
+        return np.zeros(length), np.zeros(len(nearest))
+    spectrum = (wanted / np.maximum(np.bincount(nearest, minlength=len(wanted)), 1))[nearest]
+    spectrum[[0, -1]] = 0.0
+    spectrum *= total / spectrum.sum()
+    if kind == "gaussian":
+        return _gaussian(spectrum, length, rng), spectrum
+    hidden = _spectrum(np.sin(np.pi / 2 * _correlation(spectrum / total)))
+    hidden = np.maximum(hidden, 0.0)
+    rho = _correlation(hidden / hidden.sum())
+    u = np.sqrt(total) * np.sign(_gaussian(hidden, length, rng))
+    return u, total * _spectrum(2 / np.pi * np.arcsin(np.clip(rho, -1, 1)))
+
+
+def _gaussian(
+    spectrum: Float[np.ndarray, " n"], length: int, rng: np.random.Generator
+) -> Float[np.ndarray, " length"]:
+    z = rng.normal(size=(2, len(spectrum))) * np.sqrt(spectrum)
+    return np.fft.irfft((z[0] + 1j * z[1]) * length / 2, length)
+
+
+def _correlation(spectrum: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the correlation at lags 0 to L/2 from mean squares at frequencies."""
+    inner = spectrum.copy()
+    inner[1:-1] /= 2
+    length = 2 * (len(spectrum) - 1)
+    return np.fft.irfft(inner * length, length)[: len(spectrum)]
+
+
+def _spectrum(correlation: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return mean squares at frequencies from the correlation at lags 0 to L/2."""
+    both = np.concatenate([correlation, correlation[-2:0:-1]])
+    spectrum = np.fft.rfft(both).real / len(both)
+    spectrum[1:-1] *= 2
+    return spectrum

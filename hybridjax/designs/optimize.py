@@ -1,56 +1,124 @@
-"""The design that answers a question in the fewest strides."""
+"""The design that estimates a quantity of interest in the fewest strides."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Positive, Seed, StepCount
+from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
-from .allocation import Allocation, allocate, certify
-from .candidates import Candidates
+from .allocation import Allocation, allocate, certify, occurrences, to_design, worthwhile
+from .candidates import Candidates, Model, NoiseLike, Powers, make_noise, mean_squares, rms_of
+from .criteria import criterion_of
+from .criterion import Criterion
+from .distortion import Products, products
 from .goals import Goal, Multipliers
-from .grouping import places, to_design, worthwhile
-from .limits.distortion import Products, products
-from .limits.limits import (
+from .limits import (
     Largest,
     Limit,
-    Limits,
     PowerLimits,
-    experiments_within,
+    as_limits,
+    below_peaks,
     largest_amplitudes,
     peak_of,
     power_limits,
     without_forbidden,
 )
-from .limits.peaks import below_peaks
-from .noise import NoiseLike, make_noise
 from .optimal_design import OptimalDesign
-from .questions.question import AbstractQuestion
-from .questions.question_of import question_of
-from .signals import Model, mean_squares, rms_of
 
 
-# Cosines that together tell less than such a part of all are left out, the largest part of these
-# with which the criterion grows by less than the factor. Doubled: fewer weak lines, whose answers
-# distortion hides.
+# Parts of the total gain that may be left out with weak cosines, the largest part first with which
+# the criterion grows by less than the factor. Larger: weak lines are lost, whose absence distortion
+# of strong ones reveals. Smaller: lines without effect occupy experiments.
 _NEGLIGIBLE = (2e-3, 1e-4, 0.0)
 _AS_GOOD = 1.01
-# Times that the usual design is scaled to the limits, since cosines at their largest amplitude do
-# not grow with the others. Doubled: nothing, unless nearly all are at theirs.
+# Times that a design is scaled to the limits, since cosines at their largest amplitude do not grow
+# with the others. Fewer: limits are not used up where nearly all cosines are at theirs.
 _SCALINGS = 10
-# Share of a limit from which on it is said to be reached. Lower: limits that do not matter are
-# named.
+# Share of a limit from which on it counts as reached. Smaller: inactive limits are named. Larger:
+# active ones are not, since powers are optimal to 2 % only.
 _REACHED = 0.99
+
+
+class Rules(NamedTuple):
+    """The limits that experiments must obey."""
+
+    linear: PowerLimits
+    """Limits of sums over cosines, without those of amplitudes."""
+    distortion: Products | None
+    cosines: Candidates
+    largest: Largest
+    most: Powers
+    """The same for each cosine."""
+    peak: dict[str, float]
+    seed: int
+
+    def scaled(self, design: Design) -> Design:
+        """Return the same proportions, as large as allowed, except cosines at their largest
+        amplitude."""
+        for _ in range(_SCALINGS):
+            use = self.linear.cost @ self.cosines.power_of(design)
+            if self.distortion is not None:
+                use = np.append(use, self.distortion.rms(design) / self.distortion.level)
+            root = np.sqrt(1 / max(use.max(), np.finfo(float).tiny))
+            design = dataclasses.replace(design, amplitude=design.amplitude * root)
+            design = without_forbidden(design, self.largest)
+        return design
+
+    def below_peaks(self, design: Design) -> Design:
+        """Return the design within the peaks, and with these phases also within a distortion."""
+        if not self.peak:
+            return design
+        design = below_peaks(design, self.peak, self.seed)
+        if self.distortion is None:
+            return design
+        use = (self.distortion.rms(design, phases=True) / self.distortion.level).max()
+        return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(max(use, 1.0)))
+
+    def distorted(self, design: Design) -> dict[str, float]:
+        """Return the rms of distortions in a design, by name."""
+        if self.distortion is None:
+            return {}
+        rms = self.distortion.rms(design, bool(self.peak)).tolist()
+        return dict(zip(self.distortion.names, rms, strict=True))
+
+    def less_distorted(self, criterion: Criterion, design: Design) -> Design:
+        """Return the same cosines in the same experiments, with the best powers for the distortion
+        of just these, from those that they have. (That form is not convex, so that better ones may
+        exist.)"""
+        if self.distortion is None:
+            return design
+        each = self.cosines.powers_in(design)
+        power = each.mean(axis=0)
+        kept = np.flatnonzero(power)
+        power, share = power[kept], each[:, kept] / power[kept]
+        limits = self.linear.only(kept)._replace(curved=self.distortion.divided(kept, share))
+        if np.isfinite(self.most).any():
+            limits = limits.with_rows(np.diag(2 * share.max(axis=0) / self.most[kept] ** 2))
+        factor = np.ones(len(self.most))
+        factor[kept] = np.sqrt(allocate(criterion.only(kept), limits, power).power / power)
+        amplitude = design.amplitude * factor[self.cosines.places(design)]
+        return self.scaled(dataclasses.replace(design, amplitude=amplitude))
+
+    def reached(self, design: Design) -> tuple[str, ...]:
+        """Return names of the limits that are reached, or all if only those of amplitudes are;
+        peaks always."""
+        use: dict[str, float] = {}
+        shares = self.linear.cost @ self.cosines.power_of(design)
+        for name, share in zip(self.linear.names, shares, strict=True):
+            use[name] = max(use.get(name, 0.0), np.inf if name.startswith(peak_of("")) else share)
+        if self.distortion is not None:
+            levels = zip(self.distorted(design).items(), self.distortion.level, strict=True)
+            use |= {name: rms / level for (name, rms), level in levels}
+        return tuple(name for name, share in use.items() if share > _REACHED) or tuple(use)
 
 
 @checked
@@ -64,241 +132,151 @@ def optimal_design(
     limit: Limit = "input",
     noise: NoiseLike | None = None,
     largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
-    experiments: ExperimentCount | None = None,
     seed: Seed = 0,
-    max_steps: StepCount = 300,
     robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
-    r"""The amplitudes that answer a question in the fewest strides, and proof that they do.
+    r"""Find the amplitudes with which the fewest strides estimate a quantity of interest.
 
     ```python
     plan = hj.optimal_design(model)               # multipliers, the input's power limited
-    plan = hj.optimal_design(model, limit={"yM": 0.01, "vM": 0.05})     # or the way from the cycle
+    plan = hj.optimal_design(model, limit={"yM": 0.01, "vM": 0.05})     # or the deviations
     data = hj.run_experiments(cycle, sections, plan.design, outputs)
     ```
 
     The variance of the goal is the Cramer-Rao bound. It is a convex function of the cosines'
-    powers, and the result's `certificate` says how far from the optimum they are. Strong cosines
-    stand in several experiments, weak ones in one: for variances that are estimated run
-    `plan.design.realizations(4)`, or two windows.
+    powers, and `certificate` in the result bounds the distance from the optimum. Large components
+    are excited in several experiments, small ones in only one. If variances are to be estimated
+    from the data, run `plan.design.realizations(4)` or record two periods of the multisine.
 
     **Arguments:**
 
-    - `model`: what is known of the system, exact or estimated: a `StructuredFit` also does. Its
-      deviations are then those of the harmonics that were fitted. Several models, any of which may
-      be true (`hj.designs.draws` of an estimate): see `robust`. The limits hold for each.
-    - `design`: what one would do otherwise. Its lines, inputs, periods and experiments are those of
-      the result; by default `multisine` with all lines. Lines that are not in it are forbidden.
+    - `model`: the system, exact or estimated; a `StructuredFit` also does, whose deviations are
+      those of the fitted harmonics. Several models (`hj.designs.draws` of an estimate) make the
+      design robust, see `robust`; the limits hold for each.
+    - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
+      the number of experiments are kept. Default: `multisine` with all lines.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
-      `FrequencyResponse`, `ImpulseResponse`, `Order`.
-    - `limit`: rms values by name, of inputs, outputs (their deviation from the cycle) or states,
-      over all experiments: `{"u": 0.01}`. Or what may be no larger than in `design`: `"input"` or
-      `"output"`, of each. Or `hj.designs.Limits`, also of peaks, rates and strides.
-    - `noise`: of each output that is measured, by name: the standard deviation of white noise, or
-      a function that gives it by the frequency of the output (0 to N/2 cycles per period), the root
-      of a spectrum. Or noise that was estimated: an `LDTPFit` with noise, or a model of noise as
-      for `hj.identify.noise_spectrum`. By default all outputs are measured, with white noise 20 dB
-      below their rms deviation in `design` within the limits.
-    - `largest`: amplitude that no cosine may exceed; a number, or a function of an array of f. Zero
-      forbids a frequency.
-    - `experiments`: their number, by default that of `design`. `seed` of phases and division.
-    - `max_steps` of the iteration.
-    - `robust`: of several models, whether the mean of the criterion is made small, or that of the
-      worst one (in fact a mean of 16th powers, which is a little smaller).
+      `FrequencyResponse`, `ImpulseResponse`, `Order`. Default: `"multipliers"`.
+    - `limit`: largest rms values by name, of inputs, outputs (their deviation from the cycle) or
+      states, over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as
+      in `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.
+      Default: `"input"`.
+    - `noise`: of each measured output, by name: the standard deviation of white noise, or a
+      function that returns it by the frequency of the output (0 to N/2 cycles per period), the root
+      of a spectrum. Or estimated noise: an `LDTPFit` with noise, or a model of noise as for
+      `hj.identify.noise_spectrum`. Default: all outputs are measured, with white noise 20 dB below
+      their rms deviation in `design` within the limits.
+    - `largest`: largest amplitude of a cosine; a number, or a function of an array of f. Zero
+      forbids a frequency. Default: no limit.
+    - `seed` of phases and division. Default: 0.
+    - `robust`: with several models, minimize the mean of their criteria, or the worst one (a mean
+      of 16th powers, which is slightly smaller). Default: `"mean"`.
 
-    **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data cannot see,
-    multipliers that are not simple, and arguments that do not fit together.
+    **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data do not
+    identify, multipliers that are not simple, and arguments that do not fit together.
     """
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
         raise DefinitionError("`model` holds no model.")
     usual = multisine(models[0].n_sections, inputs=models[0].inputs) if design is None else design
     _check_alike(models, usual)
+    given = as_limits(limit)
     cosines = Candidates.of(usual)
-    squares = [mean_squares(one, cosines) for one in models]
-    ports = {"input": models[0].inputs, "output": models[0].outputs}
-    limits = power_limits(limit, squares, ports, cosines.power_of(usual))
-    peak = dict(limit.peak) if isinstance(limit, Limits) else {}
+    squares = [mean_squares(each, cosines) for each in models]
+    linear = power_limits(given, models, squares, cosines.power_of(usual))
 
     usual, most = without_forbidden(usual, largest), largest_amplitudes(largest, cosines.f)
     allowed = np.flatnonzero(most > 0)
-    cosines, limits, most = cosines.only(allowed), limits.only(allowed), most[allowed]
-    squares = [{name: square[allowed] for name, square in one.items()} for one in squares]
-    count = experiments_within(limit, experiments, usual.experiments, usual.periods, len(cosines.f))
-    distorted = None
-    if isinstance(limit, Limits) and limit.distortion is not None:
+    cosines, linear, most = cosines.only(allowed), linear.only(allowed), most[allowed]
+    squares = [{name: square[allowed] for name, square in each.items()} for each in squares]
+    count = given.experiments(usual, len(allowed))
+    distortion, limits = None, linear
+    if given.distortion is not None:
         power = cosines.power_of(usual)
-        distorted = products(limit.distortion, cosines, models[0].inputs, power)
-        distorted.require_those_of(models[0])
-        limits = limits.and_of_distortion(distorted.limited, distorted.curved)
-    sums, limits = limits, limits.and_of_amplitudes(most, cosines)
+        distortion = products(given.distortion, cosines, models[0].inputs, power)
+        distortion.require_those_of(models[0])
+        limits = limits._replace(curved=distortion.bound)
+    sums, limits = limits, limits.with_amplitudes(most, cosines)
     limits.require_limits()
-    fit = functools.partial(_as_large_as_allowed, sums, distorted, cosines, largest)
-    usual = fit(usual)
-    if peak:
-        usual = _below_peaks(usual, distorted, peak, seed)
+    rules = Rules(linear, distortion, cosines, largest, most, dict(given.peak), seed)
+    usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
-    shown += [name for name in limits.names if name in squares[0] and name not in shown]
+    shown += [name for name in linear.names if name in squares[0] and name not in shown]
     usual_rms = rms_of(squares, shown, usual_power)
-    distorted_rms = functools.partial(_distorted_rms, distorted, bool(peak))
     goal = Multipliers() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
-    question = question_of(goal, models, cosines, errors, usual_power, robust)
+    criterion = criterion_of(goal, models, cosines, errors, usual_power, robust)
 
-    before = question.answer(usual_power)
-    ideal = allocate(question, limits, usual_power, max_steps)
-    kept, best = _with_fewer(question, limits, cosines, ideal, count, max_steps)
-    one = most**2 / (2 * count)
-    share = limits.only(kept).share(best.power)
-    counts = places(cosines.only(kept), best.power * share, best.power / one[kept], count)
+    before = criterion.bound(usual_power)
+    ideal = allocate(criterion, limits, usual_power)
+    kept, best = _with_fewer(criterion, limits, cosines, ideal, count)
+    room = most[kept] ** 2 / (2 * count)
+    used = best.power * limits.only(kept).share(best.power)
+    counts = occurrences(cosines.only(kept), used, best.power / room, count)
     if np.isfinite(most).any():
-        # What each may have where it stands.
-        room = sums.only(kept).and_of_powers(counts * one[kept])
-        best = allocate(question.only(kept), room, best.power, max_steps)
-    made = to_design(
-        cosines.only(kept), best.power, best.power * share, counts, most[kept], count, usual,
-        seed,
-    )  # fmt: skip
-    if distorted is not None:
-        made = fit(_less_distorted(question, sums, distorted, most, made, max_steps))
-    after = free = question.only(kept).answer(cosines.power_of(made)[kept])
-    if peak:
-        made = _below_peaks(made, distorted, peak, seed)
-        after = question.only(kept).answer(cosines.power_of(made)[kept])
+        # The largest power of each cosine in the experiments that hold it.
+        within = sums.only(kept).with_rows(np.diag(1 / (counts * room)))
+        share = limits.only(kept).share(best.power)
+        best = allocate(criterion.only(kept), within, best.power)
+        used = best.power * share
+    made = to_design(cosines.only(kept), best.power, used, counts, most[kept], count, usual, seed)
+    made = rules.less_distorted(criterion, made)
+    free = criterion.only(kept).bound(cosines.power_of(made)[kept])
+    made = rules.below_peaks(made)
     power = cosines.power_of(made)
+    after = criterion.only(kept).bound(power[kept])
     shorter = usual.experiments / count
     # Compared with all designs whose distortion is bounded as this one's is.
-    level = np.maximum(limits.bent(power), 1)
-    excess = certify(ideal.answer, ideal.power, limits, level).excess
+    level = np.maximum(limits.use_of_curved(power), 1)
+    excess = certify(ideal.bound, ideal.power, limits, level).excess
     return OptimalDesign(
         design=made,
         usual=usual,
-        names=question.names,
+        names=criterion.names,
         variances=after.variances * shorter,
         usual_variances=before.variances,
         criterion=after.criterion * shorter,
         usual_criterion=before.criterion,
-        certificate=excess * after.criterion / ideal.answer.criterion,
+        certificate=excess * after.criterion / ideal.bound.criterion,
         for_peaks=after.criterion / free.criterion,
         frequencies=cosines.f,
         channels=cosines.channel,
         power=power,
         usual_power=usual_power,
         sensitivity=ideal.certificate.relative,
-        limited=_reached(sums, distorted, power, distorted_rms(made)),
-        rms=rms_of(squares, shown, power) | distorted_rms(made),
-        usual_rms=usual_rms | distorted_rms(usual),
+        limited=rules.reached(made),
+        rms=rms_of(squares, shown, power) | rules.distorted(made),
+        usual_rms=usual_rms | rules.distorted(usual),
     )
 
 
 def _with_fewer(
-    question: AbstractQuestion,
+    criterion: Criterion,
     limits: PowerLimits,
     cosines: Candidates,
     ideal: Allocation,
-    count: int,
-    max_steps: int,
+    experiments: int,
 ) -> tuple[Int[np.ndarray, " kept"], Allocation]:
-    """The cosines that matter, as so many experiments can hold, and their powers.
+    """Return the cosines that matter, as so many experiments can hold, and their powers.
 
-    **Arguments:** `ideal`, the best powers of all.
+    **Arguments:** `ideal`: the best powers of all.
     """
-    gain = ideal.power * ideal.answer.sensitivity
+    gain = ideal.power * ideal.bound.sensitivity
     for negligible in _NEGLIGIBLE:
-        kept = np.flatnonzero(worthwhile(cosines, gain, count, negligible))
-        best = allocate(question.only(kept), limits.only(kept), ideal.power[kept], max_steps)
-        if best.answer.criterion < _AS_GOOD * ideal.answer.criterion:
+        kept = np.flatnonzero(worthwhile(cosines, gain, experiments, negligible))
+        best = allocate(criterion.only(kept), limits.only(kept), ideal.power[kept])
+        if best.bound.criterion < _AS_GOOD * ideal.bound.criterion:
             break
     return kept, best
-
-
-def _as_large_as_allowed(
-    limits: PowerLimits,
-    distorted: Products | None,
-    cosines: Candidates,
-    largest: Largest,
-    design: Design,
-) -> Design:
-    """The same proportions, but where a cosine has its largest amplitude."""
-    for _ in range(_SCALINGS):
-        use = limits.cost @ cosines.power_of(design)
-        if distorted is not None:
-            use = np.append(use, distorted.rms(design) / distorted.level)
-        root = np.sqrt(1 / max(use.max(), np.finfo(float).tiny))
-        design = dataclasses.replace(design, amplitude=design.amplitude * root)
-        design = without_forbidden(design, largest)
-    return design
-
-
-def _less_distorted(
-    question: AbstractQuestion,
-    limits: PowerLimits,
-    distorted: Products,
-    most: Float[np.ndarray, " K"],
-    design: Design,
-    max_steps: int,
-) -> Design:
-    """The same cosines in the same experiments, with the best powers for the distortion of just
-    these, from those that they have. (That form is not convex, so that better ones may exist.)
-
-    **Arguments:** `limits`, without those of amplitudes, which are `most`.
-    """
-    each = distorted.powers(design)
-    power = each.mean(axis=0)
-    kept = np.flatnonzero(power)
-    power, share = power[kept], each[:, kept] / power[kept]
-    own = limits.only(kept)._replace(curved=distorted.divided(kept, share))
-    if np.isfinite(most).any():
-        own = own.and_of_powers(most[kept] ** 2 / (2 * share.max(axis=0)))
-    factor = np.ones(len(most))
-    factor[kept] = np.sqrt(allocate(question.only(kept), own, power, max_steps).power / power)
-    amplitude = design.amplitude * factor[distorted.cosines.places(design)]
-    return dataclasses.replace(design, amplitude=amplitude)
-
-
-def _below_peaks(
-    design: Design, distorted: Products | None, peak: dict[str, float], seed: int
-) -> Design:
-    """Within the peaks, and with the phases for that also within a distortion."""
-    design = below_peaks(design, peak, seed)
-    if distorted is None:
-        return design
-    use = (distorted.rms(design, phases=True) / distorted.level).max()
-    return dataclasses.replace(design, amplitude=design.amplitude / np.sqrt(max(use, 1.0)))
-
-
-def _reached(
-    limits: PowerLimits,
-    distorted: Products | None,
-    power: Float[np.ndarray, " K"],
-    distortion: dict[str, float],
-) -> tuple[str, ...]:
-    """Names of the limits that end here, or all if only those of amplitudes do; peaks always.
-
-    **Arguments:** `limits`, without those of amplitudes.
-    """
-    use = {}
-    for name, share in zip(limits.names, limits.cost @ power, strict=False):
-        use[name] = max(use.get(name, 0.0), np.inf if name.startswith(peak_of("")) else share)
-    if distorted is not None:
-        levels = zip(distorted.limited, distorted.level, strict=True)
-        use |= {name: distortion[name] / level for name, level in levels}
-    return tuple(name for name, share in use.items() if share > _REACHED) or tuple(use)
-
-
-def _distorted_rms(distorted: Products | None, phases: bool, design: Design) -> dict[str, float]:
-    if distorted is None:
-        return {}
-    return dict(zip(distorted.limited, distorted.rms(design, phases).tolist(), strict=True))
 
 
 def _check_alike(models: list[Model], design: Design) -> None:
     """**Raises:** `DefinitionError` for models and a design that do not fit together."""
     first = models[0]
-    for k, one in enumerate(models):
+    for k, model in enumerate(models):
         for name in ("n_sections", "inputs", "outputs"):
-            if getattr(one, name) != getattr(first, name):
+            if getattr(model, name) != getattr(first, name):
                 raise DefinitionError(f"model {k} has other {name} than model 0.")
     if design.n_sections != first.n_sections or design.input_names != first.inputs:
         raise DefinitionError(

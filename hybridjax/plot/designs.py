@@ -9,10 +9,10 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
+from ..designs.candidates import Model
 from ..designs.information import InformationMap
 from ..designs.optimal_design import OptimalDesign
-from ..designs.signals import Model
-from ..designs.studies.study import Study
+from ..designs.study import Study
 from ..errors import DefinitionError
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, panels
 

@@ -8,13 +8,12 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
-from ..identify.multipliers.denominator import Denominator
+from ..identify.denominator import Denominator
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import assemble, fit_series
+from ..identify.series.fit import SeriesFit, assemble, fit_series
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.parts import Parts
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.records import PreparedRecords
 from ..identify.validation.simulation import can_be_compared, simulate_record
 from ..identify.validation.validate import Validation, validate
 from .data import SectionData
@@ -22,7 +21,7 @@ from .data import SectionData
 
 # Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
 # multipliers are missed.
-ENOUGH = 1000
+_ENOUGH = 1000
 # Fewest cycles at the end of a record that are held out; shorter records are fitted, or held out,
 # whole. More: few records are split. Fewer: ends that say no more than their initial condition.
 _SHORTEST_END = 12
@@ -49,7 +48,7 @@ def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
     early, late = split(data, share)
-    parts, ends, fits = Parts(early), uninterrupted_records(late), []
+    parts, ends, fits = PreparedRecords(early), uninterrupted_records(late), []
     for d in range(1, most + 1):
         problem = OutputErrorProblem.from_data(parts, d, parts.n_sections, free_start=True)
         c = total_least_squares(delayed_outputs(problem, d))
@@ -89,7 +88,7 @@ def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> Held
 
 def split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
     """Return the parts of the records to be fitted, and to be held out."""
-    enough = min(1.0, ENOUGH / data.cycles)
+    enough = min(1.0, _ENOUGH / data.cycles)
     ends = [round(len(r.u) * enough) for r in data.records]
     short = [k for k, n in enumerate(ends) if n * share < _SHORTEST_END * data.n_sections]
     every = round(1 / share)

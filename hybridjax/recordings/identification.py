@@ -9,14 +9,13 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import fit_series
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.fit import SeriesFit, fit_series
 from .advice import Advice, advise
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .estimate_phase import PhaseDefinition, estimate_phase, signals_of
 from .findings import Finding
-from .held_out import ENOUGH, HeldOut, choose_order, hold_out
+from .held_out import HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import inspect, inspect_cycles, refuse
 from .phase import Phase
@@ -110,10 +109,8 @@ def identify_recording(
     order = choose_order(data) if order is None else order
     say("fit to the first three quarters")
     held = hold_out(data, order)
-    # Distortion that does not pay in the beginning of a long recording is not fitted to all of it.
-    linear = data.cycles > ENOUGH and not held.fit.distortion
     say("fit to all")
-    fit = fit_series(data, order, check=False, distortion=False if linear else None)
+    fit = fit_series(data, order, check=False)
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:

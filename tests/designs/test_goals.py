@@ -1,15 +1,18 @@
-"""What one wants to know, against fits, closed forms and another optimizer."""
+"""Quantities of interest, against fits, bounds, closed forms and another optimizer."""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 import hybridjax as hj
+from hybridjax.designs.candidates import Candidates, make_noise
+from hybridjax.designs.numerators import order_criterion
 
-from .conftest import expected_htf
+from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
 
 
 N, NOISE = 4, {"y": 0.02}
+GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -26,43 +29,34 @@ def usual():
 
 
 def test_transfer_functions_in_a_band(model, usual):
-    """Their mean variance is that which `fit_ldtp` says."""
+    """Their mean variance is that of `fit_ldtp`."""
     goal = hj.designs.FrequencyResponse((0.2, 0.8), wanted=(0, 1))
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    assert plan.names == ("H_0 of y", "H_1 of y")
-    assert plan.certificate < 1.03
+    assert plan.names == ("H_0 of y", "H_1 of y") and plan.certificate < 1.03
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
     size = (np.abs(model.htf(f, (0, 1)).H) ** 2).mean(axis=1).sum()
     for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
         fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model, direct=False)
         variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
         np.testing.assert_allclose(said, variance, rtol=0.02)
-    near = hj.optimal_design(
-        model, usual, goal=hj.designs.FrequencyResponse((1.6, 1.9)), noise=NOISE
-    )
-    assert near.power @ near.frequencies > plan.power @ plan.frequencies
 
 
 def test_an_impulse_response_is_its_spectrum(model, usual):
-    """By Parseval's theorem the whole response is known as well as all transfer functions in the
+    """By Parseval's theorem the whole response has the variance of all transfer functions in the
     whole band."""
-    goal = hj.designs.ImpulseResponse(100)
-    impulse = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    goal = hj.designs.FrequencyResponse((0.0, 2.0), wanted=(-2, -1, 0, 1))
-    spectrum = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    assert impulse.names == ("response of y",)
-    assert impulse.usual_criterion == pytest.approx(spectrum.usual_criterion, rel=1e-6)
-    short = hj.optimal_design(model, usual, goal=hj.designs.ImpulseResponse(3), noise=NOISE)
-    assert short.certificate < 1.03
-    assert (
-        np.abs(short.power / short.power.sum() - impulse.power / impulse.power.sum()).max() > 0.01
-    )
+    impulse = hj.designs.ImpulseResponse(100)
+    spectrum = hj.designs.FrequencyResponse((0.0, 2.0), wanted=(-2, -1, 0, 1))
+    plans = [
+        hj.optimal_design(model, usual, goal=goal, noise=NOISE) for goal in (impulse, spectrum)
+    ]
+    assert plans[0].names == ("response of y",) and plans[0].certificate < 1.03
+    assert plans[0].usual_criterion == pytest.approx(plans[1].usual_criterion, rel=1e-6)
 
 
 def misfit(model, design, fewer, harmonics):
-    """Of the best model with fewer multipliers, as `fit_multipliers` finds it."""
-    fit = hj.fit_multipliers(expected_htf(model, design, NOISE, harmonics), fewer, check=False)
-    return fit.cost
+    """Return that of the best model with fewer multipliers, found by `fit_multipliers`."""
+    htf = expected_htf(model, design, NOISE, harmonics)
+    return hj.fit_multipliers(htf, fewer, check=False).cost
 
 
 def test_the_choice_of_an_order(model, usual):
@@ -72,30 +66,21 @@ def test_the_choice_of_an_order(model, usual):
     assert plan.certificate < 1.03 and plan.saved > 1.2
     for design, said in ((plan.usual, plan.usual_criterion), (plan.design, plan.criterion)):
         assert 1 / said == pytest.approx(misfit(model, design, fewer, harmonics), rel=0.02)
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        other = hj.multisine(N, 16, band=(0, 2), amplitude=lambda f: rng.exponential(size=f.shape))
-        other = other.scaled(plan.usual_rms["u"])
+    for other in random_designs(5, plan.usual_rms["u"], N, 16, band=(0, 2)):
         assert misfit(model, other, fewer, harmonics) < plan.certificate / plan.criterion
 
 
 @pytest.mark.filterwarnings("ignore:Values in x were outside bounds")  # SLSQP of older SciPy
 def test_the_choice_of_an_order_by_another_optimizer(model):
     """Sequential quadratic programming, with a numerical gradient of the misfit."""
-    from hybridjax.designs.candidates import Candidates
-    from hybridjax.designs.noise import make_noise
-    from hybridjax.designs.questions.order import about_order
-
     few = hj.multisine(N, 8, band=(0, 2))
-    cosines = Candidates.of(few)
-    goal = hj.designs.Order(0, harmonics=0)
-    question = about_order(goal, model, cosines, make_noise(model, NOISE, {}))
+    cosines, goal = Candidates.of(few), hj.designs.Order(0, harmonics=0)
+    criterion = order_criterion(goal, model, cosines, make_noise(model, NOISE, {}))
     start = cosines.power_of(few)
-    plan = hj.optimal_design(
-        model, few, goal=goal, noise=NOISE, limit={"u": float(np.sqrt(start.sum()))}
-    )
+    rms = float(np.sqrt(start.sum()))
+    plan = hj.optimal_design(model, few, goal=goal, noise=NOISE, limit={"u": rms})
     other = minimize(
-        lambda p: -1e-3 / question.answer(p).criterion, start, method="SLSQP",
+        lambda p: -1e-3 / criterion.bound(p).criterion, start, method="SLSQP",
         bounds=[(1e-9, 1)] * len(start),
         constraints=[{"type": "ineq", "fun": lambda p: start.sum() - p.sum()}],
         options={"ftol": 1e-10, "maxiter": 40},
@@ -106,34 +91,144 @@ def test_the_choice_of_an_order_by_another_optimizer(model):
 
 def test_a_sum_with_weights(model, usual):
     """The c-criterion: its variance is the quadratic form of the covariance."""
-    harmonics = (-1, 0, 1)
-    goal = hj.designs.Multipliers(weights=(1.0, -2.0), harmonics=harmonics)
+    goal = hj.designs.Multipliers(weights=(1.0, -2.0), harmonics=(-1, 0, 1))
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    bound = hj.identify.multiplier_bound(model, expected_htf(model, plan.usual, NOISE, harmonics))
-    one, other = bound.multipliers.real
-    gradient = -np.vander([one, other], 2) / np.array([[one - other], [other - one]])
+    htf = expected_htf(model, plan.usual, NOISE, (-1, 0, 1))
+    bound = hj.identify.multiplier_bound(model, htf)
+    a, b = bound.multipliers.real
+    gradient = -np.vander([a, b], 2) / np.array([[a - b], [b - a]])
     w = np.array([1.0, -2.0]) @ gradient
     assert plan.usual_criterion == pytest.approx(w @ bound.covariance @ w, rel=1e-6)
-    assert plan.names == (f"+1 {one:.4g} -2 {other:.4g}",) and plan.certificate < 1.03
+    assert plan.names == (f"+1 {a:.4g} -2 {b:.4g}",) and plan.certificate < 1.03
 
 
-@pytest.mark.parametrize(
-    "goal, message",
-    [
-        (hj.designs.Order(2), "2 multipliers are not fewer than the model's 2"),
-        (hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
-        (hj.designs.Multipliers(weights=(1.0,)), "must be 2 numbers: one for each of"),
-    ],
-)
-def test_bad_goals(model, usual, goal, message):
-    if isinstance(goal, hj.designs.Multipliers | hj.designs.Order):
-        goal = type(goal)(**(vars(goal) | {"harmonics": (-1, 0, 1)}))
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.optimal_design(model, usual, goal=goal, noise=NOISE)
+@pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
+def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
+    """Standard errors are those of `ldtp_bound`, which sums up all information; no other design is
+    better than the certificate allows."""
+    goal = hj.designs.Multipliers(estimator="fit_ldtp", harmonics=harmonics)
+    plan = optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
+    assert plan.certificate < 1.03
+    bound = hj.identify.ldtp_bound(two, expected_htf(two, plan.usual, TWO_NOISE, harmonics))
+    np.testing.assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
+    for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
+        bound = hj.identify.ldtp_bound(two, expected_htf(two, other, TWO_NOISE, harmonics))
+        assert total_variance(bound) > plan.criterion / plan.certificate
+    assert optimal_two(limit={"u0": 0.1, "u1": 0.1}).usual_criterion > plan.usual_criterion
+    only = hj.optimal_design(two, two_usual, goal=goal, noise={"y1": 0.02})
+    assert only.usual_criterion > plan.usual_criterion
 
 
-def test_goals_of_nothing():
+def test_multipliers_keep_the_numbers_of_the_model():
+    """Of three, the first of which no input excites."""
+    A, ones = np.diag([0.9, 0.6, 0.3]), np.array([0.0, 1.0, 1.0])
+    model = hj.LDTP(np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3)))
+    usual = hj.multisine(2, 32, band=(0, 1))
+
+    def plan(which):
+        goal = hj.designs.Multipliers(which, estimator="fit_ldtp")
+        return hj.optimal_design(model, usual, goal=goal, noise={"y": 0.01})
+
+    assert plan(1).names == ("0.6",) and plan(2).names == ("0.3",)
+    with pytest.raises(hj.DefinitionError, match=r"no input excites.*the multiplier 0\.9"):
+        plan(0)
+
+
+def test_bad_goals(model, usual):
+    htf = expected_htf(model, usual, NOISE, (-1, 0, 1))
+    fit = hj.fit_multipliers(htf, 2, check=False)
+    close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
+    double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
+    M = hj.designs.Multipliers
+    cases = (
+        (model, hj.designs.Order(2, (-1, 0, 1)), "2 multipliers are not fewer than the model's 2"),
+        (model, hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
+        (model, M(weights=(1.0,), harmonics=0), "must be 2 numbers: one for each of"),
+        (model, M(5, harmonics=0), "there is no multiplier 5, the model has 2"),
+        (model, M(harmonics=1), "symmetric about 0"),
+        (fit, M(estimator="fit_ldtp"), "needs a model with matrices"),
+        (double, M(harmonics=0), "is not simple"),
+    )
+    for system, goal, message in cases:
+        design = usual if system.n_sections == N else hj.multisine(2, 32, band=(0, 1))
+        with pytest.raises(hj.DefinitionError, match=message):
+            hj.optimal_design(system, design, goal=goal, noise=NOISE)
     with pytest.raises(hj.DefinitionError, match="must not all be zero"):
-        hj.designs.Multipliers(weights=(0.0, 0.0))
+        M(weights=(0.0, 0.0))
     with pytest.raises(hj.DefinitionError, match="must rise"):
         hj.designs.FrequencyResponse((1.0, 0.5))
+
+
+def with_angle(angle):
+    """Return a model with a pair of multipliers of modulus 0.9 and this angle."""
+    turn = 0.9 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    A = np.array([turn, np.eye(2), [[1, 0.1], [0, 1]], [[1, -0.1], [0, 1]]])
+    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])[..., None]
+    return hj.LDTP(A, B, np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])[:, None])
+
+
+def variance(model, design):
+    """Return that of the multipliers by `multiplier_bound`."""
+    htf = expected_htf(model, design, NOISE, (-1, 0, 1))
+    return total_variance(hj.identify.multiplier_bound(model, htf))
+
+
+@pytest.mark.parametrize("robust, exponent", [("mean", 1), ("worst", 16)])
+def test_several_models(robust, exponent):
+    """No design is better for the mean of powers than the certificate allows, limits hold for each
+    model, and standard errors of 1e-15 have no effect (their 16th powers are zero)."""
+    models = [with_angle(angle) for angle in (0.8, 1.6, 2.4)]
+    usual = hj.multisine(N, 32, band=(0, 2))
+    about = dict(goal=GOAL, limit={"u": 0.1}, robust=robust)
+    plan = hj.optimal_design(models, usual, noise=NOISE, **about)
+    assert plan.certificate < 1.05
+
+    def mean(design):
+        each = [variance(model, design) for model in models]
+        return np.mean(np.power(each, exponent)) ** (1 / exponent)
+
+    assert mean(plan.design) == pytest.approx(plan.criterion, rel=2e-3)
+    for other in random_designs(5, 0.1, N, 32, band=(0, 2)):
+        assert mean(other) > plan.criterion / plan.certificate
+    alone = hj.optimal_design(models[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1})
+    assert mean(alone.design) > 1.2 * plan.criterion
+    small = hj.optimal_design(models, usual, noise={"y": 2e-15}, **about)
+    assert small.saved == pytest.approx(plan.saved, rel=0.05)
+    about = dict(goal=GOAL, noise=NOISE, limit={"u": 9.0, "y": 0.1})
+    limited = hj.optimal_design(models, usual, **about).design
+    data = [hj.experiments.simulate_experiments(m, limited, start="periodic").y for m in models]
+    assert max(np.sqrt(np.mean(y**2)) for y in data) == pytest.approx(0.1, rel=1e-2)
+    with pytest.raises(hj.DefinitionError, match="model 1 has other n_sections than model 0"):
+        hj.optimal_design([models[0], hj.testing.synthetic_ldtp()], usual)
+    with pytest.raises(hj.DefinitionError, match="holds no model"):
+        hj.optimal_design([], usual)
+
+
+def test_draws_have_the_covariance_of_the_fit():
+    model, design = with_angle(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
+    fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
+    drawn = hj.designs.draws(fit, 400)
+    c = np.array([np.poly(draw.multipliers).real[1:] for draw in drawn])
+    np.testing.assert_allclose(
+        np.cov(c.T), fit.covariance, atol=0.3 * np.diag(fit.covariance).max()
+    )
+
+
+@pytest.mark.slow
+def test_physical_parameters():
+    """Their standard errors with the usual design are those of `fit_model`'s sensitivities."""
+    cycle = hj.find_limit_cycle(hj.models.Duffing())
+    sections = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
+    model = hj.linearize(cycle, sections, outputs=("x", "v"))
+    usual, free = hj.multisine(8, periods=16).scaled(0.001), ("damping", "amplitude")
+    goal = hj.designs.Parameters(cycle, sections, free, harmonics=(-1, 0, 1))
+    plan = hj.optimal_design(model, usual, goal=goal, noise={"x": 1e-4})
+    assert plan.certificate < 1.03 and plan.saved > 10
+
+    htf = model.htf(usual.frequencies, (-1, 0, 1))
+    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
+    x = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
+    observed = hj.ObservedHTF(x, sections)
+    S = hj.fitting.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
+    bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
+    np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Designs for a question: what they are worth, and that this is true."""
+"""Optimal designs of the hopper, against bounds and simulations; sequences with their spectrum."""
 
 import functools
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.designs.optimal_design import random_sequence
 
-from .conftest import expected_htf
+from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
 
 
 NOISE = {"yM": 1e-4, "vM": 3e-4}
@@ -17,7 +18,7 @@ with_variance = functools.partial(expected_htf, noise=NOISE, harmonics=HARMONICS
 
 @pytest.fixture(scope="module")
 def usual():
-    """Fewer lines than the paper's, for the time of it."""
+    """Fewer lines than the paper's, to save time."""
     return hj.multisine(periods=32, amplitude=0.003)
 
 
@@ -26,52 +27,49 @@ def plan(isochron_ldtp, usual):
     return hj.optimal_design(isochron_ldtp, usual, noise=NOISE)
 
 
+def variance(model, design):
+    bound = hj.identify.multiplier_bound(model, with_variance(model, design))
+    return total_variance(bound)
+
+
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
     """That of `multiplier_bound`, which projects numerators out in another way."""
-    for design, said in (
-        (plan.usual, plan.usual_standard_errors),
-        (plan.design, plan.standard_errors),
-    ):
+    for design, said in ((plan.usual, plan.usual_variances), (plan.design, plan.variances)):
         bound = hj.identify.multiplier_bound(isochron_ldtp, with_variance(isochron_ldtp, design))
-        variances = np.diag(bound.multiplier_covariances[0])
-        # (They differ in which combination of powers counts as rounding: one of 84.)
-        np.testing.assert_allclose(said**2, variances, rtol=2e-3)
+        # (They differ in the combinations of powers that count as rounding: by one of 84.)
+        np.testing.assert_allclose(said, np.diag(bound.multiplier_covariances[0]), rtol=2e-3)
 
 
 def test_no_other_design_is_better_than_the_certificate_allows(plan, isochron_ldtp):
     """With as much power at the input."""
     assert plan.certificate < 1.04
-    rng = np.random.default_rng(0)
     shapes = [lambda f: np.exp(-((f - 0.3) ** 2)), lambda f: 1 / (0.1 + f), np.ones_like]
     shapes.append(lambda f: np.sqrt(np.interp(f, plan.frequencies, plan.power) + 1e-9))
-    shapes += [lambda f: rng.exponential(size=f.shape) for _ in range(3)]
-    for shape in shapes:
-        other = hj.multisine(periods=32, amplitude=shape)
-        rms = np.sqrt(np.mean(other.inputs() ** 2))
-        other = other.scaled(plan.usual_rms["u"])
-        assert rms > 0
-        bound = hj.identify.multiplier_bound(isochron_ldtp, with_variance(isochron_ldtp, other))
-        assert np.trace(bound.multiplier_covariances[0]) > plan.criterion / plan.certificate
+    others = [hj.multisine(periods=32, amplitude=f).scaled(plan.usual_rms["u"]) for f in shapes]
+    for other in [*others, *random_designs(2, plan.usual_rms["u"], periods=32)]:
+        assert variance(isochron_ldtp, other) > plan.criterion / plan.certificate
 
 
 def test_the_hopper_with_its_input_limited(isochron_ldtp):
-    """620 lines. An independent script, with all numerators free and complex (that knows nothing of
-    H_{-m}(-w) = conj H_m(w)), saves 19.3 of 20.3 strides; deviations are 5.8 times larger."""
-    found = hj.optimal_design(isochron_ldtp)
-    assert found.saved == pytest.approx(19.17, abs=0.3)
-    assert 1 <= found.certificate < 1.03
-    assert found.rms["yM"] / found.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
-    assert found.frequencies[np.argmax(found.power)] == pytest.approx(0.3, abs=0.04)
-    assert "one stride does the work of 19" in repr(found)
-    np.testing.assert_allclose(found.rms["u"], found.usual_rms["u"])
+    """620 lines. An independent script, with all numerators free and complex (without the relation
+    of H_{-m}(-w) to H_m(w)), saves 19.3 of 20.3 strides; deviations are 5.8 times larger."""
+    plan = hj.optimal_design(isochron_ldtp)
+    assert plan.saved == pytest.approx(19.17, abs=0.3)
+    assert 1 <= plan.certificate < 1.03
+    assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
+    assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
+    assert "one stride does the work of 19" in repr(plan)
+    np.testing.assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 
 
-def test_the_hopper_with_deviations_limited(isochron_ldtp):
-    found = hj.optimal_design(isochron_ldtp, limit="output")
-    assert 1 < found.saved < 1.05
-    assert found.certificate < 1.03
-    assert "nearly optimal" in found.advice
-    assert all(found.rms[n] <= found.usual_rms[n] * (1 + 1e-9) for n in ("yM", "vM"))
+def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
+    plan = hj.optimal_design(isochron_ldtp, usual, limit="output")
+    assert 1 < plan.saved < 1.05 and plan.certificate < 1.03
+    assert "nearly optimal" in plan.advice
+    assert all(plan.rms[n] <= plan.usual_rms[n] * (1 + 1e-9) for n in ("yM", "vM"))
+    both = hj.optimal_design(isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE)
+    assert both.rms["u"] <= 0.02 * (1 + 1e-9) and both.rms["yM"] <= 0.001 * (1 + 1e-9)
+    assert both.limited == ("u", "yM") and both.certificate < 1.04
 
 
 def test_experiments_are_as_promised(plan, isochron_ldtp):
@@ -83,6 +81,7 @@ def test_experiments_are_as_promised(plan, isochron_ldtp):
     rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
     np.testing.assert_allclose(rms, [plan.rms["yM"], plan.rms["vM"]], rtol=1e-3)
     assert plan.strides == plan.usual.cycles(0)
+    assert plan.strides_for(plan.standard_errors.max() / 2) == 4 * plan.strides
 
 
 @pytest.mark.slow
@@ -101,43 +100,23 @@ def test_fits_reach_what_is_promised(plan, isochron_ldtp):
     )
 
 
-def test_rms_values_by_name(isochron_ldtp, usual):
-    found = hj.optimal_design(isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE)
-    assert found.rms["u"] <= 0.02 * (1 + 1e-9) and found.rms["yM"] <= 0.001 * (1 + 1e-9)
-    assert found.limited == ("u", "yM")
-    assert found.certificate < 1.04
-
-
 def test_forbidden_frequencies_and_amplitudes(isochron_ldtp, usual, plan):
     def allowed(f):
         return np.where((f > 1.1) & (f < 1.5), 0, 0.006)
 
-    found = hj.optimal_design(isochron_ldtp, usual, noise=NOISE, largest=allowed)
-    f = found.design.f
+    limited = hj.optimal_design(isochron_ldtp, usual, noise=NOISE, largest=allowed)
+    f = limited.design.f
     assert not ((f > 1.1) & (f < 1.5)).any()
-    assert found.design.amplitude.max() <= 0.006 < plan.design.amplitude.max()
-    assert found.criterion > plan.criterion
-    bound = hj.identify.multiplier_bound(isochron_ldtp, with_variance(isochron_ldtp, found.design))
-    assert found.criterion == pytest.approx(np.trace(bound.multiplier_covariances[0]), rel=1e-2)
-
-
-def test_fewer_experiments_hold_fewer_lines(isochron_ldtp, usual, plan):
-    found = hj.optimal_design(isochron_ldtp, usual, noise=NOISE, experiments=10)
-    assert found.design.experiments == 10
-    assert found.strides == 320
-    assert found.saved > 0.8 * plan.saved
-
-
-@pytest.mark.parametrize("limit", ["input", "output"])
-def test_units_do_not_matter(isochron_ldtp, usual, limit):
-    """Newtons, piconewtons and meganewtons."""
-    found = [
-        hj.optimal_design(isochron_ldtp, usual.scaled(rms), limit=limit)
-        for rms in (1e-12, 0.01, 1e6)
-    ]
-    for one in found:
-        assert one.certificate == pytest.approx(found[1].certificate, rel=1e-6)
-        assert one.saved == pytest.approx(found[1].saved, rel=1e-6)
+    assert limited.design.amplitude.max() <= 0.006 < plan.design.amplitude.max()
+    assert limited.criterion > plan.criterion
+    expected = variance(isochron_ldtp, limited.design)
+    assert limited.criterion == pytest.approx(expected, rel=1e-2)
+    # The design that is improved obeys the amplitudes, too.
+    high = hj.optimal_design(
+        isochron_ldtp, usual, noise=NOISE, largest=lambda f: 0.004 * (f > 1), limit={"u": 0.1}
+    )
+    assert high.usual.frequencies.min() > 1 and high.usual.amplitude.max() <= 0.004
+    assert high.saved >= 1 / high.certificate
 
 
 def test_nothing_within_amplitudes_is_better_than_the_certificate_says(isochron_ldtp, usual):
@@ -152,81 +131,31 @@ def test_nothing_within_amplitudes_is_better_than_the_certificate_says(isochron_
     for e in range(usual.experiments):
         best = [k[np.argsort(-strongest[k])][e % min(4, len(k))] for k in each]
         f.append(np.sort(plan.frequencies[best]))
-    other = hj.Design.from_lines(
-        f, 0.006, [rng.uniform(0, 6, len(one)) for one in f], n_sections=32, periods=32
-    )
-    rms = float(np.sqrt(np.mean(other.inputs() ** 2)))
-    found = hj.optimal_design(isochron_ldtp, other, noise=NOISE, limit={"u": rms})
-    assert found.usual_criterion * (1 + 1e-9) > plan.criterion / plan.certificate
+    phases = [rng.uniform(0, 6, len(lines)) for lines in f]
+    other = hj.Design.from_lines(f, 0.006, phases, n_sections=32, periods=32)
+    assert variance(isochron_ldtp, other) * (1 + 1e-9) > plan.criterion / plan.certificate
     assert plan.certificate < 1.3
 
 
-def test_the_usual_design_keeps_to_amplitudes(isochron_ldtp, usual):
-    """What is saved is compared with experiments that are allowed as well."""
-    plan = hj.optimal_design(
-        isochron_ldtp, usual, noise=NOISE, largest=lambda f: 0.004 * (f > 1), limit={"u": 0.1}
-    )
-    assert plan.usual.frequencies.min() > 1 and plan.usual.amplitude.max() <= 0.004
-    assert plan.saved >= 1 / plan.certificate
-
-
-def test_inputs_have_the_names_of_the_model(isochron_ldtp):
-    with pytest.raises(hj.DefinitionError, match="the inputs F, the model 32 and u"):
-        hj.optimal_design(isochron_ldtp, hj.multisine(periods=32, inputs=("F",)))
-
-
-@pytest.mark.parametrize(
-    "goal",
-    [
-        hj.designs.Multipliers(criterion="D"),
-        hj.designs.Multipliers(0, "modulus"),
-        hj.designs.Multipliers(harmonics=0),
-    ],
-)
-def test_other_goals(isochron_ldtp, usual, goal):
-    found = hj.optimal_design(isochron_ldtp, usual, goal=goal, noise=NOISE)
-    assert found.certificate < 1.1
-    assert found.saved > 5
-
-
-def test_strides_for_a_standard_error(plan):
-    half = plan.standard_errors.max() / 2
-    assert plan.strides_for(half) == 4 * plan.strides
-
-
-def test_several_inputs():
-    model = hj.testing.synthetic_ldtp()
-    found = hj.optimal_design(
-        model, hj.multisine(6, 32, band=(0, 3), inputs=model.inputs),
-        goal=hj.designs.Multipliers(harmonics=(-1, 0, 1)),
-    )  # fmt: skip
-    assert found.certificate < 1.03 and found.saved > 1
-    assert set(found.limited) == set(model.inputs)
-
-
-def test_from_an_estimate(isochron_ldtp, usual):
-    htf = with_variance(isochron_ldtp, usual)
-    fit = hj.fit_multipliers(htf, 2)
-    found = hj.optimal_design(fit, usual, noise=NOISE)
-    assert found.saved > 5
-
-
-NEAR = hj.LDTP(
-    np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]]), np.ones((2, 2, 1)), np.ones((2, 1, 2))
-)
+def test_units_and_estimates(isochron_ldtp, usual):
+    """Newtons, piconewtons and meganewtons; an estimate in place of the model."""
+    a, b, c = (hj.optimal_design(isochron_ldtp, usual.scaled(rms)) for rms in (1e-12, 0.01, 1e6))
+    assert a.saved == pytest.approx(b.saved, rel=1e-6) == pytest.approx(c.saved, rel=1e-6)
+    assert a.certificate == pytest.approx(b.certificate, rel=1e-6)
+    fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
+    for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
+        estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
+        assert estimated.saved > 5 and estimated.certificate < 1.1
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
-        (dict(limit={"z": 1.0}), "`limit` limits 'z'; what can be limited is the rms value of u"),
-        (dict(limit={}), "`limit` limits nothing"),
         (dict(noise={"z": 1.0}), "`noise` names 'z'; the outputs are yM, vM"),
         (dict(largest=lambda f: 0 * f), "`largest` is zero at all frequencies"),
         (dict(largest=lambda f: f - 1), "amplitudes that are not negative"),
-        (dict(goal=hj.designs.Multipliers(5)), "there is no multiplier 5, the model has 2"),
-        (dict(goal=hj.designs.Multipliers(harmonics=1)), "symmetric about 0"),
         (dict(design=hj.multisine(8)), "the design has 8 sections"),
+        (dict(design=hj.multisine(periods=32, inputs=("F",))), "inputs F, the model 32 and u"),
         (dict(design=hj.multisine(lines="two-phase", periods=4)), "is a multiple of 1/2"),
         (dict(limit={"u": 0.0}), "positive"),
     ],
@@ -236,28 +165,67 @@ def test_bad_input(isochron_ldtp, usual, change, message):
         hj.optimal_design(isochron_ldtp, **({"design": usual} | change))
 
 
-def test_multipliers_that_are_not_simple():
-    with pytest.raises(hj.DefinitionError, match="is not simple"):
-        goal = hj.designs.Multipliers(harmonics=0)
-        hj.optimal_design(NEAR, hj.multisine(2, 32, band=(0, 1)), goal=goal)
+@pytest.fixture(scope="module")
+def two_plan(optimal_two):
+    goal = hj.designs.Multipliers(harmonics=HARMONICS)
+    return optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "binary"])
+def test_sequences_have_the_spectrum_that_they_report(two_plan, kind):
+    """Over 40 sequences of 320 cycles, within five standard errors of chi square: each line has 10
+    frequencies."""
+    sequences = [two_plan.sequence(320, kind, seed) for seed in range(40)]
+    for channel in (0, 1):
+        members, squares = two_plan.channels == channel, []
+        for sequence in sequences:
+            u = sequence.u[:, channel]
+            power = 2 * np.abs(np.fft.rfft(u) / len(u)) ** 2
+            line = np.rint(np.arange(len(power)) / 10).astype(int)
+            squares.append(np.bincount(line, power)[np.rint(two_plan.frequencies * 32).astype(int)])
+        said = sequences[0].power[members]
+        error = 5 * said / np.sqrt(40 * 10) + 1e-3 * said.max()
+        assert (np.abs(np.mean(squares, axis=0)[members] - said) < error).all()
+    assert sequences[0].power.sum() == pytest.approx(two_plan.power.sum(), rel=0.1)
+    assert (sequences[0].u != sequences[1].u).any()
+    if kind == "binary":
+        np.testing.assert_allclose(np.abs(sequences[0].u), 0.1, rtol=1e-3)
+
+
+def test_the_arcsine_law():
+    """A binary sequence has a smooth spectrum as wanted; 0.2 would be missed without the law."""
+    f, nearest = np.arange(96) / 32, np.rint(np.arange(961) / 10).astype(int)
+    power = np.append((f > 0) / (1 + f**2), 0.0)
+    _, spectrum = random_sequence(power, nearest, "binary", np.random.default_rng(0))
+    assert np.abs(np.bincount(nearest, spectrum) - power).sum() < 0.05 * power.sum()
+
+
+def test_bad_sequences(two_plan):
+    with pytest.raises(hj.DefinitionError, match="31 cycles do not resolve lines"):
+        two_plan.sequence(31)
+    model = hj.LDTP(np.full((3, 1, 1), 0.8), np.ones((3, 1, 1)), np.ones((3, 1, 1)))
+    goal = hj.designs.Multipliers(harmonics=0)
+    plan = hj.optimal_design(model, hj.multisine(3, 32, band=(0, 1.5)), goal=goal)
+    with pytest.raises(hj.DefinitionError, match="odd number of samples"):
+        plan.sequence(33)
 
 
 @pytest.mark.slow
-def test_physical_parameters():
-    """Their standard errors with the usual design are those of `fit_model`'s sensitivities."""
-    cycle = hj.find_limit_cycle(hj.models.Duffing())
-    sections = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
-    model = hj.linearize(cycle, sections, outputs=("x", "v"))
-    usual, free = hj.multisine(8, periods=16).scaled(0.001), ("damping", "amplitude")
-    goal = hj.designs.Parameters(cycle, sections, free, harmonics=(-1, 0, 1))
-    plan = hj.optimal_design(model, usual, goal=goal, noise={"x": 1e-4})
-    assert plan.certificate < 1.03 and plan.saved > 10
-
-    htf = model.htf(usual.frequencies, (-1, 0, 1))
-    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
-    seen = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
-    S = hj.fitting.identifiability(
-        cycle.system, hj.ObservedHTF(seen, sections), free, guess=cycle
-    ).sensitivity
-    bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
-    np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)
+def test_fits_of_series_gain_what_is_promised(two, two_plan):
+    """Errors of `fit_series` with the optimal spectrum against white noise of the same rms: the
+    ratio of the variances is that of the designs, within four standard errors."""
+    rng, draws, square = np.random.default_rng(0), 60, []
+    for white in (True, False):
+        errors = []
+        for seed in range(draws):
+            u = two_plan.sequence(320, seed=seed).u
+            if white:
+                u = 0.1 * rng.normal(size=u.shape)
+            y = np.asarray(two.simulate(u))
+            y = y + rng.normal(size=y.shape) * list(TWO_NOISE.values())
+            fit = hj.fit_series(hj.Record(u, y, n_sections=6), 2, check=False)
+            errors.append(np.abs(fit.multipliers - two.multipliers)[0])
+        square.append(np.mean(np.square(errors)))
+    spread = 4 * np.sqrt(2 * 2 / draws)
+    assert square[0] / square[1] == pytest.approx(two_plan.saved, rel=spread)
+    assert square[0] > square[1]

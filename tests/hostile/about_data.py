@@ -67,23 +67,11 @@ def estimates(t):
     yield "estimate_htf", hj.estimate_htf, dict(data=t.data, harmonics=0), {
         "data": alone, "harmonics": HARMONICS, "variance": WORD, "half_integers": WORD,
     } | shared  # fmt: skip
-    yield (
-        "estimate_coherence",
-        hj.identify.estimate_coherence,
-        dict(data=t.repeated, harmonics=0, repeats=2),
-        {"data": alone, "harmonics": HARMONICS} | shared,
-    )
     yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
-    yield "htf_p_values", hj.identify.htf_p_values, dict(
-        data=t.four_times, true=t.model.htf(t.design.frequencies[:2], 0)
-    ), {"data": alone, "true": instance(t.model)} | shared  # fmt: skip
     yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
         "data": instance(t.design), "repeats": FEW,
-    }  # fmt: skip
-    yield "predict_leakage", hj.identify.predict_leakage, dict(design=t.design, model=t.model), {
-        "design": instance(t.model), "model": instance(t.design), "harmonics": HARMONICS,
     }  # fmt: skip
     yield "remove_transient", hj.identify.remove_transient, dict(
         data=t.repeated, order=2, skip=1
@@ -94,7 +82,7 @@ def estimates(t):
     htf = instance(t.model, t.data)
     yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
         "htf": htf, "harmonic": INTEGER, "output": OUTPUT, "input": INPUT, "poles": FEW,
-        "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD, "max_steps": COUNT,
+        "zeros": [*WHOLE, 10**6], "form": WORD, "weighting": WORD,
     }  # fmt: skip
     yield "RationalFit.htf", t.rational.htf, dict(f=np.array([0.1, 0.2])), {
         "f": array([0.1, 0.2], empty=True),
@@ -102,11 +90,6 @@ def estimates(t):
     yield "RationalFit.compare", t.rational.compare, dict(true=[0.5]), {
         "true": TRUE, "output": OUTPUT,
     }  # fmt: skip
-    yield "fit_aaa", hj.identify.fit_aaa, dict(htf=t.estimate), {
-        "htf": htf, "harmonic": INTEGER, "input": INPUT, "tolerance": POSITIVE,
-        "terms": COUNT,
-    }  # fmt: skip
-    yield "AAAFit.compare", t.aaa.compare, dict(true=[0.5]), {"true": TRUE, "output": OUTPUT}
     order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
     yield "fit_multipliers", hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6), {
         "htf": htf, "order": order, "harmonics": HARMONICS, "overhang": optional([*WHOLE, 10**6]),
@@ -162,7 +145,7 @@ def series(t):
     order = [None, "2", 2.5, NAN, True, 0, -1, 10**6, Other(), t.design]
     yield "fit_series", hj.fit_series, dict(data=t.record, order=2), {
         "data": data, "order": order, "overhang": optional([*WHOLE, 10**6]), "start": WORD,
-        "errors": WORD, "distortion": optional(FLAG), "check": FLAG, "max_steps": COUNT,
+        "errors": WORD, "check": FLAG, "max_steps": COUNT,
     }  # fmt: skip
     yield "SeriesFit.impulse_response", t.fit.impulse_response, dict(n_lags=3), {
         "n_lags": LIMITED,
@@ -255,24 +238,22 @@ def designs(t):
     noise = [3, "nope", {"z": 1.0}, {"y0": 0.0}, {"y0": NAN}]
     noise += [{"y0": lambda f: "x"}, {"y0": lambda f: f * NAN}, {"y0": lambda f: f - 1}]
     yield "optimal_design", hj.optimal_design, dict(
-        model=t.model, design=t.design, goal=ask, max_steps=1
+        model=t.model, design=t.design, goal=ask
     ), {
         "model": instance(t.design), "design": [3, t.model, t.one_input, np.zeros((1, 9, 2))],
         "goal": [*WORD, hj.designs.Multipliers(9), hj.designs.Multipliers(harmonics=1)],
         "limit": [*limits, distorted], "noise": optional(noise),
-        "largest": optional(amplitudes), "experiments": optional(FEW), "seed": SEED,
-        "max_steps": COUNT, "robust": WORD,
+        "largest": optional(amplitudes), "seed": SEED, "robust": WORD,
     }  # fmt: skip
     yield "Multipliers", hj.designs.Multipliers, {}, {
-        "which": optional(WHOLE), "part": WORD, "criterion": WORD, "estimator": WORD,
+        "which": optional(WHOLE), "part": WORD, "estimator": WORD,
         "weights": optional(weights),
         "harmonics": optional(HARMONICS), "overhang": optional(WHOLE),
     }  # fmt: skip
     yield "Parameters", hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",)), {
         "cycle": instance(t.system), "sections": [None, "x", 8, [], [3], Other()],
         "free": [None, 3, (), (3,), ("x", "x"), Other()],
-        "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "criterion": WORD,
-        "harmonics": HARMONICS, "weights": optional(weights),
+        "wanted": optional([3, (), (3,), ("x", "x"), Other()]), "harmonics": HARMONICS,
     }  # fmt: skip
     band = [None, 3, "x", (1,), (1, NAN), (2.0, 1.0), (-1.0, 1.0), (0, 1, 2), Other()]
     yield "FrequencyResponse", hj.designs.FrequencyResponse, dict(band=(0.1, 1.0)), {

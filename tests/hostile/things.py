@@ -78,11 +78,6 @@ class Things:
         return hj.ExperimentData(u, y, n_sections=6, periods=16, result=self.data.result)
 
     @ft.cached_property
-    def four_times(self):
-        design = self.design.realizations(4)
-        return hj.experiments.simulate_experiments(self.model, design, start="periodic")
-
-    @ft.cached_property
     def estimate(self):
         return hj.estimate_htf(self.data, (-1, 0, 1))
 
@@ -100,17 +95,13 @@ class Things:
         return hj.fit_rational(self.estimate, output=0, poles=1, zeros=1)
 
     @ft.cached_property
-    def aaa(self):
-        return hj.identify.fit_aaa(self.estimate)
-
-    @ft.cached_property
     def structured(self):
         return hj.fit_multipliers(self.estimate, 2, overhang=6)
 
     @ft.cached_property
     def plan(self):
         goal = hj.designs.Multipliers(harmonics=0, overhang=6)
-        return hj.optimal_design(self.model, self.design, goal=goal, max_steps=1)
+        return hj.optimal_design(self.model, self.design, goal=goal)
 
     @ft.cached_property
     def decaying(self):

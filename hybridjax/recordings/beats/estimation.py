@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize
 
-from ...identify.multipliers.covariance import Covariance, sandwich
+from ...identify.denominator import Covariance, sandwich
 from .model import Forecast, Intervals, basis, forecast, tabulated
 
 

@@ -1,0 +1,148 @@
+"""The criterion of each goal."""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..errors import DefinitionError
+from ..fitting.fit import identifiability
+from ..fitting.observations import ObservedHTF
+from ..identify.denominator import multipliers_of
+from .candidates import Candidates, Model, Noise, Powers, measured_htfs
+from .criterion import Average, Criterion, Information, LinearCriterion
+from .goals import Goal, Multipliers, Order, Parameters
+from .matrices import ldtp_matrices, response_criterion
+from .numerators import denominator_information, order_criterion
+
+
+# Exponents of the mean over models. Larger, for the worst one: closer to the largest criterion (of
+# ten models within 13 %), but the iteration takes shorter steps.
+_EXPONENT = {"mean": 1.0, "worst": 16.0}
+# Relative size of the polynomial's slope below which a multiplier is not simple, and relative
+# distance at which multipliers of a minimal and of the whole model are the same. Larger: distinct
+# multipliers count as one. Smaller: rounding separates equal ones.
+_SAME = 1e-6
+
+
+def criterion_of(
+    goal: Goal,
+    models: list[Model],
+    cosines: Candidates,
+    noise: Noise,
+    power: Powers,
+    robust: Literal["mean", "worst"],
+) -> Criterion:
+    """Return the criterion of a goal for one or several models.
+
+    **Arguments:** `power` of the cosines in the usual design: combinations of matrices that it does
+    not determine are left out.
+
+    **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
+    that do not exist, and combinations that the data do not identify, which are named.
+    """
+    if isinstance(goal, Parameters) and len(models) > 1:
+        raise DefinitionError("a goal of parameters holds its own cycle: give one `model`.")
+    each = []
+    for model in models:
+        if isinstance(goal, Multipliers):
+            each.append(_multipliers(goal, model, cosines, noise, power))
+        elif isinstance(goal, Order):
+            each.append(order_criterion(goal, model, cosines, noise))
+        elif isinstance(goal, Parameters):
+            each.append(_parameters(goal, model, cosines, noise))
+        else:
+            each.append(response_criterion(goal, model, cosines, noise, power))
+    return each[0] if len(each) == 1 else Average(each[0].names, tuple(each), _EXPONENT[robust])
+
+
+def _multipliers(
+    goal: Multipliers, model: Model, cosines: Candidates, noise: Noise, power: Powers
+) -> LinearCriterion:
+    multipliers = np.asarray(model.multipliers)
+    if goal.estimator == "fit_ldtp":
+        matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
+        c, slopes = matrices.characteristic()
+        minimal = multipliers_of(c)
+        if goal.which is not None and goal.which < len(multipliers):
+            apart = np.abs(minimal - multipliers[goal.which])
+            if not apart.min() < _SAME * np.abs(multipliers).max():
+                raise DefinitionError(
+                    f"no input excites, or no measured output depends on, the multiplier "
+                    f"{multipliers[goal.which]:.4g}."
+                )
+            goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
+        wanted, names = wanted_parts(goal, minimal, c)
+        return matrices.criterion(wanted @ slopes, names)
+    c = np.poly(multipliers).real[1:]
+    htfs = list(measured_htfs(model, cosines, goal.fitted_harmonics, noise))
+    wanted, names = wanted_parts(goal, multipliers, c)
+    return LinearCriterion(names, denominator_information(htfs, c, goal.overhang), wanted)
+
+
+def wanted_parts(
+    goal: Multipliers, multipliers: Complex[np.ndarray, " d"], c: Float[np.ndarray, " d"]
+) -> tuple[Float[np.ndarray, "g d"], tuple[str, ...]]:
+    """Return derivatives of real and imaginary parts, or moduli, by c, and their names."""
+    d = len(c)
+    if d == 0:
+        raise DefinitionError("the model has no multipliers but zero: there is nothing to design.")
+    if goal.which is not None and goal.which >= d:
+        raise DefinitionError(f"`goal`: there is no multiplier {goal.which}, the model has {d}.")
+    slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
+    wanted, names = [], []
+    for k in range(d) if goal.which is None else [goal.which]:
+        z = multipliers[k]
+        if goal.which is None and z.imag < 0:
+            continue
+        if abs(slope[k]) < _SAME:
+            raise DefinitionError(
+                f"the multiplier {z:.4g} is not simple: its variance is infinite to first "
+                "order, so no design can be made for it."
+            )
+        gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
+        name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
+        if goal.part == "modulus":
+            wanted.append((z.conj() * gradient).real / abs(z))
+            names.append(f"|{name}|")
+        elif z.imag == 0:
+            wanted.append(gradient.real)
+            names.append(name)
+        else:
+            wanted += [gradient.real, gradient.imag]
+            names += [f"Re({name})", f"Im({name})"]
+    if goal.weights is None:
+        return np.array(wanted), tuple(names)
+    if len(goal.weights) != len(names):
+        raise DefinitionError(
+            f"`weights` of the goal must be {len(names)} numbers: one for each of "
+            f"{', '.join(names)}."
+        )
+    pairs = zip(goal.weights, names, strict=True)
+    total = " ".join(f"{w:+.3g} {name}" for w, name in pairs if w)
+    return np.array([goal.weights]) @ np.array(wanted), (total,)
+
+
+def _parameters(
+    goal: Parameters, model: Model, cosines: Candidates, noise: Noise
+) -> LinearCriterion:
+    free = tuple(goal.free)
+    wanted = free if goal.wanted is None else tuple(goal.wanted)
+    unknown = [name for name in wanted if name not in free]
+    if unknown:
+        raise DefinitionError(f"`goal`: '{unknown[0]}' is wanted, but not one of `free`, {free}.")
+    slopes, cosine = [], []
+    for htf, members, _ in measured_htfs(model, cosines, goal.harmonics, noise):
+        observed = ObservedHTF(htf, goal.sections)
+        data = identifiability(goal.cycle.system, observed, free, guess=goal.cycle)
+        if not data.complete:
+            lost = "; ".join(data.descriptions())
+            raise DefinitionError(f"the data do not identify {lost}: leave it out of `free`.")
+        slopes.append(data.sensitivity.T)
+        shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
+        cosine.append(np.broadcast_to(members[:, None], shape).ravel())
+    flat = np.concatenate(slopes, axis=1)
+    information = Information.direct(np.concatenate(cosine), flat, free)
+    rows = np.eye(len(free))[[free.index(name) for name in wanted]]
+    return LinearCriterion(wanted, information, rows)

@@ -1,0 +1,250 @@
+r"""Limits of experiments: powers p of the cosines with $W p \le 1$ and $p^T Q p \le 1$."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Positive
+from ..errors import DefinitionError
+from ..experiments.design.design import Design
+from ..experiments.design.multisine import optimize_phases
+from ..experiments.design.partition import line_class
+from .candidates import Candidates, Kept, Model, Powers, Squares, rate_of
+from .distortion import Distortion
+
+
+# Lower bound of a cosine's price, relative to its price without negative terms. Larger: prices are
+# wrong where a few are negative. Smaller: powers without a positive price grow without bound.
+_LEAST = 1e-3
+
+Words = Literal["input", "output"]
+
+
+@checked
+class Limits(eqx.Module):
+    """Limits of experiments, by the names of signals.
+
+    **Arguments:**
+
+    - `rms`: of inputs, of outputs (their deviation from the cycle), or of states by their names in
+      `LDTP.coordinates`, over all experiments. `"input"` or `"output"` means that none of these may
+      be larger than in the `design` that is improved.
+    - `rate`: rms of the change of an input from one section to the next.
+    - `peak`: of an input, in every experiment. Phases are then optimized for a low peak, and
+      experiments that still exceed it are scaled down. (Such phases are not random: the scatter of
+      realizations does not show nonlinear distortion.)
+    - `strides`: cycles of all experiments together, without those that are discarded. Default: as
+      many as in `design`.
+    - `distortion`: of outputs.
+    """
+
+    rms: Mapping[str, Positive] | Words = eqx.field(default_factory=dict)
+    rate: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    peak: Mapping[str, Positive] = eqx.field(default_factory=dict)
+    strides: Count | None = eqx.field(static=True, default=None)
+    distortion: Distortion | None = None
+
+    def require_inputs(self, inputs: tuple[str, ...]) -> None:
+        """**Raises:** `DefinitionError` for rates and peaks of signals that are no inputs."""
+        for word, given in (("rate", self.rate), ("peak", self.peak)):
+            unknown = [n for n in given if n not in inputs]
+            if unknown:
+                raise DefinitionError(
+                    f"`limit` has the {word} of '{unknown[0]}'; the inputs are {', '.join(inputs)}."
+                )
+
+    def experiments(self, design: Design, cosines: int) -> int:
+        """Return the number of experiments that the strides allow.
+
+        **Raises:** `DefinitionError` if they do not suffice for one, or there are fewer cosines.
+        """
+        periods = design.periods
+        count = design.experiments if self.strides is None else self.strides // periods
+        if count == 0:
+            raise DefinitionError(
+                f"`limit` allows {self.strides} strides, but one experiment has {periods} periods: "
+                "allow more, or take shorter experiments."
+            )
+        if count > cosines:
+            raise DefinitionError(
+                f"{count} experiments are more than the {cosines} cosines of the `design`."
+            )
+        return count
+
+
+Limit = Words | Mapping[str, Positive] | Limits
+Largest = float | Callable[[np.ndarray], np.ndarray] | None
+"""Amplitude that a cosine may have in an experiment, as a function of its frequency."""
+
+
+def as_limits(limit: Limit) -> Limits:
+    return limit if isinstance(limit, Limits) else Limits(limit)
+
+
+def peak_of(name: str) -> str:
+    return f"peak of {name}"
+
+
+class PowerLimits(NamedTuple):
+    """L limits of sums over cosines, and O of quadratic forms."""
+
+    names: tuple[str, ...]
+    """Names of the limited quantities: rms values of signals, rates, peaks, distortions; not of
+    amplitudes."""
+    cost: Float[np.ndarray, "L K"]
+    """W: share of each limit that a unit of a cosine's power takes."""
+    curved: Float[np.ndarray, "O K K"]
+    """Q, positive semidefinite: the root of $p^T Q p$ is the share that is used."""
+
+    def use(self, power: Powers) -> Float[np.ndarray, " shares"]:
+        """Return the share of each limit that is used, those of quadratic forms last."""
+        return np.append(self.cost @ power, self.use_of_curved(power))
+
+    def use_of_curved(self, power: Powers) -> Float[np.ndarray, " O"]:
+        return np.sqrt(np.maximum(self.curved @ power @ power, 0))
+
+    def tangent(self, power: Powers, level: Float[np.ndarray, " O"] | float = 1.0) -> "PowerLimits":
+        r"""Return linear limits, $p^T Q q \le \sqrt{p^T Q p}$, that all q within the quadratic ones
+        obey (Cauchy-Schwarz inequality): p itself uses both alike.
+
+        **Arguments:** `level`: factor by which the quadratic forms may exceed 1. Default: 1.
+        """
+        slope, use = self.curved @ power, self.use_of_curved(power)
+        slope = slope / np.where(use > 0, use * level, 1.0)[:, None]
+        return PowerLimits(self.names, np.concatenate([self.cost, slope]), self.curved[:0])
+
+    def scaled(self, power: Powers) -> Powers:
+        """Return the same proportions, as large as the limits allow."""
+        return power / self.use(power).max()
+
+    def price(self, prices: Float[np.ndarray, " L"]) -> Powers:
+        """Return the price of a unit of each cosine's power, which is positive even where the
+        tangent of a quadratic limit is not."""
+        return np.maximum(prices @ self.cost, _LEAST * (prices @ np.abs(self.cost)))
+
+    def share(self, power: Powers) -> Powers:
+        """Return the average share of the limits that a unit of each cosine's power takes."""
+        flat = self.tangent(power)
+        return flat.price(np.full(len(flat.cost), 1 / len(flat.cost)))
+
+    def only(self, kept: Kept) -> "PowerLimits":
+        return self._replace(cost=self.cost[:, kept], curved=self.curved[:, kept][:, :, kept])
+
+    def with_rows(self, cost: Float[np.ndarray, "L K"]) -> "PowerLimits":
+        return self._replace(cost=np.concatenate([self.cost, cost]))
+
+    def with_amplitudes(self, largest: Powers, cosines: Candidates) -> "PowerLimits":
+        r"""Return the limits with those of the cosines' amplitudes in every experiment.
+
+        A cosine of power p (on the average over all experiments) with its largest amplitude a takes
+        a share $2p / a^2$ of them, and each experiment can hold one of each class.
+        """
+        classes = line_class(cosines.line, cosines.periods)
+        limited = np.unique(classes[np.isfinite(largest)])
+        return self.with_rows((classes == limited[:, None]) * 2 / largest**2)
+
+    def require_limits(self) -> None:
+        """**Raises:** `DefinitionError` if some cosine is not limited."""
+        alone = np.diagonal(self.curved, axis1=1, axis2=2)
+        free = np.concatenate([self.cost, alone]).max(axis=0) == 0
+        if free.any():
+            raise DefinitionError(
+                f"no limit applies to cosine {int(np.argmax(free))} of the design (a distortion "
+                "does not where nothing is distorted): limit the input, too."
+            )
+
+
+def power_limits(
+    limits: Limits, models: list[Model], squares: list[Squares], usual: Powers
+) -> PowerLimits:
+    """Return the linear limits, which hold for each model. A peak is no smaller than an rms value.
+
+    **Arguments:** `squares` of each model. `usual`: powers of the design that is improved.
+
+    **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies.
+    """
+    inputs, outputs = models[0].inputs, models[0].outputs
+    if isinstance(limits.rms, str):
+        names = inputs if limits.rms == "input" else outputs
+        levels = [{n: float(np.sqrt(square[n] @ usual)) for n in names} for square in squares]
+    else:
+        rates = {rate_of(n) for n in inputs}
+        unknown = [n for n in limits.rms if n not in squares[0] or n in rates]
+        if unknown or not (limits.rms or limits.rate or limits.peak or limits.distortion):
+            problem = f"has '{unknown[0]}'" if unknown else "limits nothing"
+            known = ", ".join(n for n in squares[0] if n not in rates)
+            raise DefinitionError(f"`limit` {problem}; rms values can be limited of {known}.")
+        levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
+    limits.require_inputs(inputs)
+    for level in levels:
+        level |= {rate_of(n): float(x) for n, x in limits.rate.items()}
+        level |= {peak_of(n): float(x) for n, x in limits.peak.items()}
+    silent = [n for level in levels for n, rms in level.items() if rms == 0]
+    if silent:
+        raise DefinitionError(f"the `design` does not move {silent[0]}, so it cannot be limited.")
+    names = [n for level in levels for n in level]
+    rows = [
+        square[n.removeprefix(peak_of(""))] / rms**2
+        for square, level in zip(squares, levels, strict=True)
+        for n, rms in level.items()
+    ]
+    K = len(usual)
+    cost = np.reshape(rows, (-1, K))
+    distinct = np.sort(np.unique(cost, axis=0, return_index=True)[1])
+    return PowerLimits(tuple(names[i] for i in distinct), cost[distinct], np.zeros((0, K, K)))
+
+
+def largest_amplitudes(largest: Largest, f: Powers) -> Powers:
+    """Return the largest amplitude at each frequency, infinite where there is no limit.
+
+    **Raises:** `DefinitionError` for anything but numbers that are not negative.
+    """
+    if largest is None:
+        return np.full(len(f), np.inf)
+    given = np.asarray(largest(f) if callable(largest) else largest)
+    if given.dtype.kind not in "fiu" or given.shape not in ((), f.shape):
+        raise DefinitionError("`largest` must return a real number for each frequency.")
+    if not (given >= 0).all():
+        raise DefinitionError("`largest` must return amplitudes that are not negative.")
+    return np.broadcast_to(given, f.shape)
+
+
+def without_forbidden(design: Design, largest: Largest) -> Design:
+    """Return the design with the allowed lines only, none above its largest amplitude; experiments
+    without any are left out.
+
+    **Raises:** `DefinitionError` as `largest_amplitudes`, and if no line remains.
+    """
+    most = largest_amplitudes(largest, design.line / design.periods)
+    kept = most > 0
+    if not kept.any():
+        raise DefinitionError("`largest` is zero at all frequencies: no cosine may be applied.")
+    used, experiment = np.unique(design.experiment[kept], return_inverse=True)
+    parts = {n: getattr(design, n)[kept] for n in ("line", "channel", "phase")}
+    parts["amplitude"] = np.minimum(design.amplitude, most)[kept]
+    return dataclasses.replace(design, experiment=experiment, experiments=len(used), **parts)
+
+
+def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
+    """Return the design with phases for low peaks, and with experiments that still exceed a peak
+    scaled down."""
+    phase = np.array(design.phase)
+    for e in range(design.experiments):
+        lines = np.flatnonzero(design.experiment == e)
+        parts = {n: getattr(design, n)[lines] for n in ("line", "channel", "amplitude", "phase")}
+        # (Alone, so that a line that occurs in several experiments may have any phase.)
+        single = dataclasses.replace(design, experiment=0 * lines, experiments=1, **parts)
+        phase[lines] = optimize_phases(single, seed).phase
+    design = dataclasses.replace(design, phase=phase)
+    highest = np.abs(design.inputs()).max(axis=1)
+    factor = np.ones_like(highest)
+    for name, most in peak.items():
+        i = design.input_names.index(name)
+        factor[:, i] = most / np.maximum(highest[:, i], most)
+    amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
+    return dataclasses.replace(design, amplitude=amplitude)

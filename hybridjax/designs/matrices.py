@@ -1,0 +1,236 @@
+r"""Criteria of `fit_ldtp`, whose unknowns are the matrices of a linear periodic model.
+
+They are taken in the local coordinates of `fit_ldtp`, in combinations for which the information of
+the usual design is the identity; combinations that it does not determine are left out.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..errors import DefinitionError
+from ..identify.htf_errors import check_values, error_weights
+from ..identify.joint.characteristic import characteristic_slopes
+from ..identify.joint.coordinates import LocalCoordinates, local_coordinates
+from ..identify.joint.frequency import transfer, transfer_slopes
+from ..identify.joint.periodic_model import PeriodicModel
+from ..identify.series.realization import realize
+from ..linear.frequency_response import Harmonics, check_harmonics
+from ..linear.ldtp import LDTP
+from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
+from .criterion import Information, LinearCriterion
+from .goals import FrequencyResponse, ImpulseResponse
+
+
+# Periods of the impulse response from which a minimal model is made, and the fewest lags. Fewer:
+# states that appear late in the outputs are dropped. More: states that hardly appear are kept.
+_PERIODS, _LAGS = 4, 17
+# Combinations with less information in the usual design, relative to the largest, are rounding
+# errors. Larger: combinations that the data determine are left out. Smaller: rounding is kept.
+_SINGULAR = 1e-13
+# Part of a wanted variance that left-out combinations may have, at least. Larger: standard errors
+# are too small by half of it. Smaller: goals are rejected for rounding errors.
+_MISSED = 0.05
+# Part of a sum of squares, in units of the usual errors, that is left out to have fewer rows.
+# Larger: variances are too small by it. Smaller: more rows, which take longer.
+_NEGLIGIBLE = 1e-8
+# Frequencies of a band at which its mean is taken. Fewer: the mean of a resonant curve is off.
+# More: longer computation.
+_POINTS = 64
+# Length of the imaginary steps by which derivatives are taken: its square must underflow beside 1.
+_STEP = 1e-30
+
+
+class Matrices(NamedTuple):
+    """Combinations of the P local coordinates, and the information about them."""
+
+    coordinates: LocalCoordinates
+    information: Information
+    size: Float[np.ndarray, " P"]
+    """One over the unit of each coordinate."""
+    values: Float[np.ndarray, " P"]
+    """Eigenvalues of the usual information in these units."""
+    vectors: Float[np.ndarray, "P P"]
+
+    def characteristic(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n P"]]:
+        """Return the coefficients of the multipliers' polynomial, and their derivatives."""
+        return characteristic_slopes(self.coordinates)
+
+    def criterion(
+        self,
+        wanted: Float[np.ndarray, "rows P"],
+        names: tuple[str, ...],
+        part: Int[np.ndarray, " rows"] | None = None,
+    ) -> LinearCriterion:
+        """Return the criterion of functions with these derivatives by the coordinates.
+
+        **Arguments:** `part`: as in `LinearCriterion`.
+
+        **Raises:** `DefinitionError` if the usual design does not determine them.
+        """
+        kept = _determined(self.values)
+        turned = wanted / self.size @ self.vectors
+        square = turned**2 / np.maximum(self.values, _SINGULAR * self.values[-1])
+        quantity = np.arange(len(wanted)) if part is None else part
+        whole = np.bincount(quantity, square.sum(axis=1))
+        if (np.bincount(quantity, square[:, ~kept].sum(axis=1)) > _MISSED * whole).any():
+            raise DefinitionError(
+                "the usual design does not determine what `goal` asks for: measure more harmonics "
+                "or lines."
+            )
+        wanted = turned[:, kept] / np.sqrt(self.values[kept])
+        return LinearCriterion(names, self.information, wanted, part)
+
+
+def ldtp_matrices(
+    model: Model, cosines: Candidates, harmonics: Harmonics | None, noise: Noise, power: Powers
+) -> Matrices:
+    """Return the unknown matrices of a minimal model.
+
+    **Arguments:** `power` of the usual design.
+
+    **Raises:** `DefinitionError` for a model that is no `LDTP`.
+    """
+    if not isinstance(model, LDTP):
+        raise DefinitionError(
+            "a goal of `fit_ldtp` needs a model with matrices: an `LDTP`, such as `fit.model` of "
+            "`fit_ldtp` or a result of `hj.identify.realize`."
+        )
+    lags = max(_PERIODS * model.n_sections, _LAGS - 1) + 1
+    response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
+    htfs = list(measured_htfs(model, cosines, harmonics, noise))
+    scale = np.sqrt(np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0))
+    direct = bool(response[:, 0].any())
+    coordinates = local_coordinates(PeriodicModel.of(realize(response), scale), direct)
+    gram = np.zeros((coordinates.size, coordinates.size))
+    for lines, rows in _rows(coordinates, htfs, scale):
+        flat = _flat(rows * np.sqrt(power[lines])[:, None, None])
+        gram += flat @ flat.T
+    size = np.sqrt(np.diag(gram))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(gram / size / size[:, None])
+    kept = _determined(values)
+    turn = (vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]).T
+    cosine, slopes = [], []
+    for lines, rows in _rows(coordinates, htfs, scale):
+        cosine.append(np.repeat(lines, rows.shape[2]))
+        slopes.append(turn @ _flat(rows))
+    unknowns = tuple(f"combination {k} of the matrices" for k in range(kept.sum()))
+    flat = np.concatenate(slopes, axis=1)
+    information = Information.direct(np.concatenate(cosine), flat, unknowns)
+    return Matrices(coordinates, information, size, values, vectors)
+
+
+def _determined(values: Float[np.ndarray, " P"]) -> Bool[np.ndarray, " P"]:
+    return values > _SINGULAR * values[-1]
+
+
+def _rows(
+    coordinates: LocalCoordinates, htfs: list[Measured], scale: Float[np.ndarray, " ny"]
+) -> Iterator[tuple[Int[np.ndarray, " lines"], Float[np.ndarray, "lines P rows"]]]:
+    """Yield derivatives of the measurements of some cosines, in units of their standard deviations
+    at power 1."""
+    for htf, cosines, channel in htfs:
+        weight = error_weights(htf, scale)[..., 0] * scale
+        for chunk, slopes in transfer_slopes(coordinates, np.asarray(htf.f), htf.harmonics):
+            rows = slopes[..., channel] * weight[:, chunk]
+            rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
+            yield cosines[chunk], rows.reshape(*rows.shape[:2], -1).view(float)
+
+
+def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines*rows"]:
+    return rows.swapaxes(0, 1).reshape(rows.shape[1], -1)
+
+
+def response_criterion(
+    goal: FrequencyResponse | ImpulseResponse,
+    model: Model,
+    cosines: Candidates,
+    noise: Noise,
+    power: Powers,
+) -> LinearCriterion:
+    """Return the criterion of transfer functions in a band, or of impulse responses.
+
+    **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
+    """
+    N = cosines.n_sections
+    pairs = [
+        f"{model.outputs[i]}{f' from {u}' * (len(model.inputs) > 1)}"
+        for i in noise.outputs
+        for u in model.inputs
+    ]
+    if isinstance(goal, ImpulseResponse):
+        matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
+        response, slopes = _impulses(matrices.coordinates, goal.lags)
+        square = (response**2).sum(axis=(0, 1))
+        slopes = slopes / np.sqrt(np.where(square > 0, square, np.inf))
+        names = [f"response of {pair}" for pair in pairs]
+        each = slopes.transpose(3, 4, 0, 1, 2)
+    else:
+        low, high = goal.band
+        if high > N / 2:
+            raise DefinitionError(f"`band` must lie within 0 and {N / 2:g}, not {goal.band}.")
+        harmonics = check_harmonics(goal.wanted, N)
+        matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
+        f = low + (high - low) * (np.arange(_POINTS) + 0.5) / _POINTS
+        H = transfer(matrices.coordinates.model, f, harmonics)
+        parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
+        slopes = np.concatenate(parts, axis=2)
+        size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
+        slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
+        names = [f"H_{m} of {pair}" for m in harmonics for pair in pairs]
+        each = slopes.transpose(1, 4, 5, 0, 2, 3)  # (M, ny, nu, P, F, 2)
+    each = each.reshape(len(names), matrices.coordinates.size, -1)
+    part = np.repeat(np.arange(len(each)), each.shape[2])
+    wanted = each.swapaxes(1, 2).reshape(len(part), -1)
+    return _fewer_rows(matrices.criterion(wanted, tuple(names), part), part)
+
+
+def _fewer_rows(criterion: LinearCriterion, part: Int[np.ndarray, " rows"]) -> LinearCriterion:
+    """Return the criterion with as few rows of each quantity as have the same sum of squares."""
+    rows, parts = [], []
+    for k in range(len(criterion.names)):
+        _, values, vectors = np.linalg.svd(criterion.wanted[part == k], full_matrices=False)
+        square = values**2
+        kept = np.cumsum(square[::-1])[::-1] > _NEGLIGIBLE * square.sum()
+        rows.append(vectors[kept] * values[kept, None])
+        parts.append(np.full(kept.sum(), k))
+    changed = np.concatenate(rows), np.concatenate(parts)
+    return LinearCriterion(criterion.names, criterion.information, *changed)
+
+
+def _impulses(
+    coordinates: LocalCoordinates, lags: int
+) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, "P N lags ny nu"]]:
+    """Return responses at section n to an input r sections earlier, and their derivatives."""
+    P, places = coordinates.size, coordinates.places
+    A, B, C, D = ([x.astype(complex)[None] for x in blocks] for blocks in coordinates.model[:4])
+    N, (ny, nu) = coordinates.model.n_sections, coordinates.model.D[0].shape
+    response = np.zeros((P, N, lags, ny, nu), complex)
+
+    def perturbed(n: int) -> tuple[np.ndarray, ...]:
+        """Return the matrices of a section, with an imaginary step of each coordinate."""
+        step = np.zeros((P, P), complex)
+        at = [i for part in places[n].values() for i in range(part.start, part.stop)]
+        step[at, at] = 1j * _STEP
+        change = {
+            name: step[:, places[n][name]].reshape(P, *shape)
+            for name, shape in coordinates.blocks(n)
+        }
+        return (
+            A[n] + coordinates.to_A[n] @ change["Y"],
+            B[n] + change["B"],
+            C[n] + coordinates.to_C[n] @ change["Y"],
+            D[n] + change.get("D", 0.0),
+        )
+
+    sections = [perturbed(n) for n in range(N)]
+    for first, (_, x, _, direct) in enumerate(sections):
+        response[:, first, 0] = direct
+        for r in range(1, lags):
+            n = (first + r) % N
+            response[:, n, r] = sections[n][2] @ x
+            x = sections[n][0] @ x
+    return np.real(response[0]), np.imag(response) / _STEP

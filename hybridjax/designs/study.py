@@ -1,0 +1,316 @@
+"""Studies: experiments block after block, until the estimate is as precise as requested."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._core.arguments import require_same
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Order, Positive, Seed
+from .._core.execution import one_blas_thread
+from .._core.html import card, multiplier_table, table, text
+from .._core.progress import working
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.design.design import Design
+from ..identify.multipliers import StructuredFit
+from .candidates import Candidates
+from .goals import Multipliers
+from .limits import Limit, as_limits, without_forbidden
+from .optimal_design import OptimalDesign
+from .optimize import optimal_design
+from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
+
+
+# A block has at most so many times the strides of all before it. Larger: more strides for a design
+# from a poor estimate. Smaller: more blocks.
+_GROWTH = 2.0
+# Part by which a block is longer than predicted. Larger: too many strides where the prediction was
+# right. Smaller: another block where it was a little too low.
+_SPARE = 0.05
+# Level of the confidence intervals whose widths are compared with the requested precision.
+_LEVEL = 0.95
+
+
+class History(NamedTuple):
+    """The blocks of a study, and the results after each."""
+
+    blocks: tuple[Block, ...] = ()
+    strides: Float[np.ndarray, " B"] = np.zeros(0)
+    standard_errors: Float[np.ndarray, "B g"] = np.zeros((0, 0))
+    estimate: Estimate | None = None
+    plan: OptimalDesign | None = None
+
+
+@checked
+class Study(eqx.Module):
+    r"""A sequence of experiments that starts without a model, and ends at a requested precision.
+
+    ```python
+    study = hj.designs.Study(hj.multisine(lines="odd").scaled(0.001), order=2, standard_error=1e-4)
+    while not study.done:
+        data = hj.run_experiments(cycle, sections, study.design, outputs, start="steady")
+        study = study.add(data)     # in a laboratory: hj.identify.remove_transient(data).data
+    print(study)
+    study.fit.contains(true)         # confidence regions, valid at the time of stopping
+    ```
+
+    The first block is applied as it is, whatever `limit` is. Each later block has the
+    `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
+    these, and as many experiments as are missing, but at most twice the strides so far. While the
+    data do not support `order` multipliers, the first block is repeated with new phases. No prior
+    knowledge is used except the number of multipliers.
+
+    *Why intervals hold.* The estimate at the end is that of maximum likelihood from all blocks.
+    Inputs and the time of stopping are decided by earlier data only, which changes nothing in the
+    likelihood; the estimate, divided by its estimated standard error, is Gaussian in the limit of
+    many strides (Wu, Biometrika 72, 1985, for designs that depend on estimates; Anscombe, Proc.
+    Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for stopping as soon
+    as an interval of given width is reached). A standard error that is too small by chance would
+    violate this. Therefore the larger of two is used, from the scatter at the lines that matter and
+    from the level of the noise in all of them, and the width of the interval by Student's
+    distribution with its degrees of freedom is compared with the requested precision, as in Stein's
+    two stages (Ann. Math. Stat. 16, 1945).
+
+    A study is immutable: `add` returns a new one. It depends on its arguments and blocks only, so
+    that it can be reconstructed from stored data.
+
+    **Arguments:**
+
+    - `first`: the first block; its lines, periods and power are those of all blocks. One input.
+    - `order`: the number of multipliers.
+    - `standard_error`: of each multiplier of `goal`, at which to stop (for `"position"` the root of
+      the expected squared distance from the true one).
+    - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
+    - `limit` and `largest`: as in `optimal_design`, relative to `first`. Default: rms of the input
+      as in `first`.
+    - `seed`: of phases and division of all blocks but the first. Default: 0.
+
+    **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
+    """
+
+    first: Design
+    order: Order = eqx.field(static=True)
+    standard_error: Positive = eqx.field(static=True)
+    goal: Multipliers
+    limit: Limit
+    largest: Positive | Callable[[np.ndarray], np.ndarray] | None
+    seed: Seed = eqx.field(static=True)
+    _history: History
+
+    def __init__(
+        self,
+        first: Design,
+        order: Order,
+        standard_error: Positive,
+        *,
+        goal: Multipliers | None = None,
+        limit: Limit = "input",
+        largest: Positive | Callable[[np.ndarray], np.ndarray] | None = None,
+        seed: Seed = 0,
+    ):
+        if len(first.input_names) > 1:
+            raise DefinitionError(
+                f"`first` has the inputs {', '.join(first.input_names)}: study one at a time."
+            )
+        goal = Multipliers() if goal is None else goal
+        if goal.weights is not None or goal.estimator == "fit_ldtp":
+            raise DefinitionError(
+                "a study estimates multipliers by fit_multipliers: `goal` may have no weights and "
+                "no other estimator."
+            )
+        if goal.which is not None and goal.which >= order:
+            raise DefinitionError(
+                f"`goal`: there is no multiplier {goal.which}, the order is {order}."
+            )
+        limits = as_limits(limit)
+        if limits.strides is not None:
+            raise DefinitionError(
+                "`limit` limits the strides, but a study ends at a precision: end it yourself."
+            )
+        limits.require_inputs(first.input_names)
+        Candidates.of(without_forbidden(first, largest))
+        self.first, self.order, self.standard_error = first, order, standard_error
+        self.goal, self.limit, self.largest, self.seed = goal, limit, largest, seed
+        self._history = History()
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks so far."""
+        return len(self._history.blocks)
+
+    @property
+    def fit(self) -> StructuredFit | None:
+        """The fit to all blocks so far; None before the first."""
+        estimate = self._history.estimate
+        return None if estimate is None else estimate.fit
+
+    @property
+    def plan(self) -> OptimalDesign | None:
+        """The optimal design for the next block; None where that has equal amplitudes."""
+        return self._history.plan
+
+    @property
+    def strides(self) -> Float[np.ndarray, " B"]:
+        """Cycles of all records up to each block, with those that were discarded."""
+        return self._history.strides
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, "B g"]:
+        """Standard errors of the multipliers of `goal` after each block. NaN where the data did not
+        support as many multipliers."""
+        return self._history.standard_errors
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of each output's noise (and distortion) in the last block, by name."""
+        estimate = self._history.estimate
+        if estimate is None:
+            return {}
+        return dict(zip(estimate.fit.outputs, estimate.noise[-1].tolist(), strict=True))
+
+    @property
+    def done(self) -> bool:
+        """Whether the requested precision is reached."""
+        if self.fit is None or not np.isfinite(self.standard_errors[-1]).all():
+            return False
+        return bool(self.standard_errors[-1].max() * _student(self.fit) <= self.standard_error)
+
+    @property
+    def design(self) -> Design:
+        """The next block: for `run_experiments`, or for hardware
+        (`hj.recordings.write_design`)."""
+        if self.fit is None:
+            return self.first
+        if self.plan is None:
+            return self.first.realizations(1, seed=self.seed + self.blocks)
+        return self.plan.design
+
+    @working("Study.add")
+    @one_blas_thread()
+    def add(self, data: ExperimentData, *, repeats: Count = 1) -> "Study":
+        """Return the study with one more block, its estimate and its next design.
+
+        **Arguments:** `data`: the responses to `design`, or to other inputs of the same lines (from
+        recordings: `section_data(...).experiments(periods)`). `repeats`: number of last windows
+        that are averaged. Default: 1.
+
+        **Raises:** `DefinitionError` for data of other inputs, outputs or sections, and where a
+        transient of the start is larger than a part `standard_error` of the response (cycles before
+        the window show it); as `estimate_htf`, `fit_multipliers` and `optimal_design`.
+        """
+        if data.n_sections != self.first.n_sections or len(data.inputs) > 1:
+            raise DefinitionError(
+                f"`data` have {data.n_sections} sections and {len(data.inputs)} inputs, the study "
+                f"{self.first.n_sections} and 1."
+            )
+        block = block_of(data, self.goal, repeats)
+        for earlier in self._history.blocks[:1]:
+            require_same("blocks of one study", earlier, block, ("inputs", "outputs"))
+        blocks = (*self._history.blocks, block)
+        best = estimate(blocks, self.order, self.goal)
+        errors = _standard_errors(best.fit, self.goal)
+        if best.objection:
+            errors = np.full_like(errors, np.nan)
+        else:
+            noise = best.noise[-1]
+            refuse_transient(data, repeats, best.fit.multipliers, noise, self.standard_error)
+        errors_so_far = [*self.standard_errors, errors]
+        width = max(map(len, errors_so_far))
+        padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
+        strides = np.cumsum([block.strides for block in blocks]).astype(float)
+        plan = None if best.objection else self._next(best, errors, strides[-1], len(blocks))
+        history = History(blocks, strides, np.array(padded), best, plan)
+        return eqx.tree_at(lambda s: s._history, self, history, is_leaf=lambda x: x is None)
+
+    def _next(
+        self, best: Estimate, errors: Float[np.ndarray, " g"], strides: float, blocks: int
+    ) -> OptimalDesign:
+        """Return the design for the missing strides."""
+        noise = dict(zip(best.fit.outputs, best.noise[-1].tolist(), strict=True))
+
+        def planned(limit: Limit) -> OptimalDesign:
+            return optimal_design(
+                best.fit, self.first, goal=self.goal, limit=limit, noise=noise,
+                largest=self.largest, seed=self.seed + blocks,
+            )  # fmt: skip
+
+        plan, periods = planned(self.limit), self.first.periods
+        # Precisions of independent blocks add.
+        now = (errors**2).sum()
+        wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
+        missing = plan.strides * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
+        count = int(np.ceil(min(missing * (1 + _SPARE), _GROWTH * strides) / periods))
+        count = min(max(count, self.first.experiments), len(Candidates.of(self.first).f))
+        if count == self.first.experiments:
+            return plan
+        return planned(dataclasses.replace(as_limits(self.limit), strides=count * periods))
+
+    def __repr__(self) -> str:
+        if self.fit is None:
+            rows = [f"  next: {self.design!r}".replace("\n", "\n  ")]
+        else:
+            rows = ["  strides  standard errors"]
+            rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
+            rows.append(f"  multipliers {self.fit.show_multipliers()}")
+            rows += [f"  {x}" for x in self._outlook(self.fit).splitlines()]
+        return "\n".join([f"Study({self._state()})", *rows])
+
+    def _repr_html_(self) -> str:
+        if self.fit is None:
+            return card("Study", self._state())
+        return card(
+            "Study", self._state(), multiplier_table(self.fit.multipliers, self.fit.half_widths()),
+            table(("strides", "standard errors"), self._rows()), text(self._outlook(self.fit)),
+        )  # fmt: skip
+
+    def _state(self) -> str:
+        if self.fit is None:
+            return f"standard error {self.standard_error:.2g} requested; nothing measured yet"
+        state = "reached" if self.done else "not yet reached"
+        return f"standard error {self.standard_error:.2g} requested: {state}"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        rows = []
+        for n, errors in zip(self.strides, self.standard_errors, strict=True):
+            known = ", ".join(f"{x:.2e}" for x in errors)
+            lost = "too few data for so many multipliers"
+            rows.append((f"{n:.0f}", known if np.isfinite(errors).all() else lost))
+        return rows
+
+    def _outlook(self, fit: StructuredFit) -> str:
+        best, plan = self._history.estimate, self.plan
+        if plan is None or best is None:
+            return f"next: equal amplitudes again, since {best.objection if best else ''}"
+        usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
+        equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
+        comparison = f"equal amplitudes would take about {equal:.3g} strides"
+        if self.done:
+            return comparison
+        design = plan.design
+        return f"{comparison}\nnext: {design.experiments} experiments of {design.periods} periods"
+
+
+def _standard_errors(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
+    """Return standard errors of the multipliers of a goal, those of a conjugate pair once."""
+    z = np.asarray(fit.multipliers)
+    wanted = np.flatnonzero(np.imag(z) >= 0) if goal.which is None else np.array([goal.which])
+    covariance = fit.multiplier_covariances[wanted]
+    if goal.part == "position":
+        return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    direction = np.stack([np.real(z[wanted]), np.imag(z[wanted])], axis=1) / np.abs(z[wanted, None])
+    return np.sqrt(np.einsum("gi,gij,gj->g", direction, covariance, direction))
+
+
+def _student(fit: StructuredFit) -> float:
+    """Return the ratio of Student's to Gaussian intervals of the fit."""
+    from scipy import special  # (a fifth of a second)
+
+    if np.isinf(fit.covariance_freedom):
+        return 1.0
+    tail = (1 + _LEVEL) / 2
+    return float(special.stdtrit(fit.covariance_freedom, tail) / special.ndtri(tail))

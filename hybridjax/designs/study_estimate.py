@@ -1,0 +1,196 @@
+"""The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.multipliers import StructuredFit, fit_multipliers
+from ..identify.order import require_order
+from ..identify.spectral_sums import spectral_sums
+from ..identify.variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of
+from ..linear.htf import HTF
+from .goals import Multipliers
+from .numerators import coefficients
+
+
+# Estimates of the noise, at most, each from the residual of a fit weighted by the last one; and the
+# relative change that ends them. Fewer: weights that are off by the signal in the first estimate.
+# A smaller change: more fits for weights that are known to a few percent only.
+_SWEEPS = 10
+_SETTLED = 0.02
+# Steps of each of these fits. Fewer: the noise is overestimated, until the next fit continues.
+_MAX_STEPS = 50
+# Standard deviations by which a transient exceeds the noise before the data are rejected. Larger:
+# weak transients bias the multipliers. Smaller: noise is taken for a transient.
+_BEYOND_NOISE = 3.0
+
+
+class Block(NamedTuple):
+    """The data of one block of experiments that a study keeps: R responses to one cosine each, in
+    one experiment each."""
+
+    f: Float[np.ndarray, " R"]
+    H: Complex[np.ndarray, "M R ny"]
+    variance: Float[np.ndarray, " R"]
+    """Variance of each H for white noise of variance 1 on each sample."""
+    harmonics: tuple[int, ...]
+    n_sections: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    strides: int
+    """All cycles of the records, with those that are discarded."""
+
+
+def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
+    """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
+    each = []
+    for s in np.flatnonzero(data.ok):
+        single = ExperimentData(
+            data.u[s : s + 1], data.y[s : s + 1], n_sections=data.n_sections,
+            periods=data.periods, inputs=data.inputs, outputs=data.outputs,
+        )  # fmt: skip
+        each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
+    if not each:
+        raise DefinitionError(f"no experiment ran well: {data.summary()}.")
+    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])
+    H = np.concatenate([sums.along[:, 0] for sums in each]) / power[:, None, None]
+    return Block(
+        f=np.concatenate([sums.line for sums in each]) / data.periods,
+        H=np.moveaxis(H, 1, 0),
+        variance=data.n_sections * data.periods / repeats / power,
+        harmonics=each[0].harmonics,
+        n_sections=data.n_sections,
+        inputs=data.inputs,
+        outputs=data.outputs,
+        strides=data.u.shape[0] * data.u.shape[1] // data.n_sections,
+    )
+
+
+class Estimate(NamedTuple):
+    """The estimate from all blocks together."""
+
+    fit: StructuredFit
+    by_level: StructuredFit
+    """The same with the standard errors of white noise of these levels."""
+    noise: Float[np.ndarray, "B ny"]
+    """Standard deviation of each output's noise in each block."""
+    objection: str
+    """The reason to reject the order; empty if the data support it."""
+
+
+def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estimate:
+    """Fit all responses of all blocks as `fit_multipliers` does, each weighted by the power of its
+    cosine and by the noise of its block.
+
+    A line that was measured in several experiments counts several times: the least-squares problem
+    is that of the weighted mean. The noise level is one number for each block and output, from the
+    residuals of all of its lines and harmonics (less the part that numerators take of it). With
+    hundreds of degrees of freedom it does not depend on the errors of single lines, as variances of
+    their own would, and does not bias.
+
+    The standard errors are computed twice, and the larger ones are used: from the scatter of noise
+    and distortion at the lines that matter, valid for any spectrum of the noise, but uncertain
+    where these are few; and from the levels of the noise, as if it were white.
+    """
+    size = coefficients(order, blocks[0].n_sections, goal.overhang)
+    member = np.repeat(np.arange(len(blocks)), [len(block.f) for block in blocks])
+    H = np.concatenate([block.H for block in blocks], axis=1)
+    # To begin with, all of it may be noise.
+    square = [np.mean(np.abs(b.H) ** 2 / b.variance[:, None], axis=(0, 1)) for b in blocks]
+    noise, c = np.sqrt(square), None
+
+    def grouped() -> tuple[HTF, list[HTFGroup]]:
+        htf = _joined(blocks, noise, H)
+        require_frequencies(htf, order, size)
+        return htf, group_htf(htf, error_weights(htf, check_values(htf)), size)
+
+    for _ in range(_SWEEPS):
+        _, groups = grouped()
+        c, _ = maximum_likelihood(groups, order, _MAX_STEPS, c)
+        change = _relative_noise(groups, c, member, noise.shape)
+        noise = noise * change
+        if np.abs(np.log(change)).max() < _SETTLED:
+            break
+    htf, groups = grouped()
+    by_scatter = fit_multipliers(htf, order, overhang=goal.overhang, check=False)
+    by_level = fit_multipliers(htf, order, overhang=goal.overhang, check=False, errors="variance")
+    fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
+    return Estimate(fit, by_level, noise, _objection(groups, htf, fit))
+
+
+def _joined(
+    blocks: tuple[Block, ...], noise: Float[np.ndarray, "B ny"], H: Complex[np.ndarray, "M F ny"]
+) -> HTF:
+    """Return all lines of all blocks, one after the other, with their variances."""
+    first = blocks[0]
+    variance = [b.variance[:, None] * std**2 for b, std in zip(blocks, noise, strict=True)]
+    f, v = np.concatenate([b.f for b in blocks]), np.concatenate(variance)
+    return HTF(
+        f, H[..., None], first.harmonics, first.n_sections, first.inputs, first.outputs,
+        variance=np.broadcast_to(v[..., None], (*H.shape, 1)),
+    )  # fmt: skip
+
+
+def _relative_noise(
+    groups: list[HTFGroup],
+    c: Float[np.ndarray, " d"],
+    member: np.ndarray,
+    shape: tuple[int, ...],
+) -> Float[np.ndarray, "B ny"]:
+    """Return the rms residual of each block and output, in units of the supposed noise."""
+    square, freedom = np.zeros(shape), np.zeros(shape)
+    for group in groups:
+        misfit, block = misfit_of(group, c), member[group.line]
+        for k, output in enumerate(group.channel[:, 0]):
+            np.add.at(square[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0))
+            np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
+    return np.sqrt(square / freedom)
+
+
+def _objection(groups: list[HTFGroup], htf: HTF, fit: StructuredFit) -> str:
+    """Return the objection of `fit_multipliers` to an order that the data do not support."""
+    try:
+        require_order(groups, htf, len(fit.coefficients), fit.cost / fit.freedom)
+    except DefinitionError as error:
+        return str(error)
+    return ""
+
+
+def refuse_transient(
+    data: ExperimentData,
+    repeats: int,
+    multipliers: Complex[np.ndarray, " d"],
+    noise: Float[np.ndarray, " ny"],
+    allowed: float,
+) -> None:
+    """Check that the start of the records left no transient in the window.
+
+    The transient is the difference between the cycles before the window and those P later. (The
+    first cycle is left out, which also shows modes that decay within a cycle.)
+
+    **Arguments:** `noise`: standard deviation of each output's. `allowed`: the part of the response
+    that may be left of the transient when the window begins.
+
+    **Raises:** `DefinitionError` if more is left.
+    """
+    N, P, y = data.n_sections, data.periods, data.y[data.ok]
+    before = y.shape[1] // N - P * repeats
+    if not before:
+        return
+    k = min(1, before - 1)
+    early, late = (y[:, N * n : N * (n + 1)] for n in (k, k + P))
+    excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
+    threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / early[..., 0].size)
+    size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
+    left = np.where(excess > threshold, size, 0).max() * np.abs(multipliers).max() ** (before - k)
+    if left > allowed:
+        raise DefinitionError(
+            f"after {before} discarded cycles a part of {left:.1g} of the start's transient is "
+            f"left in the response, but {allowed:.1g} is allowed: use "
+            "`hj.identify.remove_transient(data).data`, or begin in the periodic response "
+            "(start='steady' in simulations)."
+        )
