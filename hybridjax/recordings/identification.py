@@ -13,12 +13,12 @@ from ..identify.series.fit import SeriesFit, fit_series
 from .advice import Advice, advise
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .estimate_phase import PhaseDefinition, estimate_phase, signals_of
 from .findings import Finding
 from .held_out import HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import inspect, inspect_cycles, refuse
 from .phase import Phase
+from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording
 from .sampling import DriftCycles, section_data, without_drift
 from .smoothing import Bandwidth

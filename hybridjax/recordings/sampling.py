@@ -14,8 +14,8 @@ from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..experiments.record import Record
 from .data import SectionData
-from .estimate_phase import PhaseDefinition, estimate_phase
 from .phase import LONGEST_GAP, Phase, Winding
+from .phase_estimation import PhaseDefinition, estimate_phase
 from .recording import Recording, Trial
 from .smoothing import (
     FEWEST,

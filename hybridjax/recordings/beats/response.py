@@ -19,9 +19,9 @@ from ..._core.signal import Signal, unit_of, with_unit
 from ..._core.text import p_value
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
-from ..estimate_phase import estimate_phase
 from ..findings import Finding, print_findings
 from ..phase import Phase
+from ..phase_estimation import estimate_phase
 from ..recording import Recording
 from .estimation import WAVES, CurveFit, accuracy_of, fit_curve, plain_curve
 from .model import Intervals, basis, intervals_of
