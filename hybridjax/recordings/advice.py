@@ -180,10 +180,10 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
 
 def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
     """Return the median over sections of the modulus of the correlation."""
-    known = np.isfinite(x) & np.isfinite(y)
-    both = np.where(known, [x, y], 0.0)
-    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(known.sum(axis=(0, 1)), 1)
-    x, y = np.where(known, both - mean, 0.0)
+    finite = np.isfinite(x) & np.isfinite(y)
+    both = np.where(finite, [x, y], 0.0)
+    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(finite.sum(axis=(0, 1)), 1)
+    x, y = np.where(finite, both - mean, 0.0)
     xy, xx, yy = ((a * b).sum(axis=(0, 1)) for a, b in ((x, y), (x, x), (y, y)))
     return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
 

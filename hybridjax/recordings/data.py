@@ -155,9 +155,7 @@ class SectionData(eqx.Module):
         )
 
 
-def input_spectrum(
-    data: SectionData,
-) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
+def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Return frequencies in cycles per period, and power spectral densities of the inputs (Welch
     1967) from windows of up to 16 cycles."""
     records, N = uninterrupted_records(data), data.n_sections

@@ -163,11 +163,11 @@ def natural_multipliers(
     # The first weights are those of all cycles, the others draws.
     drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
     weights = np.stack([np.ones(K), *drawn])
-    state, forward, square, seen, ahead = (_summed(weights, x) for x in moments[:5])
-    first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(seen, 2, 3)
-    by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(seen @ first)), length)
+    state, forward, square, cross, ahead = (_summed(weights, x) for x in moments[:5])
+    first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
+    by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length)
     plain = _multipliers(forward @ np.linalg.inv(state))
-    explained = seen[0] @ np.linalg.solve(square[0], np.swapaxes(seen[0], 1, 2))
+    explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
     shares = np.trace(explained, axis1=1, axis2=2) / np.trace(state[0], axis1=1, axis2=2)
     return NaturalMultipliers(
         multipliers=by_instruments[0],
@@ -190,7 +190,7 @@ class _Moments(NamedTuple):
     """Products of the next state with the state."""
     square: Float[np.ndarray, "N K r r"]
     """Products of the instruments with themselves."""
-    seen: Float[np.ndarray, "N K d r"]
+    cross: Float[np.ndarray, "N K d r"]
     """Products of the state with the instruments."""
     ahead: Float[np.ndarray, "N K d r"]
     """Products of the next state with the instruments."""
@@ -230,12 +230,12 @@ def _moments(data: SectionData, order: int) -> _Moments:
 
     state, after = values(0, _STATE), values(-N, _STATE)
     instruments = values(_STATE - 1 + _APART, _INSTRUMENTS)
-    known = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(axis=1)
+    finite = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(axis=1)
     r = min(_PER_STATE * order + _MORE, instruments.shape[1])
     shapes = ((order, order), (order, order), (r, r), (order, r), (order, r))
     parts = [np.zeros((N, K, *shape)) for shape in shapes]
     for n in range(N):
-        at = np.flatnonzero(known & (rows[:, 2] == n))
+        at = np.flatnonzero(finite & (rows[:, 2] == n))
         if len(at) <= r + 1:
             raise DefinitionError(f"section {n} was seen in {len(at)} cycles only: too few.")
         x, z = _principal(state[at], after[at], order)
@@ -271,7 +271,7 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Complex[np.ndarray, "B d
     for k in range(values.shape[2]):
         later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
         c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    c = c.real.mean(axis=1)[:, 1:]
+    c = np.real(c).mean(axis=1)[:, 1:]
     companion = np.zeros((len(c), c.shape[1], c.shape[1]))
     companion[:, 0] = -c
     companion[:, np.arange(1, c.shape[1]), np.arange(c.shape[1] - 1)] = 1.0

@@ -89,6 +89,7 @@ def section_data(
     **Raises:** `DefinitionError` for unknown names, constant signals, another number of sections
     than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
+    inputs, outputs = tuple(inputs), tuple(outputs)
     _refuse_constant(recording, inputs, outputs)
     if not outputs and timing is None:
         timing = "duration"
@@ -179,12 +180,12 @@ def _without_spikes(
         times.append(w.time)
         phases.append(w.phase - np.floor(w.phase[0]) + cycle)
         cycle = np.ceil(phases[-1][-1])
-    known, phase = np.concatenate(times), np.concatenate(phases)
+    time_of, phase = np.concatenate(times), np.concatenate(phases)
     for i, x in enumerate(signals.T):
         heights = (input_spikes if i < nu else spike_heights)(x)
         at = np.flatnonzero(heights)
-        if len(at) and len(known):
-            phase_there = np.interp(time[at], known, phase)
+        if len(at) and len(time_of):
+            phase_there = np.interp(time[at], time_of, phase)
             at = at[~recurring(heights[at], phase_there, np.ptp(phase))]
         x[at] = np.nan
         counts.append(len(at))
@@ -227,16 +228,16 @@ class _Sampler:
         observed = ~inside(unobserved, start, start)
         values = np.zeros((len(start), len(self.signals)))
         for i, x in enumerate(self.signals):
-            known = np.isfinite(x)
-            holes = gaps(self.time, known, bridgeable(self.time, known, section))
+            finite = np.isfinite(x)
+            holes = gaps(self.time, finite, bridgeable(self.time, finite, section))
             if i >= self.nu:
                 values[:, i] = self.curves[i - self.nu](start)
                 values[inside(holes, start, start) | ~observed, i] = np.nan
                 continue
             if self.sampled == "middle":
-                time = self.time[known]
+                time = self.time[finite]
                 nearest = np.searchsorted((time[:-1] + time[1:]) / 2, (start + end) / 2)
-                values[:, i] = x[known][nearest]
+                values[:, i] = x[finite][nearest]
             else:
                 values[:, i] = means(self.time, x, t)
             values[inside(holes, start, end), i] = np.nan
@@ -323,7 +324,7 @@ def cycle_means(
     holes = gaps(trial.time, np.isfinite(x), LONGEST_GAP * period)
     middles, levels = [np.zeros(0)], [np.zeros(0)]
     for edges in (w.edges() for w in stretches):
-        known = ~inside(holes, edges[:-1], edges[1:])
-        middles.append(((edges[:-1] + edges[1:]) / 2)[known])
-        levels.append(means(trial.time, x, edges)[known])
+        whole = ~inside(holes, edges[:-1], edges[1:])
+        middles.append(((edges[:-1] + edges[1:]) / 2)[whole])
+        levels.append(means(trial.time, x, edges)[whole])
     return np.concatenate(middles), np.concatenate(levels)

@@ -73,10 +73,10 @@ def spline(
     $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
     this is one half at b.
     """
-    known = np.isfinite(values)
-    if known.sum() < FEWEST:
-        raise DefinitionError(f"{int(known.sum())} samples are too few for a spline.")
-    time, values = time[known], values[known]
+    finite = np.isfinite(values)
+    if finite.sum() < FEWEST:
+        raise DefinitionError(f"{int(finite.sum())} samples are too few for a spline.")
+    time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step
     weight = (2 * np.pi * bandwidth * step) ** -4.0
@@ -95,18 +95,18 @@ def spline(
 
 
 def bridgeable(
-    time: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"], longest: int | float = 0.0
+    time: Float[np.ndarray, " n"], finite: Bool[np.ndarray, " n"], longest: int | float = 0.0
 ) -> float:
     """Return the longest gap that a spline bridges: `longest`, but not less than three samples."""
-    return max(longest, 3.001 * float(np.median(np.diff(time[known]))))
+    return max(longest, 3.001 * float(np.median(np.diff(time[finite]))))
 
 
 def gaps(
-    time: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"], longest: int | float
+    time: Float[np.ndarray, " n"], finite: Bool[np.ndarray, " n"], longest: int | float
 ) -> Float[np.ndarray, "g 2"]:
     """Return the intervals without samples that are longer than `longest`, from the one before all
     samples, which starts at -inf, to the one after them."""
-    edges = np.concatenate([[-np.inf], time[known], [np.inf]])
+    edges = np.concatenate([[-np.inf], time[finite], [np.inf]])
     wide = np.flatnonzero(np.diff(edges) > longest)
     return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
@@ -126,8 +126,8 @@ def means(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m1"]
 ) -> Float[np.ndarray, " m"]:
     """Return means of a signal between successive edges; it is linear between its samples."""
-    known = np.isfinite(values)
-    time, values = time[known], values[known]
+    finite = np.isfinite(values)
+    time, values = time[finite], values[finite]
     area = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
     at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
     since = edges - time[at]
@@ -154,8 +154,8 @@ def spike_heights(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     **Arguments:** `values`: the signal; NaN where a sample is missing.
     """
     heights = np.zeros(len(values))
-    known = np.isfinite(values)
-    x = values[known]
+    finite = np.isfinite(values)
+    x = values[finite]
     if len(x) <= _NEIGHBORHOOD:
         return heights
     top = x - ndimage.grey_opening(x, _LONGEST + 1)
@@ -172,7 +172,7 @@ def spike_heights(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     large = large[np.abs(out[large]) > _RANGES * closest_half]
     near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(large, large - _NEAR)
     large = large[near <= _CROWD]
-    heights[np.flatnonzero(known)[large]] = out[large]
+    heights[np.flatnonzero(finite)[large]] = out[large]
     return heights
 
 

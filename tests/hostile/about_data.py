@@ -8,7 +8,6 @@ from .things import NAMES as STATES, PHASE
 from .values import (
     CALLABLE,
     COUNT,
-    FINITE,
     FLAG,
     HARMONICS,
     HUGE,
@@ -32,7 +31,6 @@ from .values import (
     WHOLE,
     WORD,
     Other,
-    Right,
     array,
     instance,
     optional,
@@ -350,12 +348,11 @@ def recordings(t):
     for name in ("column", "unit"):
         yield f"Recording.{name}", getattr(t.recording, name), dict(name="x"), {"name": NAME}
     definition = [None, "x", 3, hj.AtEvent("nope"), hj.Crossing("nope", "rising"),
-                  hj.ClockPhase(4), Other(), t.design, lambda time, signals: "x"]  # fmt: skip
+                  hj.ClockPhase(4), Other(), t.design]  # fmt: skip
     yield "estimate_phase", hj.recordings.estimate_phase, dict(
         recording=t.recording, definition=angle
     ), {
         "recording": instance(t.record), "definition": definition, "bandwidth": LIMIT,
-        "causal": FLAG,
     }  # fmt: skip
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
     taken = {
@@ -423,17 +420,6 @@ def recordings(t):
             "signals": NEW_NAMES,
         },
     )
-    pair = ["ab", None, 1.0, (1.0,), (NAN, 1.0), (1j, 0.0), (None, 1.0), ("1", "2")]
-    tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
-    yield "PhaseTracker", hj.recordings.PhaseTracker, tracker, {
-        "center": pair, "scale": [*pair, (0.0, 1.0), (-1.0, 1.0)], "rate": [*FINITE, 0.0],
-        "anchor": FINITE, "bandwidth": optional(POSITIVE),
-    }  # fmt: skip
-    update = hj.recordings.PhaseTracker(**tracker).update
-    sample = [Right(NAN), *(x for x in FINITE if x is not NAN)]
-    yield "PhaseTracker.update", update, dict(time=0.0, position=1.0, velocity=0.0), {
-        "time": FINITE, "position": sample, "velocity": sample,
-    }  # fmt: skip
 
 
 def testing(t):

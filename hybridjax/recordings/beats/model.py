@@ -84,7 +84,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     """Return the intervals between events, with the input of that name, linear between samples.
 
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
-    missing or constant, and too few intervals during which it is known.
+    missing or constant, and too few intervals during which it is finite.
     """
     pairs = phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
@@ -94,17 +94,17 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     column, trials, outside = recording.column(name), [], 0
     for trial, parts in pairs:
         x = trial.values[:, column]
-        known = np.isfinite(x)
-        if known.sum() < 2:
+        finite = np.isfinite(x)
+        if finite.sum() < 2:
             raise DefinitionError(f"trial '{trial.name}' has no samples of the input {name}.")
         start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
         duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
-        holes = gaps(trial.time, known, bridgeable(trial.time, known))
+        holes = gaps(trial.time, finite, bridgeable(trial.time, finite))
         # An interval may begin or end just where the input does.
         used = ~inside(holes, start + 1e-9 * duration, start + (1 - 1e-9) * duration)
         outside += int((~used).sum())
         if used.sum() >= _FEWEST:
-            trials.append((trial.name, trial.time[known], x[known], start[used], duration[used]))
+            trials.append((trial.name, trial.time[finite], x[finite], start[used], duration[used]))
     if not trials:
         lost = f"; {outside} lie where {name} was not recorded" if outside else ""
         raise DefinitionError(

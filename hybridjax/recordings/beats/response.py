@@ -145,10 +145,7 @@ def curve_unit(name: str) -> str:
 @checked
 @working("phase_response")
 def phase_response(
-    recording: Recording,
-    phase: Phase | AtEvent | Crossing,
-    *,
-    input: str,
+    recording: Recording, phase: Phase | AtEvent | Crossing, *, input: str
 ) -> PhaseResponse:
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.
 

@@ -192,7 +192,7 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
     """
     columns, trials = [recording.column(name) for name in names], recording.trials
     size = _SAME * np.nanstd(np.concatenate([t.values[:, columns] for t in trials]), axis=0)
-    known, findings = [np.zeros(len(t.time), bool) for t in trials], []
+    repeated, findings = [np.zeros(len(t.time), bool) for t in trials], []
     for (_, a), (j, b) in combinations(enumerate(trials), 2):
         x, y = a.values[:, columns], b.values[:, columns]
         shift = _shift(x, y, size)
@@ -202,16 +202,16 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
         same = np.zeros(len(y), bool)
         off = np.abs(x[first:last] - y[first - shift : last - shift])
         same[first - shift : last - shift] = (~(off > size)).all(axis=1)
-        if not (same & ~known[j]).any():
+        if not (same & ~repeated[j]).any():
             continue
         cause, start = "overlap", f"{same.sum()} samples ({places([b], [same])}) are"
         end = f"in trial '{a.name}' too, and count once; cut one of the two."
         if same.mean() > _EQUAL:
             cause, start = "a trial twice", f"all samples of trial '{b.name}' are"
             end, same[:] = f"in trial '{a.name}' already, and count once.", True
-        known[j] |= same
+        repeated[j] |= same
         findings.append(Finding(cause, f"{start} {end}", "left out"))
-    return known, findings
+    return repeated, findings
 
 
 def _shift(
