@@ -167,7 +167,7 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    records = PreparedRecords(data)
+    records = PreparedRecords.of(data)
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     usual = problem if loss == "squares" else without_outliers(problem)
