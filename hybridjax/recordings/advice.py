@@ -18,7 +18,7 @@ from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validation.validate import Validation
 from .beats.response import PhaseResponse
-from .data import SectionData, input_band, input_spectrum
+from .data import WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings
 
 
@@ -35,9 +35,6 @@ _MANY_MISSING = 0.2
 # Correlation of two outputs at a section that makes them redundant. Larger: nearly equal ones
 # pass. Smaller: outputs that share most of a response are reported.
 _SAME_OUTPUTS = 0.98
-# Fraction of the Nyquist frequency up to which an input must have power. Larger: the edge of every
-# band is reported. Smaller: transfer functions without power behind them pass.
-_WHOLE_BAND = 0.9
 # Numbers of strides for which standard errors are predicted.
 _STRIDES = (100, 300, 1000, 3000)
 
@@ -168,7 +165,7 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
                 f"{name} has power only up to {edge:.2g} cycles per period, so that responses at "
                 "different phases can hardly be told apart.",
             )
-        elif edge < _WHOLE_BAND * fit.n_sections / 2:
+        elif edge < WHOLE_BAND * fit.n_sections / 2:
             yield Finding(
                 "band",
                 f"transfer functions are determined up to f = {edge:.3g} cycles per period only, "

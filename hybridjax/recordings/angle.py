@@ -11,7 +11,7 @@ from ..orbits.crossing import Crossing
 from ..sections.families import KinematicPhase
 from .phase import LONGEST_GAP, Phase, Winding
 from .recording import Recording
-from .smoothing import FEWEST, bridgeable, gaps, inside, spline, without_spikes
+from .smoothing import FEWEST, Series, bridgeable, gaps, inside, spline, without_spikes
 
 
 # Default bandwidth of the two signals of an angle, in harmonics of the cycle. Larger: the phase is
@@ -25,8 +25,8 @@ _UNITY = 0.5
 class Angle(NamedTuple):
     """An angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
 
-    time: Float[np.ndarray, " n"]
-    angle: Float[np.ndarray, " n"]
+    time: Series
+    angle: Series
 
 
 def from_angles(angles: Sequence[Angle], n_sections: int) -> Phase:
@@ -91,9 +91,7 @@ def kinematic_angles(
     return angles
 
 
-def _at_common_times(
-    time: Float[np.ndarray, " n"], signals: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 2"]:
+def _at_common_times(time: Series, signals: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Interpolate two signals with clocks of their own, each at the times of the other, not in
     gaps."""
     finite = np.isfinite(signals)
@@ -160,7 +158,7 @@ def _turns_per_time(angles: Sequence[Angle]) -> float:
     return turns / duration
 
 
-def _monotone(time: Float[np.ndarray, " n"], phase: Float[np.ndarray, " n"]) -> Winding | None:
+def _monotone(time: Series, phase: Series) -> Winding | None:
     finite = np.isfinite(time)
     unseen = gaps(time, finite, bridgeable(time, finite))[1:-1]
     low = np.maximum.accumulate(phase)

@@ -17,10 +17,7 @@ PhaseDefinition = KinematicPhase | Crossing | AtEvent
 
 @checked
 def estimate_phase(
-    recording: Recording,
-    definition: PhaseDefinition,
-    *,
-    bandwidth: Bandwidth | None = None,
+    recording: Recording, definition: PhaseDefinition, *, bandwidth: Bandwidth | None = None
 ) -> Phase:
     """Estimate the phase of every trial.
 

@@ -20,6 +20,7 @@ from .recording import Recording, Trial
 from .smoothing import (
     FEWEST,
     Bandwidth,
+    Series,
     bridgeable,
     gaps,
     input_spikes,
@@ -168,10 +169,7 @@ def _refuse_constant(
 
 
 def _without_spikes(
-    time: Float[np.ndarray, " n"],
-    signals: Float[np.ndarray, "n nuy"],
-    nu: int,
-    stretches: Sequence[Winding],
+    time: Series, signals: Float[np.ndarray, "n nuy"], nu: int, stretches: Sequence[Winding]
 ) -> tuple[Float[np.ndarray, "n nuy"], Int[np.ndarray, " nuy"]]:
     """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
     signals, counts = signals.copy(), []
@@ -196,7 +194,7 @@ class _Sections(NamedTuple):
     """Samples of one stretch at sections k[0], k[0] + 1, ...; whether the phase was observed."""
 
     k: Int[np.ndarray, " n"]
-    t: Float[np.ndarray, " n"]
+    t: Series
     observed: Bool[np.ndarray, " n"]
     values: Float[np.ndarray, "n nuy"]
 
@@ -206,7 +204,7 @@ class _Sampler:
 
     def __init__(
         self,
-        time: Float[np.ndarray, " n"],
+        time: Series,
         signals: Float[np.ndarray, "n nuy"],
         nu: int,
         bandwidth: float,
@@ -318,7 +316,7 @@ def without_drift(
 
 
 def cycle_means(
-    trial: Trial, x: Float[np.ndarray, " n"], stretches: Sequence[Winding], period: float
+    trial: Trial, x: Series, stretches: Sequence[Winding], period: float
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the middle of each cycle without a long gap, and the mean of a signal over it."""
     holes = gaps(trial.time, np.isfinite(x), LONGEST_GAP * period)

@@ -239,6 +239,7 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 def test_the_command_says_what_has_not_converged(files, tmp_path, monkeypatch, capsys):
     short = functools.partial(hj.fit_series, max_steps=1)
     monkeypatch.setattr("hybridjax.recordings.identification.fit_series", short)
@@ -261,7 +262,6 @@ def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsy
     [
         (["--outputs", "x,q"], "no signal 'q'"),
         (["--time", "t"], "no column 't'"),
-        (["--sections", "200"], "are too few"),
     ],
 )
 def test_the_command_writes_nothing_half(files, tmp_path, more, message):

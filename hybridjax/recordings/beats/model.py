@@ -44,6 +44,11 @@ _POINTS = 1024
 _FEWEST = 3
 
 
+Lanes = Float[np.ndarray, " l"]
+Table = Float[np.ndarray, "M p"]
+"""A basis of curves at equal steps of the phase from 0 on."""
+
+
 class Intervals(NamedTuple):
     """All intervals of a recording between events that nothing interrupts, trial by trial."""
 
@@ -140,7 +145,7 @@ def basis(
     return np.cos(angle * phase[:, None]) * np.exp(-spread * phase[:, None])
 
 
-def tabulated(waves: int, jitter: float) -> Float[np.ndarray, "M p"]:
+def tabulated(waves: int, jitter: float) -> Table:
     """Return the basis at equal steps of the phase from 0 on."""
     return basis(np.arange(3 * _POINTS // 2 + 1) / _POINTS, waves, jitter)
 
@@ -163,7 +168,7 @@ class Forecast(NamedTuple):
 
 def forecast(
     intervals: Intervals,
-    table: Float[np.ndarray, "M p"],
+    table: Table,
     coefficients: Float[np.ndarray, " p"],
     rates: Float[np.ndarray, " trials"],
 ) -> Forecast:
@@ -186,7 +191,7 @@ def _integrate(
     h: Float[np.ndarray, " L"],
     w: Float[np.ndarray, " L"],
     curve: Float[np.ndarray, " M"],
-    table: Float[np.ndarray, "M p"],
+    table: Table,
 ) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
     L, p = len(h), table.shape[1]
@@ -245,13 +250,7 @@ def _integrate(
     return result
 
 
-def _end(
-    a: Float[np.ndarray, " l"],
-    b: Float[np.ndarray, " l"],
-    m0: Float[np.ndarray, " l"],
-    m1: Float[np.ndarray, " l"],
-    own: Float[np.ndarray, " l"],
-) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
+def _end(a: Lanes, b: Lanes, m0: Lanes, m1: Lanes, own: Lanes) -> tuple[Lanes, Lanes]:
     """Return the part of a step at whose end the phase is 1, and the rate there per step.
 
     It is the root of the cubic with the values a, b and slopes m0, m1 at both ends of the step.

@@ -31,8 +31,8 @@ _ODD, _NONE = 0.8, 0.4
 # Unexplained power where a part's input is displaced as is best for it, relative to the
 # displacement that is best for all. Larger: displaced by chance. Smaller: real shifts pass.
 _BETTER = 0.5
-# Unexplained power of a part relative to the median that makes a disturbance, and of what the
-# input explains. Larger: stumbles pass. Smaller: noisy parts are reported.
+# Unexplained power of a part relative to the median that makes a disturbance, and relative to what
+# the input explains. Larger: stumbles pass. Smaller: noisy parts are reported.
 _DISTURBED, _MUCH = 9.0, 0.25
 # Fraction of an input's variance that repeats with the cycle, from which on it is feedback, and
 # the cycles that show it. Larger: triggers pass. Smaller: it repeats by chance.

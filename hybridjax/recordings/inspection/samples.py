@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..findings import Finding, places
 from ..recording import Recording, Trial
+from ..smoothing import Series
 
 
 # Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
@@ -64,7 +65,7 @@ def placeholders(s: Signal) -> tuple[Rows, list[Finding]]:
     )
 
 
-def _placeholders(x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _placeholders(x: Series) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
     for extreme in (np.min, np.max) * 2:  # two of either sign
         left = x[np.isfinite(x) & ~bad]
@@ -98,7 +99,7 @@ def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
     )
 
 
-def _frozen(x: Float[np.ndarray, " n"], period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
+def _frozen(x: Series, period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
     first, length = _runs(x)
     plateaus = length[length >= _PLATEAU]
@@ -113,7 +114,7 @@ def _frozen(x: Float[np.ndarray, " n"], period: float, is_input: bool) -> Bool[n
     return bad
 
 
-def _runs(x: Float[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
     """Return first samples and lengths of the runs of equal values; each NaN is its own run."""
     first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
     return first, np.diff(np.append(first, len(x)))
@@ -134,7 +135,7 @@ def clipped(s: Signal) -> Iterator[Finding]:
         )
 
 
-def _clipped(x: Float[np.ndarray, " n"]) -> tuple[int, list[float]]:
+def _clipped(x: Series) -> tuple[int, list[float]]:
     """Return the number of clipped samples, and their values."""
     first, length = _runs(x)
     flat = length >= _PLATEAU

@@ -12,9 +12,9 @@ from ..recording import Recording, Trial
 from ..sampling import cycle_means
 
 
-# Factor within which ranges of two signals are alike, and within which a ratio is a power of ten.
-# Larger: swapped columns pass; other settings are taken for units. Smaller: the reverse.
-_ALIKE, _NEAR_UNIT = 1.5, 1.2
+# Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
+# gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
+_ALIKE = 1.2
 # Least offset of another zero: in ranges, and in those of the other trials. Larger: offsets pass.
 # Smaller: scatter between trials is reported.
 _OFFSET, _OFF = 0.1, 10.0
@@ -69,7 +69,7 @@ def other_settings(
             unit = 10.0**power
             # Pushes may be chosen to be ten times as strong.
             units = (1, 2, 3, 6) if name in outputs else (3, 6)
-            if abs(power) in units and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
+            if abs(power) in units and max(ratio / unit, unit / ratio) < _ALIKE:
                 text = (
                     f"{name} varies {ratio:.3g} times as much in trial '{trial.name}' as in the "
                     f"peers: if its unit is another one, divide it by {unit:g}."
@@ -100,7 +100,7 @@ def clocks(recording: Recording) -> Iterator[Finding]:
         peers = steps[:s] + steps[s + 1 :]
         ratio = steps[s] / float(np.median(peers)) if peers else 1.0
         unit = 1000.0 ** np.round(np.log10(ratio) / 3)
-        if unit != 1 and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
+        if unit != 1 and max(ratio / unit, unit / ratio) < _ALIKE:
             text = (
                 f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart as those of "
                 "the others: if its times have another unit (milliseconds), convert them."
