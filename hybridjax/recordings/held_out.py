@@ -10,7 +10,7 @@ from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Denominator
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import SeriesFit, assemble, fit_series
+from ..identify.series.fit import SeriesFit, assemble, fit_records
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import PreparedRecords
@@ -72,7 +72,7 @@ class Split(NamedTuple):
 
     def fit(self, order: int) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
-        fit = fit_series(self.early, order, check=False)
+        fit = fit_records(self.early, order, check=False)
         return HeldOut(fit, validate(fit, self.late))
 
 

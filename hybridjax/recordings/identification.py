@@ -9,7 +9,7 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import SeriesFit, fit_series
+from ..identify.series.fit import SeriesFit, fit_records
 from ..identify.series.records import PreparedRecords
 from .advice import Advice, collect_advice
 from .beats.response import PhaseResponse, phase_response
@@ -112,7 +112,7 @@ def identify_recording(
     say("fit to the first three quarters")
     held = parts.fit(order)
     say("fit to all")
-    fit = fit_series(records, order, check=False)
+    fit = fit_records(records, order, check=False)
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:

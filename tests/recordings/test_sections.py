@@ -11,6 +11,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
+from hybridjax.identify.series.fit import fit_records
 
 from .conftest import MULTIPLIER
 from .mishaps import mishandle, misjudged
@@ -241,8 +242,8 @@ def test_the_command(files, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_says_what_has_not_converged(files, tmp_path, monkeypatch, capsys):
-    short = functools.partial(hj.fit_series, max_steps=1)
-    monkeypatch.setattr("hybridjax.recordings.identification.fit_series", short)
+    short = functools.partial(fit_records, max_steps=1)
+    monkeypatch.setattr("hybridjax.recordings.identification.fit_records", short)
     assert identify(files, tmp_path / "out", "--order", "2") == 1
     assert "a fit did not converge" in capsys.readouterr().err
     page = (tmp_path / "out" / "report.html").read_text()

@@ -120,16 +120,6 @@ class PreparedRecords:
                 raise DefinitionError(f"the output {name} is zero or missing at every sample.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
-    @classmethod
-    def of(cls, data: RecordedData) -> "PreparedRecords":
-        """Return prepared records as they are, and prepare other data."""
-        return data if isinstance(data, cls) else cls(data)
-
-    @property
-    def records(self) -> list[Record]:
-        """The uninterrupted records, so that prepared records may be fitted again."""
-        return uninterrupted_records(self._data)
-
     def __iter__(self) -> Iterator[CycleGrid]:
         return _grids(self._data) if self._grids is None else iter(self._grids)
 
