@@ -5,8 +5,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from targets import TARGETS, verdict
-
 
 JOBS = ("hopper.isochron", "hopper.kinematic", "bar.isochron", "bar.kinematic")
 NONE = "-"
@@ -38,16 +36,6 @@ def machines(values: dict, baseline: dict) -> str:
     for line, name in lines:
         found.setdefault(line, []).append(name)
     return "\n".join(f"- {', '.join(names)}: {line}." for line, names in found.items()) or NONE
-
-
-def targets(values: dict, baseline: dict) -> str:
-    rows = []
-    for x in TARGETS:
-        value = values.get(x.key)
-        got, error = number(value, x.unit), number(values.get(x.error)) if x.error else ""
-        reached = verdict(x, value) if isinstance(value, int | float) else NONE
-        rows.append((x.what, got, error, number(x.least), number(x.aim), reached))
-    return markdown(("what", "measured", "error", "at least", "aim", "reached"), rows)
 
 
 def experiments(values: dict, baseline: dict) -> str:
@@ -152,7 +140,7 @@ def precision(values: dict, baseline: dict) -> str:
 
 
 TABLES: dict[str, Callable[[dict, dict], str]] = {
-    "machines": machines, "targets": targets, "experiments": experiments, "loops": loops,
+    "machines": machines, "experiments": experiments, "loops": loops,
     "honesty": honesty, "precision": precision, "sizes": sizes, "derivatives": derivatives,
 }  # fmt: skip
 

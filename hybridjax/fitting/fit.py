@@ -12,11 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Path, Seed
-from .._core.pieces.blocks import Blocks
 from .._core.pieces.description import array_digest, digest_of, versions
-from .._core.pieces.layout import Constant, Layout, Variable
-from .._core.pieces.place import filled
-from .._core.pieces.run import DaskClient
+from .._core.pieces.run import DaskClient, fill
+from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import counted, working
 from .._core.results import Result
 from ..engine.describe import describe
@@ -251,12 +249,42 @@ class Guesses:
         return Tried(*(np.concatenate([x[name] for x in results]) for name in Tried._fields))
 
     def all(self, store: Any, client: Any) -> Tried:
-        """Return the results of all guesses, from workers or a store; see `fit_model`."""
+        """Return the results of all guesses, by workers or in a store; see `fit_model`."""
+        data = fill(self, store, client).dataset()
+        return Tried(*(data[name].values for name in Tried._fields))
+
+    def begin(self, client: DaskClient | None) -> tuple["Guesses", Layout]:
+        """Return the job, and the form of its results."""
         S, p = self.x.shape
-        computed, static = eqx.partition((self.problem, self.near), eqx.is_array)
-        arrays, tree = jax.tree_util.tree_flatten(computed)
+        variables = {
+            "fitted": Variable("<f8", ("parameter",), (p,)),
+            "cost": Variable("<f8"),
+            **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
+        }
+        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names))}
+        blocks, about = Blocks((S,), (1,)), self.description
+        return self, Layout(("guess",), blocks, variables, constants, ("parameter",), about)
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return the arrays that were computed before the first guess."""
+        return [np.asarray(x) for x in jax.tree_util.tree_leaves(self._computed()[0])]
+
+    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "Guesses":
+        """Return the job with these arrays of another call."""
+        computed, static = self._computed()
+        tree = jax.tree_util.tree_structure(computed)
+        restored = jax.tree_util.tree_unflatten(tree, [jnp.asarray(x) for x in arrays])
+        problem, near = eqx.combine(restored, static)
+        return dataclasses.replace(self, problem=problem, near=near)
+
+    def _computed(self) -> Any:
+        return eqx.partition((self.problem, self.near), eqx.is_array)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """JSON from which these fits can be told from others."""
         parameters = self.problem.parameters
-        description = {
+        return {
             "kind": "guesses",
             "versions": versions(),
             "model": describe(self.system),
@@ -267,25 +295,6 @@ class Guesses:
             "guesses": array_digest(self.x),
             "max_steps": MAX_STEPS,
         }
-
-        def begin() -> tuple["Guesses", Layout, list[np.ndarray]]:
-            variables = {
-                "fitted": Variable("<f8", ("parameter",), (p,)),
-                "cost": Variable("<f8"),
-                **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
-            }
-            constants = {"parameter": Constant(("parameter",), np.array(parameters.names))}
-            blocks = Blocks((S,), (1,))
-            layout = Layout(("guess",), blocks, variables, constants, ("parameter",), description)
-            return self, layout, [np.asarray(x) for x in arrays]
-
-        def again(layout: Layout, start: list[np.ndarray]) -> "Guesses":
-            restored = jax.tree_util.tree_unflatten(tree, [jnp.asarray(x) for x in start])
-            problem, near = eqx.combine(restored, static)
-            return dataclasses.replace(self, problem=problem, near=near)
-
-        results = filled(begin, again, description, store, client, (0, 1)).dataset()
-        return Tried(*(results[name].values for name in Tried._fields))
 
 
 def _digest(data: AbstractObservation) -> str:

@@ -3,7 +3,7 @@
 A function that a user has written with `jnp` is traced, and in its program (a jaxpr) the equations
 for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `trigonometry`, and
 the factorizations behind `jnp.linalg` by those of `factorizations`;
-docs/vector-math.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
+docs/how-to/speed-up.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
 Where a later JAX has another name for what is looked for here, nothing is replaced, and all is as
 slow as it would be without.
 """
@@ -57,7 +57,7 @@ def enable_vector_math(enabled: bool = True) -> None:
 
     On CPU, `jnp.sin` and its relatives take 8 to 22 ns for every number in double precision; what
     replaces them takes 2 to 3 ns and is accurate to 1.5 to 3.3 units in the last place (see
-    docs/vector-math.md). Factorizations are LAPACK's: 150 ns for 3 equations in place of 10.
+    docs/how-to/speed-up.md). Factorizations are LAPACK's: 150 ns for 3 equations in place of 10.
     Switched off, users' functions are computed as they are written.
 
     What JAX compiled under the other setting is dropped, all of this process's programs.
