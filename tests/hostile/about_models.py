@@ -42,9 +42,10 @@ from .values import (
 
 SECTIONS = [None, "ClockPhase", 8, [], [3], NAN, Other(), hj.Execution(), TRACED]
 PAIR = ["ab", 1.0, (1.0,), (1.0, 2.0, 3.0), (NAN, 1.0), (1j, 0.0), (None, 1.0), TRACED]
-SHARES = [None, 1, (0,), (2, 2), (-1, 2), (0, 0), (0.5, 2), ("0", "2")]
 SIZES = ["x", 3, ["x"], {"x": -1.0}, {"x": NAN}, {"x": "1"}, {"x": 1j}, {"nope": 1.0}]
-CLIENTS = ["tcp://here", 3, Other()]
+CLIENTS = [
+    "tcp://here", 3, Other(), 1, (0,), (2, 2), (-1, 2), (0, 0), (0.5, 2), ("0", "2"),
+]  # fmt: skip
 RANGES = [None, 3, {}, {"x": 3}, {"x": (1.0,)}, {"x": (1.0, 0.0)}, {"x": (0.0, NAN)}, Other()]
 VALUES = [None, 3, {}, {"x": []}, {"x": [NAN]}, {"x": ["1"]}, {"x": [1.0], "y": [1.0, 2.0]}]
 BAND = [2.0, (1.0,), ("0", "1"), (NAN, 1.0), (0.0, INF), (-1.0, 1.0), (1.0, 0.5), (0.0, 1j)]
@@ -64,8 +65,7 @@ def calls(t):
 
 def scale(t):
     """In pieces."""
-    pieces = {"chunk": COUNT[1:], "store": PATH[1:], "share": SHARES, "client": CLIENTS}
-    measures = [3, {"x": 3}, {3: abs}, {"result": abs}, Other()]
+    pieces = {"chunk": COUNT[1:], "store": PATH[1:], "client": CLIENTS}
     yield (
         "sweep",
         hj.sweep,
@@ -74,7 +74,6 @@ def scale(t):
             "model": [None, "Hopper", 3, Other()],
             "over": [*VALUES, {"nope": [1.0]}],
             "want": WORD,
-            "measures": measures,
             "guess": [3, "cycle", Other()],
             "force": FLAG,
             **pieces,
@@ -89,7 +88,7 @@ def scale(t):
     yield "Points", hj.scale.Points, dict(values={"x": [1.0]}), {"values": VALUES}
     good = dict(ranges={"x": (0.0, 1.0)}, count=4)
     wrong = {"ranges": RANGES, "count": LIMITED, "seed": SEED}
-    yield "sobol_points", hj.scale.sobol_points, good, wrong
+    yield "Points.sobol", hj.scale.Points.sobol, good, wrong
 
 
 def systems(t):
@@ -328,14 +327,10 @@ def experiments(t):
         "start": WORD, "discard": optional(WHOLE), "process_noise": [0.1, "x", PHASE],
         "accuracy": optional(POSITIVE), "record_events": FLAG, "execution": EXECUTION,
     }  # fmt: skip
-    stored = {"chunk": LIMITED, "store": PATH[1:], "share": SHARES, "client": CLIENTS}
-    yield "run_experiments", hj.run_experiments, to_run, drive | options | stored
-    yield (
-        "stream_experiments",
-        hj.experiments.stream_experiments,
-        to_run,
-        (drive | options | {"chunk": LIMITED}),
-    )
+    yield "run_experiments", hj.run_experiments, to_run, drive | options
+    yield "Options", hj.experiments.Options, {}, options
+    stored = {"options": instance(PHASE), "chunk": LIMITED, "store": PATH[1:], "client": CLIENTS}
+    yield "stream_experiments", hj.experiments.stream_experiments, to_run, drive | stored
     yield "StoredExperiments", hj.experiments.StoredExperiments, dict(store="nope"), {
         "store": [*PATH, "nope"],
     }  # fmt: skip
@@ -349,8 +344,8 @@ def experiments(t):
     yield "ResponseFunction", t.response, dict(u=u), {
         "u": array(u), "start": ["x", np.zeros(9), Other()], "system": ["x", 3, PHASE],
     }  # fmt: skip
-    yield "steady_start", hj.experiments.steady_start, dict(response=t.response, u=u), {
-        "response": instance(PHASE)[:-1], "u": array(u),
+    yield "steady_start", t.response.steady_start, dict(u=u), {
+        "u": array(u),
         "system": ["x", 3, PHASE], "accuracy": POSITIVE,
     }  # fmt: skip
     yield "simulate_experiments", hj.experiments.simulate_experiments, dict(
@@ -368,7 +363,6 @@ def experiments(t):
         "seed": SEED, "memory": NONNEGATIVE,
         "snr": ["x", 1j, NAN, Other(), 10.0],
     }  # fmt: skip
-    yield "odd_part", hj.experiments.odd_part, dict(data=t.data), {"data": instance(t.design)}
     y = np.ones(t.data.y.shape)
     yield "ExperimentData", hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16), {
         "u": array(t.data.u), "y": array(y, missing=True), "n_sections": LIMITED,
