@@ -178,7 +178,7 @@ def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
     yield "fit_model", hj.fit_model, both, shared | {
-        "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT,
+        "guesses": COUNT, "seed": SEED,
         "store": PATH[1:], "client": ["tcp://here", 3, Other()],
     }  # fmt: skip
     yield "identifiability", hj.fitting.identifiability, both, shared
@@ -361,41 +361,29 @@ def recordings(t):
     taken = {
         "recording": instance(t.record), "phase": definition, "inputs": OR_NONE, "outputs": OR_NONE,
         "n_sections": [*optional(LIMITED), 8.5], "bandwidth": LIMIT, "sampled": WORD,
-        "timing": optional(WORD), "drift": LIMIT,
+        "timing": optional(WORD),
     }  # fmt: skip
-    yield "section_data", hj.recordings.section_data, take, taken | {"max_gap": LIMIT}
+    yield "section_data", hj.recordings.section_data, take, taken
+    taken.pop("sampled")
     yield (
         "identify_recording",
         hj.identify_recording,
         take | dict(order=1),
-        (taken | {"order": optional(FEW)}),
+        (taken | {"order": optional(FEW), "drift": LIMIT}),
     )
     yield "SectionData.experiments", t.section_data.experiments, dict(periods=4), {
         "periods": LIMITED,
     }  # fmt: skip
     yield "inspect", hj.recordings.inspect, dict(
         recording=t.recording, inputs="f", outputs=("x", "v")
-    ), {"recording": instance(t.record), "inputs": SIGNAL, "outputs": OR_NONE}  # fmt: skip
-    yield "inspect_cycles", hj.recordings.inspect_cycles, dict(
-        recording=t.recording, phase=t.phase, data=t.section_data
     ), {
-        "recording": instance(t.record), "phase": [None, "x", 3, Other()],
-        "data": instance(t.record),
-    }  # fmt: skip
-    about = dict(input="f", outputs=("x", "v"), event="strike")
-    yield "mishandle", hj.testing.mishandle, dict(
-        recording=t.recording, mishap="white noise", **about
-    ), {
-        "recording": instance(t.record), "mishap": WORD, "input": SIGNAL, "outputs": SIGNAL,
-        "event": [None, 3, Other()], "seed": SEED,
+        "recording": instance(t.record), "inputs": SIGNAL, "outputs": OR_NONE,
+        "phase": ["x", 3, Other()], "data": ["x", 3, t.record, Other()],
     }  # fmt: skip
     data = instance(t.record, t.data)
     yield "advise", hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit), {
         "data": data, "fit": instance(t.structured), "validation": optional(instance(t.data)),
         "findings": ["x", 3, [3], Other()], "curve": optional(instance(t.design)),
-    }  # fmt: skip
-    yield "plain_regression", hj.recordings.plain_regression, dict(data=t.record, order=2), {
-        "data": [*instance(t.design), [], [3]], "order": FEW,
     }  # fmt: skip
     yield "choose_order", hj.recordings.choose_order, dict(data=t.section_data), {
         "data": data, "most": FEW, "share": [*SHARE, 1.0],
@@ -415,20 +403,14 @@ def recordings(t):
         "recording": instance(t.record), "phase": instance(PHASE), "signals": SIGNAL,
         "cycles": POSITIVE,
     }  # fmt: skip
-    command = {"c": np.zeros((1, 120))}
     yield "add_command", hj.recordings.add_command, dict(
-        recording=t.recording, phase=t.phase, command=command, n_sections=2
+        recording=t.recording, phase=t.phase, path="nope.csv"
     ), {
-        "recording": instance(t.record), "phase": instance(PHASE), "n_sections": LIMITED,
-        "command": [None, 3, "x", ["c"], {"c": "x"}, {3: command["c"]},
-                    {"c": np.zeros(3)}, {"c": command["c"] * NAN}, {"c": command["c"] + 1j}],
+        "recording": instance(t.record), "phase": instance(PHASE), "path": [*PATH, "nope.csv"],
     }  # fmt: skip
     yield "write_design", hj.recordings.write_design, dict(path="d.csv", design=t.one_input), {
         "path": [*PATH, "nope/d.csv"], "design": instance(t.model), "cycles": optional(LIMITED),
         "period": optional(POSITIVE), "rate": optional(POSITIVE),
-    }  # fmt: skip
-    yield "read_design", hj.recordings.read_design, dict(path="nope.csv"), {
-        "path": [*PATH, "nope.csv"],
     }  # fmt: skip
     yield (
         "read_recording",
@@ -455,18 +437,11 @@ def recordings(t):
 
 
 def testing(t):
-    yield "Dirt", hj.testing.Dirt, {}, {
-        "noise": NONNEGATIVE, "quantum": NONNEGATIVE, "drift": FINITE,
-        "missing": [*NONNEGATIVE, 1.5], "gap": ["ab", 1.0, (1.0,), (NAN, 1.0), (2.0, 1.0)],
-        "irregular": FLAG, "lost_events": WHOLE, "doubled_events": WHOLE, "stretch": FINITE,
-        "seed": SEED,
+    yield "spoil", hj.testing.spoil, dict(recording=t.recording, signals=("x",)), {
+        "recording": instance(t.record), "signals": SIGNAL, "noise": NONNEGATIVE,
+        "quantum": NONNEGATIVE, "missing": [*NONNEGATIVE, 1.5], "seed": SEED,
+        "gap": ["ab", 1.0, (1.0,), (NAN, 1.0), (2.0, 1.0)], "spikes": [*NONNEGATIVE, 1.5],
     }  # fmt: skip
-    yield (
-        "spoil",
-        hj.testing.spoil,
-        dict(recording=t.recording, signals=("x",), dirt=hj.testing.Dirt()),
-        {"recording": instance(t.record), "signals": SIGNAL, "dirt": instance(PHASE)},
-    )
     yield "random_force", hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5), {
         "duration": [*POSITIVE, 1e12], "rate": [*POSITIVE, 1e12], "bandwidth": [*POSITIVE, 40],
         "rms": NONNEGATIVE, "inputs": LIMITED, "seed": SEED,

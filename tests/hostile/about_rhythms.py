@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 import hybridjax as hj
 
-from .about_data import FEW, SIGNAL
+from .about_data import FEW, FLAG, SIGNAL
 from .values import (
     CALLABLE,
     LABELS,
@@ -35,12 +35,6 @@ def calls(t):
     about = dict(recording=t.recording, phase=BEAT, input="f")
     wrong = {"recording": instance(t.record), "phase": definition, "input": SIGNAL}
     yield "phase_response", hj.recordings.phase_response, about, wrong
-    yield (
-        "forecast_intervals",
-        hj.recordings.forecast_intervals,
-        about | dict(curve=[1.0]),
-        (wrong | {"folds": FEW, "curve": array([1.0, 0.0, 0.0])}),
-    )
     yield "phase_response", hj.plot.phase_response, dict(found=t.beats), {
         "found": instance(t.design), "labels": LABELS,
     }  # fmt: skip
@@ -53,8 +47,7 @@ def calls(t):
         "data": instance(t.record), "order": [*FEW, 99], "seed": SEED,
     }  # fmt: skip
     natural = hj.recordings.natural_multipliers(t.variability)
-    yield "NaturalMultipliers.interval", natural.interval, {}, {"level": SHARE}
-    yield "NaturalMultipliers.plain_interval", natural.plain_interval, {}, {"level": SHARE}
+    yield "NaturalMultipliers.interval", natural.interval, {}, {"level": SHARE, "plain": FLAG}
     yield "MultiplierEstimate.half_widths", t.structured.half_widths, {}, {"level": SHARE}
     yield "simulate_beats", hj.testing.simulate_beats, dict(curve=[1.0], force=jnp.ones((1, 99))), {
         "curve": array([1.0, 0.0, 0.0]), "force": array([[1.0, 0.0]]), "rate": POSITIVE,
