@@ -149,7 +149,7 @@ def robot_layout(seeds=40, multiplier=0.6):
 
         def one(rng, gain=gain):
             records = [in_loop(model, 5, gain, rng) for _ in range(12)]
-            fit = hj.fit_series(records, 1, check=False, distortion=False)
+            fit = hj.fit_series(records, 1, check=False)
             return {
                 "held": int(fit.contains([multiplier])[0]),
                 "value": float(fit.multipliers[0].real),

@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [parts] [dirt] [mishaps] [spikes] [walker] [size] [bag]
-[coverage] [products] [short] [losses] [real]
+[coverage] [quiet] [short] [losses] [real]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -104,7 +104,7 @@ def parts(seeds=10, strides=1000, noise=1e-4, part=0.1):
             found, said = [], []
             for seed, recording in enumerate(recordings):
                 data = at_sections(noisy(recording, share * noise, seed), name)
-                fit = hj.fit_series(data.records, 2, check=False, distortion=False)
+                fit = hj.fit_series(data.records, 2, check=False)
                 found.append(distance(fit.multipliers, true))
                 said.append(fit.standard_errors[0])
             print(
@@ -124,7 +124,7 @@ def bound(strides, noise, n_sections=N_SECTIONS, seed=0):
     y = np.array(hj.linearize(cycle, placed, ("yM", "vM")).simulate(u))
     y += noise * np.sqrt(n_sections / RATE) * np.random.default_rng(seed).normal(size=y.shape)
     record = hj.Record(u, y, n_sections=n_sections)
-    return hj.fit_series(record, 2, errors="white", distortion=False).standard_errors[0]
+    return hj.fit_series(record, 2, errors="white").standard_errors[0]
 
 
 def rms(values):
@@ -152,8 +152,8 @@ def coverage(draws=400, strides=300, noise=1e-4, chunk=50, n_sections=16, phases
         print(f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}", flush=True)
 
 
-def products(draws=200):
-    """Where next to no noise is left, and products of second order are taken."""
+def quiet(draws=200):
+    """Next to no noise: distortion is the misfit."""
     coverage(draws, noise=0.0, n_sections=N_SECTIONS, phases=PHASES)
     walks("van der Pol", *oscillator(0.02), draws, 100, 5, 1e-4)
 
@@ -354,7 +354,7 @@ def losses(draws=200, strides=200):
     system = LINEAR["a complex pair"]
     for label, noise in NOISES_OF_LOSSES.items():
         for loss in ("squares", "huber", "student"):
-            about = dict(loss=loss, distortion=False)
+            about = dict(loss=loss)
             coverage_of(f"{label}, {loss}", *system, noise, draws, strides, **about)
 
 
@@ -514,7 +514,7 @@ def write_trials(files, minutes, rate):
 
 ALL = (
     "errors", "parts", "dirt", "mishaps", "spikes", "walker", "size", "bag", "coverage",
-    "products", "short", "losses", "real",
+    "quiet", "short", "losses", "real",
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -240,8 +240,9 @@ def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
     def store(S: int):
         design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
-        records = hj.run_experiments(
-            cycle, placed, design, outputs, discard=4, store=folder / f"{S}.zarr"
+        options = hj.experiments.Options(discard=4)
+        records = hj.experiments.stream_experiments(
+            cycle, placed, design, outputs, options, store=folder / f"{S}.zarr"
         )
         wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
         show(f"experiments.{S}.run_cpu_seconds", cpu)
@@ -271,7 +272,7 @@ def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
         show(f"experiments.fit.{S}.cpu_seconds", seconds[-1])
         show(f"experiments.fit.{S}.memory", megabytes())
     show("experiments.fit.linear", seconds[1] / seconds[0] / 2)
-    whole = hj.fit_series(list(records), 2, check=False, distortion=False)
+    whole = hj.fit_series(list(records), 2, check=False)
     show("experiments.fit.difference", np.abs(found.coefficients - whole.coefficients).max())
 
 

@@ -10,6 +10,8 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
+from hybridjax.identify.rational import RationalFit
 
 
 def same(a, b):
@@ -71,8 +73,8 @@ def test_failed_experiments_and_cycle_outputs(folder):
     y[1, 3:] = np.nan
     data = hj.ExperimentData(
         np.zeros((2, 6, 1)), y, n_sections=3, periods=1, result=[0, hj.Result.GRAZING],
-        simulated=hj.experiments.Simulated(np.array([-1, 3])),
-        cycle_outputs=np.arange(3.0)[:, None], label="by hand",
+        simulated=Simulated(np.array([-1, 3]), label="by hand"),
+        cycle_outputs=np.arange(3.0)[:, None],
     )  # fmt: skip
     object.__setattr__(data, "periods", np.int64(1))  # as where nobody checks annotations
     back = trip(folder, data)
@@ -115,7 +117,7 @@ def test_round_trip_of_any_fit(folder, data):
     other = [data.draw(arrays(complex, s)) for s in ((ny, p), (ny, q), (ny, p))]
     code = data.draw(arrays(np.int64, ny))
     names = tuple(f"y{i}" for i in range(ny))
-    fit = hj.identify.RationalFit(
+    fit = RationalFit(
         *real[:2], *other, real[2], code, 0, 32, "delayed", "uniform", names, data.draw(st.text())
     )
     assert same(fit, trip(folder, fit))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
 from hybridjax.systems.system import own_fields
 
 from .conftest import KINEMATIC, OUTPUTS
@@ -75,7 +76,7 @@ def test_results_print_briefly(hopper_cycle, placed_kinematic, kinematic_ldtp, h
         hopper_cycle, hopper_cycle.trajectory(), placed_kinematic, kinematic_ldtp, htf,
         hopper_data, KINEMATIC, response, hj.section_map(hopper_cycle, placed_kinematic, 0, 5),
         hj.ObservedHTF(htf, KINEMATIC), hj.ObservedSeries(hopper_data, KINEMATIC),
-        hj.ObservedCycle(KINEMATIC, period=1.0), hj.experiments.Simulated(np.zeros(3, int)),
+        hj.ObservedCycle(KINEMATIC, period=1.0), Simulated(np.zeros(3, int)),
     ]  # fmt: skip
     for thing in things:
         text = repr(thing)

@@ -151,18 +151,15 @@ UNCHECKED = {
         "ReturnMap.turn_with_jacobian", "Structure", "Winding.when",
     },
     "made by this package": {
-        "AAAFit", "Advice", "AmplitudeSweep", "Branch", "Coherence", "Constrained", "EventTimes",
+        "Advice", "Branch", "Constrained", "EventTimes",
         "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
         "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
-        "LimitCycles", "ModelFit", "MultiplierBound", "MultiplierComparison", "OrderSelection",
-        "NaturalMultipliers", "OutputLevels", "ParameterGuesses", "Phase",
-        "PhaseResponse",
-        "PlacedSections", "Plan", "Plot",
-        "RationalFit", "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
-        "Stepping", "StructuredFit", "Trajectory", "TransientFit", "Trial", "Validation",
-        "Winding",
+        "LimitCycles", "ModelFit", "NaturalMultipliers", "ParameterGuesses", "Phase",
+        "PhaseResponse", "PlacedSections", "Plan", "Plot",
+        "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
+        "Stepping", "Trajectory", "Trial", "Winding",
     },
 }  # fmt: skip
 

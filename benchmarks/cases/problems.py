@@ -15,9 +15,8 @@ from peers.contest import Seconds, measure
 
 import hybridjax as hj
 from hybridjax.experiments import campaign
-from hybridjax.experiments.campaign import prepare
+from hybridjax.experiments.campaign import Options, prepare
 from hybridjax.experiments.flow_batch import course, flow_batch
-from hybridjax.experiments.options import Options
 
 
 MODELS = {"hopper": hj.models.VerticalHopper, "bar": hj.models.TwoLeggedBar}

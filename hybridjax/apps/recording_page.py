@@ -230,8 +230,8 @@ def _recording(found: Identification, images: dict[str, str]) -> list[str]:
             wide=True,
         ),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
-        f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags"
-        f"{', with a part of second order' if fit.distortion else ''}; regions from the residuals, "
+        f"{data.bandwidth:.3g} Hz; output-error fit with {fit.numerators.shape[1]} lags; regions "
+        "from the residuals, "
         "cycle by cycle.</p>",
     ]
 

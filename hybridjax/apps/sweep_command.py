@@ -12,7 +12,7 @@ from .._core.arguments import package
 from ..errors import DefinitionError
 from ..plot.look import save
 from ..plot.over_parameters import sweep as plot_sweep
-from ..scale.map import sweep
+from ..scale.sweep import sweep
 from ..scale.wanted import Want
 
 

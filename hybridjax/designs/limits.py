@@ -11,8 +11,8 @@ from jaxtyping import Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive
 from ..errors import DefinitionError
-from ..experiments.design.crest import optimize_phases
 from ..experiments.design.design import Design
+from ..experiments.design.multisine import optimize_phases
 from ..experiments.design.partition import line_class
 from .candidates import Candidates, Kept, Model, Powers, Squares, rate_of
 from .distortion import Distortion

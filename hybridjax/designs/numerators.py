@@ -14,9 +14,9 @@ from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 
 from ..errors import DefinitionError
-from ..identify.multipliers.denominator import chi
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.variable_projection import powers_basis
+from ..identify.denominator import chi
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.variable_projection import powers_basis
 from ..linear.htf import HTF
 from .candidates import Candidates, Kept, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Bound, Channel, Criterion, Information, only_channels

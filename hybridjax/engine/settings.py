@@ -17,7 +17,7 @@ from .._core.text import fields
 from ..errors import DefinitionError
 from ..systems.solver import Solver, solvers
 from ..systems.system import HybridSystem, integrated
-from .solver.step import Step
+from .runge_kutta import Step
 
 
 # Default accuracies: the error that one step may have, relative to the size of each state. A tenth

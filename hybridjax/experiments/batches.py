@@ -1,4 +1,4 @@
-"""Many experiments through one compiled program: batches of one size, in threads."""
+"""Many experiments through one compiled function: batches of one size, in threads."""
 
 import contextlib
 import dataclasses
@@ -11,23 +11,21 @@ import numpy as np
 from .._core.execution import Execution, in_threads
 from .._core.executor import on_cpu
 from .._core.precision import single, single_precision
+from .._core.progress import counted
 
 
-# Experiments of one compiled call: on CPU, where fewer share the cost of what is done once for all
-# lanes, and twice as many leave the cache; and on accelerators, where twice as many need twice the
-# memory.
+# Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
+# them, more leave the cache. On accelerators: more need more memory.
 _BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
-# Fewer experiments than this are not split among workers. Twice as many leave cores idle in small
-# jobs.
+# Fewer experiments than this are not split among workers: smaller batches cost more than they gain.
 _UNDIVIDED = 32
-# Batches are multiples of this, as processors add several numbers at once: others are up to a third
-# slower. Twice this fills more of a last batch with repetitions.
+# Batches are multiples of this, the width of vector instructions: others take up to a third longer.
 _VECTOR = 8
 
 
 def divide(S: int, execution: Execution) -> Execution:
-    """`execution` with the size of batches for S experiments, and the number of threads that share
-    them, filled in."""
+    """Return `execution` with the batch size for S experiments and the number of threads filled
+    in."""
     workers = execution.threads
     if execution.batch is not None:
         size = min(execution.batch, S)
@@ -45,32 +43,34 @@ def in_batches(
     arguments: Callable[[slice | np.ndarray], tuple],
     S: int,
     execution: Execution,
+    name: str,
 ) -> Iterator[tuple[slice, Any]]:
-    """Rows, and what `program` gives for them, batch after batch.
+    """Yield rows and the results of `program` for them, batch after batch.
 
-    **Arguments:** `program`, compiled, with experiments first in all that it returns;
-    `arguments`, its arguments for some experiments, in double precision; `execution` as `divide`
-    returns it.
+    **Arguments:** `program`: compiled, with experiments first in all that it returns. `arguments`:
+    returns its arguments for some experiments, in double precision. `execution`: from `divide`.
+    `name`: of the experiments, for the progress line.
     """
-    size = execution.batch
-    assert size is not None and execution.workers is not None
+    size = execution.batch or S
 
     def work(k: int):
-        some = slice(k, k + size)
+        rows = slice(k, k + size)
         if k + size > S:  # the last batch is filled up with repetitions
-            some = np.arange(k, k + size) % S
+            rows = np.arange(k, k + size) % S
         with precision_of(execution) as convert:
-            out = program(*convert(arguments(some)))
+            out = program(*convert(arguments(rows)))
         return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], out)
 
-    parts = in_threads(work, range(0, S, size), execution.workers)
-    for k, part in zip(range(0, S, size), parts, strict=True):
+    starts = range(0, S, size)
+    parts = in_threads(work, starts, execution.workers or 1)
+    for k, part in counted(zip(starts, parts, strict=True), f"batches of {name}", len(starts)):
         yield slice(k, min(k + size, S)), part
 
 
 @contextlib.contextmanager
 def precision_of(execution: Execution):
-    """A context of this precision, and what brings arguments to it."""
+    """Enter the precision of `execution`; the context is a function that converts arguments to
+    it."""
     if execution.precision == "double":
         yield lambda tree: tree
     else:

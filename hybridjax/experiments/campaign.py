@@ -1,18 +1,19 @@
-"""Experiments on one system, one cycle and one family of sections, ready to be run part by part."""
+"""Experiments on one system, one cycle and one family of sections, run all at once or in parts."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index
+from .._core.boundary.values import Reals
 from .._core.compilation import TwoTiers
 from .._core.execution import Execution
 from .._core.executor import from_host
-from .._core.memo import Memory
-from .._core.progress import counted
+from .._core.memo import Memory, remembered
 from .._core.results import Result
 from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
 from ..errors import ComputationError, DefinitionError
@@ -20,145 +21,190 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
-from ..systems.output import Output
+from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
 from .batches import divide, in_batches, precision_of
 from .data import ExperimentData, Simulated
-from .design.design import DISCARD
+from .design.design import DISCARD, Design
 from .events import EventList, EventTimes, in_order
 from .flow_batch import Course, IntervalEvents, course, flow_batch
-from .inputs import DesignLike, Inputs, check_inputs
 from .noise import ProcessNoise
-from .options import Options, StartName
-from .start import CycleStart, PeriodicStart, Start, SteadyStart, predict_start
-from .steady import settle_batch
-from .stepping.plan import Stepping, plan_flow
-from .stepping.single_precision import plan_single
+from .plan import Accuracy, Stepping, plan_flow
+from .single_precision import plan_single
+from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
 
 
-# From so many samples in all, it pays to wait for a program that is compiled thoroughly: that takes
-# 10 s longer, and then 2 microseconds less for each of them. Twice as many: jobs of up to 20 s take
-# twice as long.
+DesignLike = (
+    Design | Annotated[np.ndarray | jax.Array, Reals("S n nu", missing=True, infinite=True)]
+)
+"""A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
+
+# From so many samples in all, a run waits for the optimized program: it takes 10 s longer to
+# compile and saves 2 microseconds per sample. Fewer: short runs wait in vain. More: runs of 20 s
+# take twice as long.
 _LARGE = 5_000_000
+# Experiments whose inputs are checked together, as an array may lie on disk. More need more memory.
+_CHECKED = 1024
 _ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of experiments, the keyword arguments of `run_experiments`.
+
+    **Fields:** `start`, `discard`, `process_noise`, `accuracy`, `record_events` and `execution`,
+    with the defaults and the meaning that they have in `run_experiments`.
+    """
+
+    start: StartName = "cycle"
+    discard: Index | None = None
+    process_noise: ProcessNoise | None = None
+    accuracy: Accuracy | None = None
+    record_events: bool = False
+    execution: Execution | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """Inputs of a set of experiments, generated or read in parts.
+
+    **Fields:** `source`: a design or an array (S, n, nu). `cycles`: length of the experiments in
+    periods of the limit cycle. `periods`: number of the last periods that are for estimation.
+    """
+
+    source: Design | np.ndarray
+    cycles: int
+    periods: int
+
+    def __len__(self) -> int:
+        return self.source.experiments if isinstance(self.source, Design) else len(self.source)
+
+    def part(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
+        """Return the inputs of consecutive experiments."""
+        if isinstance(self.source, Design):
+            return self.source.inputs(self.cycles, rows)
+        return np.asarray(self.source[rows], float)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Campaign:
-    """Experiments that have all in common but their inputs. `run` does some or all of them.
+    """Experiments that differ in their inputs only. A campaign can be pickled: nothing that is
+    compiled belongs to it.
 
     **Fields:**
 
-    - `placed`: the sections, on their limit cycle. `course`: what the program needs to know of
-        them. `outputs`: what is recorded there.
-    - `inputs`: where inputs come from, and which part of the records is for estimation.
-    - `start`: how experiments start. `process_noise`: what acts beside their inputs.
-    - `stepping`: how lanes step from section to section. `program`: `flow_batch`, compiled.
-    - `record_events`: whether the times of events are recorded.
-    - `execution`: how they are run, with the size of batches and the number of threads.
+    - `placed`: the sections on the limit cycle. `outputs`: recorded there.
+    - `inputs`: source of the inputs. `start`: the kind of initial condition. `model`: the
+      linearization that predicts it, except for starts on the cycle.
+    - `stepping`: tolerances and step schedule between sections.
+    - `process_noise`, `record_events`: as in `run_experiments`.
+    - `execution`: precision, batch size and number of threads.
+    - `large`: whether to wait for the optimized program.
     """
 
     placed: PlacedSections
-    course: Course
-    outputs: Outputs
+    outputs: tuple[str | Output, ...]
     inputs: Inputs
-    start: Start
-    process_noise: ProcessNoise | None
+    start: StartName
+    model: LDTP | None
     stepping: Stepping
-    program: TwoTiers
+    process_noise: ProcessNoise | None
     record_events: bool
     execution: Execution
+    large: bool
 
-    def run(self, rows: slice | None = None) -> ExperimentData:
-        """Run some of the experiments, by default all.
-
-        **Arguments:** `rows`, consecutive ones.
+    def run(self, rows: slice | None = None, workers: int | None = None) -> ExperimentData:
+        """Run the experiments of consecutive `rows`. Default: all of them.
 
         **Raises:** `DefinitionError` for an output that is not defined where experiments go;
         `ComputationError` if a steady start is not found.
         """
         rows = slice(0, len(self.inputs)) if rows is None else rows
-        u = self.inputs.of(rows)
-        start = self.start.states(u, rows.start)
+        workers = self.execution.workers if workers is None else workers
+        execution = dataclasses.replace(self.execution, workers=workers)
+        u, N = self.inputs.part(rows), self.placed.n_sections
+        start = self._starts(u, rows.start, execution)
         applied = u
         if self.process_noise is not None:
-            applied = u + self.process_noise.draw(u.shape, self.placed.n_sections, rows.start)
-        cycle_log = self._cycle_log() if self.record_events else None
-        capacity = 0 if cycle_log is None else 1 + int(np.asarray(cycle_log.count).max())
+            applied = u + self.process_noise.draw(u.shape, N, rows.start)
+        capacity = 1 + int(self._cycle_log.count.max()) if self.record_events else 0
         while True:
-            y, result, failed_at, error, log = self._respond(applied, start, capacity)
+            y, result, failed_at, error, log = self._respond(applied, start, capacity, execution)
             if log is None or (most := int(log.count.max(initial=0))) <= capacity:
                 break
             capacity = 2 ** (most - 1).bit_length()  # as few sizes, and so programs, as possible
         self._require_outputs(y, result)
+        z, label = self.at_sections.outputs, self.placed.family.label
         return ExperimentData(
             u,
             y,
-            n_sections=self.placed.n_sections,
+            n_sections=N,
             periods=self.inputs.periods,
-            inputs=self.outputs.structure.inputs,
-            outputs=self.outputs.names,
+            inputs=z.structure.inputs,
+            outputs=z.names,
             result=result,
-            simulated=Simulated(failed_at, error, self._events(log, cycle_log)),
-            cycle_outputs=self.cycle_outputs(),
-            label=self.placed.family.label,
-        )
-
-    def by(self, workers: int) -> "Campaign":
-        """The same, by so many threads."""
-        return dataclasses.replace(
-            self, execution=dataclasses.replace(self.execution, workers=workers)
+            simulated=Simulated(failed_at, error, self._events(log), label),
+            cycle_outputs=self.at_sections.on_cycle,
         )
 
     @property
-    def taught(self) -> tuple[PlacedSections, Stepping, LDTP | None]:
-        """What is known before the first experiment."""
-        start = self.start.predicted if isinstance(self.start, SteadyStart) else self.start
-        model = start.model if isinstance(start, PeriodicStart) else None
-        return self.placed, self.stepping, model
+    def at_sections(self) -> "_AtSections":
+        """Outputs, compiled definitions and values at the sections."""
+        return _at_sections(self.placed, self.outputs, self.execution)
 
-    def with_taught(self, taught: tuple[PlacedSections, Stepping, LDTP | None]) -> "Campaign":
-        """The same, with what another call has found out."""
-        placed, stepping, model = taught
-        state = self.__getstate__() | {"placed": placed, "stepping": stepping, "model": model}
-        new = object.__new__(Campaign)
-        new.__setstate__(state)
-        return new
+    @remembered
+    def _programs(self) -> tuple[TwoTiers, TwoTiers]:
+        return TwoTiers(flow_batch, self.large), TwoTiers(settle_batch, self.large)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what is compiled, for other processes."""
-        placed, stepping, model = self.taught
-        return {
-            "placed": placed, "stepping": stepping, "model": model,
-            "outputs": tuple(self.outputs.items), "inputs": self.inputs, "start": self.start.name,
-            "process_noise": self.process_noise, "record_events": self.record_events,
-            "execution": self.execution, "large": self.program.large,
-        }  # fmt: skip
+    def _starts(self, u, first: int, execution: Execution) -> Float[np.ndarray, "m S"]:
+        """Return times and states on section 0 at which experiments start.
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        made = _compose(**state)
-        for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, getattr(made, field.name))
+        **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
+        """
+        if self.model is None:
+            return np.repeat(on_cycle(self.placed), len(u), axis=1)
+        stepping, periods = self.stepping, self.inputs.periods
+        window = u[:, : periods * self.placed.n_sections]
+        predicted = periodic_start(self.placed, self.model, window)
+        if self.start == "periodic":
+            return predicted
+        prediction = predict(self.placed, self.model, stepping, periods)
+        silent = dataclasses.replace(self.at_sections.course, outputs=())
 
-    def _respond(self, u, start, capacity: int):
-        """Deviations of outputs from the cycle (S, n, ny), codes, samples of failures, errors, and
-        the first `capacity` events between any two sections."""
-        stepping, N = self.stepping, self.placed.n_sections
-        base = self.cycle_outputs()
+        def arguments(rows):
+            start, u = from_host((predicted[:, rows], window[rows]))
+            return silent, stepping.plan, start, u, stepping.settings, prediction
 
-        def arguments(some):
+        parts = in_batches(self._programs[1], arguments, len(u), execution, "steady starts")
+        each = zip(*(part for _, part in parts), strict=True)
+        start, change = (np.concatenate(x).astype(float) for x in each)
+        if (change > stepping.accuracy).any():
+            s = int(np.nanargmax(change))
+            raise ComputationError(
+                f"experiment {first + s}: no periodic response was found near the one that the "
+                f"linearization predicts (Newton's last step is {change[s]:.1e} of the state's "
+                "size): make the input smaller, or discard cycles instead."
+            )
+        return np.where(np.isnan(change), predicted, start.T)
+
+    def _respond(self, u, start, capacity: int, execution: Execution):
+        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
+        errors, and the first `capacity` events between any two sections."""
+        stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
+
+        def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
-            x, held = jax.device_put((start[:, some], u[some]))
-            return self.course, stepping.plan, x, held, stepping.settings, capacity
+            x, held = jax.device_put((start[:, rows], u[rows]))
+            course = self.at_sections.course
+            return course, stepping.plan, x, held, stepping.settings, capacity
 
         S, n, _ = u.shape
-        y, others = np.empty((S, n // N, *base.shape)), []
-        parts = in_batches(self.program, arguments, S, self.execution)
-        batches = -(-S // self.execution.batch) if self.execution.batch else None
-        for some, part in counted(parts, "batches of experiments", batches):
-            np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[some])
-            others.append((part.result, part.failed_at, part.error, part.log))
-        *each, logs = zip(*others, strict=True)
+        y, parts = np.empty((S, n // N, *base.shape)), []
+        for rows, part in in_batches(self._programs[0], arguments, S, execution, "experiments"):
+            np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
+            parts.append((part.result, part.failed_at, part.error, part.log))
+        *each, logs = zip(*parts, strict=True)
         result, failed_at, error = map(np.concatenate, each)
         log = IntervalEvents(*map(np.concatenate, zip(*logs, strict=True))) if capacity else None
         error = error.astype(float) + stepping.rounding
@@ -169,126 +215,121 @@ class Campaign:
         if finite.all() or (finite.all(axis=(1, 2)) | (result != Result.OK)).all():
             return
         for a in np.unique(self.placed.lanes.chart):
-            self.outputs.require(int(a))
+            self.at_sections.outputs.require(int(a))
         raise DefinitionError(
             "an output is NaN although its experiment ran well: it is not defined everywhere "
             "that the experiments go."
         )
 
-    def cycle_outputs(self) -> Float[np.ndarray, "N ny"]:
-        """The outputs on the limit cycle."""
-        items = tuple(self.outputs.items)
-        look = lambda: np.asarray(self.placed.observe(items))  # noqa: E731
-        # (An `Output` may be another one at every call.)
-        named = all(isinstance(item, str) for item in items)
-        return _observed.recall(self.placed, items, look) if named else look()
-
+    @remembered
     def _cycle_log(self) -> IntervalEvents:
-        """The events of one period of the limit cycle, by the same steps as in experiments."""
-        placed, stepping, N = self.placed, self.stepping, self.placed.n_sections
-        start = CycleStart(placed).states(np.zeros((1, 0, 0)), 0)
-        u = np.zeros((1, N, len(placed.cycle.system.inputs)))
+        """Events of one period of the limit cycle, by the same steps as in experiments."""
+        placed, stepping = self.placed, self.stepping
+        u = np.zeros((1, placed.n_sections, len(placed.cycle.system.inputs)))
         capacity = max(len(placed.cycle.event_sequence), 1)
-        own = dataclasses.replace(self.course, outputs=())
-        return TwoTiers(flow_batch, large=False)(
-            own, stepping.plan, *from_host((start, u)), stepping.settings, capacity
-        ).log
+        silent = dataclasses.replace(self.at_sections.course, outputs=())
+        flow = TwoTiers(flow_batch, large=False)
+        arguments = *from_host((on_cycle(placed), u)), stepping.settings, capacity
+        return IntervalEvents(*map(np.asarray, flow(silent, stepping.plan, *arguments).log))
 
     def cycle_events(self) -> EventList:
-        """The events of one period of the limit cycle, those of one experiment."""
-        N, period = self.placed.n_sections, float(np.asarray(self.placed.cycle.period))
-        return in_order(self._cycle_log(), N, period)
+        """Return the events of one period of the limit cycle, as those of one experiment."""
+        return in_order(self._cycle_log, self.placed.n_sections, float(self.placed.cycle.period))
 
-    def _events(
-        self, log: IntervalEvents | None, cycle_log: IntervalEvents | None
-    ) -> EventTimes | None:
-        if log is None or cycle_log is None:
+    def _events(self, log: IntervalEvents | None) -> EventTimes | None:
+        if log is None:
             return None
-        N, period = self.placed.n_sections, np.asarray(self.placed.cycle.period)
-        own, cycle = (in_order(x, N, float(period)) for x in (log, cycle_log))
-        names = tuple(t.name for t in self.outputs.structure.transitions)
-        return EventTimes(*own, cycle.time[0], cycle.event[0], period, n_sections=N, names=names)
+        N, period, cycle = self.placed.n_sections, self.placed.cycle.period, self.cycle_events()
+        names = tuple(t.name for t in self.at_sections.outputs.structure.transitions)
+        listed, at = in_order(log, N, float(period)), (cycle.time[0], cycle.event[0])
+        return EventTimes(*listed, *at, np.asarray(period), n_sections=N, names=names)
 
 
 def prepare(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: Sequence[str | Output],
+    outputs: OutputNames,
     options: Options,
     chunk: int | None = None,
     one_program: bool = False,
 ) -> Campaign:
-    """Check what `run_experiments` was given, and do what is done once for all experiments.
+    """Check the arguments of `run_experiments`, and do what is done once for all experiments.
 
-    **Arguments:** `chunk`, how many of them are run together; by default all. `one_program`: all
-    are run by the program that is compiled thoroughly, whatever there is.
+    **Arguments:** `chunk`: number of experiments that run together. Default: all. `one_program`:
+    whether all runs have to use the optimized program.
     """
     placed = as_placed(cycle, sections)
-    _resolved(placed, outputs)
+    items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
+    placed.structure().resolve_outputs(items)
     _require_return(cycle, placed)
-    start, discard, accuracy = options.start, options.discard, options.accuracy
-    execution = Execution() if options.execution is None else options.execution
-    accuracy = _ACCURACY[execution.precision] if accuracy is None else accuracy
-    discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
+    start, noise = options.start, options.process_noise
+    discard = (DISCARD if start == "cycle" else 0) if options.discard is None else options.discard
     N, nu = placed.n_sections, len(cycle.system.inputs)
     inputs = check_inputs(design, discard, N, nu)
-    if options.process_noise is not None:
-        options.process_noise.require(N)
+    if noise is not None:
+        noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:
         raise DefinitionError(
             f"a {start} start needs inputs of a whole number of windows: use `discard=0`."
         )
-    together = len(inputs) if chunk is None else chunks(len(inputs), chunk)[0].stop
-    execution = divide(together, execution)
-    samples = inputs.cycles * N
-    large = one_program or len(inputs) * samples > _LARGE
-    single = execution.precision == "single"
-    stepping = (plan_single if single else plan_flow)(placed, accuracy)
-    model = None if start == "cycle" else predict_start(placed, inputs.periods).model
-    return _compose(
-        placed=placed, stepping=stepping, model=model, outputs=outputs, inputs=inputs, start=start,
-        process_noise=options.process_noise, record_events=options.record_events,
-        execution=execution, large=large,
-    )  # fmt: skip
-
-
-def _compose(
-    *,
-    placed: PlacedSections,
-    stepping: Stepping,
-    model: LDTP | None,
-    outputs: Sequence[str | Output],
-    inputs: Inputs,
-    start: StartName,
-    process_noise: ProcessNoise | None,
-    record_events: bool,
-    execution: Execution,
-    large: bool,
-) -> Campaign:
-    """A campaign from what another process can be told."""
-    z = _resolved(placed, outputs)
-    own = _course(placed, z, execution)
-    begin: Start = CycleStart(placed)
-    if model is not None:
-        begin = PeriodicStart(placed, model, inputs.periods)
-    if start == "steady":
-        assert isinstance(begin, PeriodicStart)
-        aside = dataclasses.replace(own, outputs=())
-        begin = SteadyStart(begin, aside, stepping, execution, TwoTiers(settle_batch, large))
+    together = len(inputs) if chunk is None else min(chunk, len(inputs))
+    execution = divide(together, options.execution or Execution())
+    precision = execution.precision
+    accuracy = _ACCURACY[precision] if options.accuracy is None else options.accuracy
     return Campaign(
-        placed, own, z, inputs, begin, process_noise, stepping, TwoTiers(flow_batch, large),
-        record_events, execution,
-    )  # fmt: skip
+        placed=placed,
+        outputs=items,
+        inputs=inputs,
+        start=start,
+        model=None if start == "cycle" else linearized(placed),
+        stepping=(plan_single if precision == "single" else plan_flow)(placed, accuracy),
+        process_noise=noise,
+        record_events=options.record_events,
+        execution=execution,
+        large=one_program or len(inputs) * inputs.cycles * N > _LARGE,
+    )
 
 
-def chunks(count: int, chunk: int) -> list[slice]:
-    """Consecutive parts of `count` experiments, all but the last of the size `chunk`."""
-    return [slice(k, min(k + chunk, count)) for k in range(0, count, chunk)]
+def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> Inputs:
+    """Return the inputs for N sections and nu inputs, with the first `discard` cycles not for
+    estimation.
+
+    **Raises:** `DefinitionError` if they do not fit, or hold NaN.
+    """
+    if isinstance(design, Design):
+        if design.n_sections != n_sections:
+            raise DefinitionError(
+                f"the design is for {design.n_sections} sections, but the family has {n_sections}."
+            )
+        if len(design.input_names) != nu:
+            raise DefinitionError(
+                f"the design has {len(design.input_names)} inputs, but the system has {nu}."
+            )
+        return Inputs(design, discard + design.periods, design.periods)
+    u = np.asarray(design)  # may lie on disk (`numpy.memmap`), so never all of it is read at once
+    if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % n_sections or 0 in u.shape:
+        raise DefinitionError(
+            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
+            f"the {n_sections} sections; got {u.shape}."
+        )
+    for k in range(0, len(u), _CHECKED):
+        finite = np.isfinite(np.asarray(u[k : k + _CHECKED], float)).all(axis=(1, 2))
+        if not finite.all():
+            raise DefinitionError(
+                "`design` has NaN or infinity in the input of experiment "
+                f"{k + int(np.argmin(finite))}."
+            )
+    cycles = u.shape[1] // n_sections
+    if discard >= cycles:
+        raise DefinitionError(
+            f"inputs of {cycles} cycles less {discard} discarded ones leave none for estimation."
+        )
+    return Inputs(u, cycles, cycles - discard)
 
 
 def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
-    """Refuse cycles that experiments would leave."""
+    """**Raises:** an error for cycles that experiments would leave."""
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
             f"clock sections sample {type(cycle.system).__name__}, which has no clock, at fixed "
@@ -305,27 +346,26 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
         )
 
 
-# States of the cycle at its sections, by their names; outputs by what was asked for; courses by
-# outputs.
-_observed, _outputs, _courses = Memory(), Memory(), Memory()
+class _AtSections(NamedTuple):
+    outputs: Outputs
+    course: Course
+    """In the precision of the campaign."""
+    on_cycle: Float[np.ndarray, "N ny"]
+    given: tuple[str | Output, ...]
+    """The outputs by whose `id` this is found: they must not be collected."""
 
 
-def _resolved(placed: PlacedSections, outputs: Sequence[str | Output]) -> Outputs:
-    """Outputs at the sections; the same for the same sections and outputs."""
+_resolved = Memory()
+
+
+def _at_sections(placed: PlacedSections, outputs, execution: Execution) -> _AtSections:
+    """Return outputs and course, made once for the same sections, outputs and precision."""
     names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
 
-    def make():
-        # (Together with what is known by its `id`, which thereby keeps it.)
-        return placed.structure().resolve_outputs(outputs), outputs
-
-    return _outputs.recall(placed, names, make)[0]
-
-
-def _course(placed: PlacedSections, outputs: Outputs, execution: Execution) -> Course:
-    """The course in the precision that is asked for, once for the same sections and outputs."""
-
-    def make():
+    def make() -> _AtSections:
+        z = placed.structure().resolve_outputs(outputs)
         with precision_of(execution) as convert:
-            return convert(course(placed, outputs.items)), outputs
+            made = convert(course(placed, z.items))
+        return _AtSections(z, made, np.asarray(placed.observe(tuple(z.items))), outputs)
 
-    return _courses.recall(placed, (id(outputs), execution.precision), make)[0]
+    return _resolved.recall(placed, (names, execution.precision), make)

@@ -1,4 +1,4 @@
-"""What experiments return, whoever made them: a hybrid system, a linear model, a laboratory."""
+"""Data of experiments on a hybrid system, on a linear model or in a laboratory."""
 
 from typing import Annotated
 
@@ -19,26 +19,31 @@ from .events import EventTimes
 from .record import Record
 
 
-# What a notebook looks at: experiments (spread over all), and cycles of the one that it draws.
-# Doubled: twice the time, for larger samples of very many.
-_LOOKED_AT, _DRAWN = 64, 4
+# Experiments that the notebook summary evaluates, and cycles of the one that it draws. More: the
+# summary of large data takes seconds. Fewer: its rms values scatter, and the picture is empty.
+_EVALUATED, _DRAWN = 64, 4
+# Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
+# recorded inputs separates pairs. Larger: even-order distortion is left in the odd part.
+_OPPOSITE = 1e-9
 
 
 @checked
 class Simulated(eqx.Module):
-    """What only a simulation knows of its S experiments.
+    """Results of S experiments that only a simulation has.
 
     **Fields:**
 
     - `failed_at`: (S,) the sample at which an experiment failed, -1 where it did not.
     - `error`: (S,) estimates of the largest error of the states at any section, relative to their
       sizes (`LimitCycle.scale`), or None.
-    - `events`: when events happened, or None.
+    - `events`: times of events, or None.
+    - `label`: name of the section family.
     """
 
     failed_at: Int[np.ndarray, " S"]
     error: Float[np.ndarray, " S"] | None = None
     events: EventTimes | None = None
+    label: str = eqx.field(static=True, default="")
 
     def __repr__(self) -> str:
         return fields(self)
@@ -55,11 +60,11 @@ class ExperimentData(eqx.Module):
     - `y`: outputs at the sections minus those on the limit cycle, (S, n, ny), sampled before
       `u[:, i]` acts. NaN from the failure on where an experiment failed.
     - `result`: (S,) codes of `Result`.
-    - `simulated`: what only a simulation knows, or None; also to be had as `failed_at`, `error`
-      and `events`.
+    - `simulated`: results that only a simulation has, or None; also available as `failed_at`,
+      `error`, `events` and `label`.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
-    - `inputs`, `outputs`: names, or units by name. `label`: whose sections these are, for labels.
+    - `inputs`, `outputs`: names, or units by name.
     """
 
     u: Float[np.ndarray, "S n nu"]
@@ -71,7 +76,6 @@ class ExperimentData(eqx.Module):
     periods: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-    label: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -85,13 +89,13 @@ class ExperimentData(eqx.Module):
         result: Annotated[Numbers, Integers("S")] | None = None,
         simulated: Simulated | None = None,
         cycle_outputs: Annotated[Numbers, Reals("N ny")] | None = None,
-        label: str = "",
     ):
-        """**Arguments:** the fields. Without `result` every experiment counts as good; names
-        default to `u` and `y`, or `u0`, `u1`, ... where there are several.
+        """**Arguments:** the fields. Default of `result`: all OK. Default names: `u` and `y`, or
+        `u0`, `u1`, ... for several.
 
-        **Raises:** `DefinitionError` for shapes that do not fit together, a record that is not a
-        whole number of periods or shorter than the window, and for NaN in a good experiment.
+        **Raises:** `DefinitionError` for shapes that do not fit together, for a record that is not
+        a whole number of periods or is shorter than the window, and for NaN in an experiment whose
+        `result` is OK.
         """
         self.u, self.y = np.array(u), np.array(y)
         shapes = self.u.shape, self.y.shape
@@ -106,7 +110,7 @@ class ExperimentData(eqx.Module):
             raise DefinitionError("`result` must hold codes of `Result`.")
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
-        self.n_sections, self.periods, self.label = n_sections, periods, label
+        self.n_sections, self.periods = n_sections, periods
         self.inputs = names("inputs", inputs, self.u.shape[2])
         self.outputs = names("outputs", outputs, self.y.shape[2])
 
@@ -150,7 +154,7 @@ class ExperimentData(eqx.Module):
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:
-        """Which experiments ran to their end."""
+        """True for experiments that ran to their end."""
         return self.result == Result.OK
 
     @property
@@ -168,13 +172,18 @@ class ExperimentData(eqx.Module):
     def error(self) -> Float[np.ndarray, " S"]:
         """Estimates of the largest error of a simulation, relative to the sizes of the states
         (`LimitCycle.scale`); NaN if not known."""
-        known = None if self.simulated is None else self.simulated.error
-        return np.full(len(self.u), np.nan) if known is None else known
+        error = None if self.simulated is None else self.simulated.error
+        return np.full(len(self.u), np.nan) if error is None else error
 
     @property
     def events(self) -> EventTimes | None:
-        """When events happened (`run_experiments(record_events=True)`), or None if not known."""
+        """Times of events (`run_experiments(record_events=True)`), or None if not known."""
         return None if self.simulated is None else self.simulated.events
+
+    @property
+    def label(self) -> str:
+        """Name of the section family of a simulation, else ""."""
+        return "" if self.simulated is None else self.simulated.label
 
     @property
     def window(self) -> slice:
@@ -182,7 +191,7 @@ class ExperimentData(eqx.Module):
         return slice(self.u.shape[1] - self.n_sections * self.periods, None)
 
     def windows(self, repeats: Count = 1) -> list[slice]:
-        """The last `repeats` windows of P periods each, one after the other.
+        """Return the last `repeats` windows of P periods each, one after the other.
 
         **Raises:** `DefinitionError` if the record is too short.
         """
@@ -197,7 +206,8 @@ class ExperimentData(eqx.Module):
         return [slice(first + r * length, first + (r + 1) * length) for r in range(repeats)]
 
     def summary(self, limit: Index = 5) -> str:
-        """`80/80 ok`, or how many ran and why the first `limit` of the others did not."""
+        """Return `80/80 ok`, or the number of OK experiments with the causes of the first `limit`
+        failures."""
         return summary(self.result, self.failed_at, self.n_sections, limit)
 
     def __repr__(self) -> str:
@@ -211,22 +221,22 @@ class ExperimentData(eqx.Module):
 
     def _repr_html_(self) -> str:
         S, n, _ = self.u.shape
-        known = {
+        about = {
             "cycles": f"{n // self.n_sections} of {self.n_sections} sections",
             "window": f"the last {self.periods} periods",
             "sections": self.label,
         }
         good = np.flatnonzero(self.ok)
-        some = good[:: max(1, len(good) // _LOOKED_AT)]
-        if not len(some):
-            return card("ExperimentData", self.summary(), facts(known))
-        signals = [(x, self.u[some, :, k]) for k, x in enumerate(self.inputs)]
-        signals += [(y, self.y[some, :, k]) for k, y in enumerate(self.outputs)]
-        rows = [
+        rows = good[:: max(1, len(good) // _EVALUATED)]
+        if not len(rows):
+            return card("ExperimentData", self.summary(), facts(about))
+        signals = [(x, self.u[rows, :, k]) for k, x in enumerate(self.inputs)]
+        signals += [(y, self.y[rows, :, k]) for k, y in enumerate(self.outputs)]
+        sizes = [
             (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
             for x, v in signals
         ]
-        of_them = "" if len(some) == len(good) else f" of {len(some)} of them"
+        part = "" if len(rows) == len(good) else f" of {len(rows)} of them"
         k = slice(self.window.start, self.window.start + _DRAWN * self.n_sections)
         t = np.arange(n)[k] / self.n_sections
         drawn = [
@@ -235,14 +245,50 @@ class ExperimentData(eqx.Module):
                 (signals[0], signals[len(self.inputs)]), (COLORS[-1], COLORS[0]), strict=True
             )
         ]
-        sizes = table(("signal", f"rms{of_them}", "largest"), rows)
-        return card("ExperimentData", self.summary(), facts(known), sizes, *drawn)
+        rms = table(("signal", f"rms{part}", "largest"), sizes)
+        return card("ExperimentData", self.summary(), facts(about), rms, *drawn)
+
+    def odd_part(self) -> "ExperimentData":
+        """Return half the difference of each pair of experiments with opposite inputs.
+
+        Even-order distortion is the same for u and -u and cancels; so do offsets, such as an error
+        of the limit cycle. Experiments 2k and 2k + 1 are a pair, as in a design
+        `with_negatives()`. A pair with a failed member counts as failed. Events are left out.
+
+        **Raises:** `DefinitionError` for experiments that are no such pairs.
+        """
+        plus, minus = self.u[::2], self.u[1::2]
+        if len(self.u) % 2:
+            raise DefinitionError(f"{len(self.u)} experiments are not pairs: one has no partner.")
+        total, size = (np.abs(x).max(axis=(1, 2)) for x in (plus + minus, plus))
+        apart = ~(total <= _OPPOSITE * size)
+        if apart.any():
+            k = 2 * int(np.argmax(apart))
+            raise DefinitionError(
+                f"experiments {k} and {k + 1} are no pair: their inputs are not opposite "
+                "(`Design.with_negatives` makes pairs)."
+            )
+        first, second = self.result[::2], self.result[1::2]
+        broken = first != Result.OK
+        failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])
+        error = np.maximum(self.error[::2], self.error[1::2])
+        return ExperimentData(
+            plus,
+            (self.y[::2] - self.y[1::2]) / 2,
+            n_sections=self.n_sections,
+            periods=self.periods,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            result=np.where(broken, first, second),
+            simulated=Simulated(failed_at, error, label=self.label),
+            cycle_outputs=self.cycle_outputs,
+        )
 
 
 def summary(
     result: Int[np.ndarray, " S"], failed_at: Int[np.ndarray, " S"], n_sections: int, limit: int
 ) -> str:
-    """What became of experiments, and where and why the first `limit` that failed did so."""
+    """Return the number of OK experiments, with place and cause of the first `limit` failures."""
     failed = np.flatnonzero(result != Result.OK)
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:

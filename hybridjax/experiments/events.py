@@ -1,4 +1,4 @@
-"""When the events of experiments happened."""
+"""Times of the events in experiments."""
 
 from typing import NamedTuple
 
@@ -16,30 +16,30 @@ class ExperimentEvent(NamedTuple):
     """One event of one experiment."""
 
     time: float
-    """From the experiment's beginning, in the model's unit."""
+    """Time since the start of the experiment, in the model's unit."""
     name: str
-    """Of the transition."""
+    """Name of the transition."""
     cycle: int
     section: int
-    """The last section before the event, in this cycle of the experiment."""
+    """Last section before the event, in this cycle of the experiment."""
     deviation: float
-    """How much later it is than on the limit cycle, or NaN for one that is not the cycle's."""
+    """Delay relative to the event of the limit cycle; NaN if the cycle has another event there."""
 
 
 @checked_methods
 class EventTimes(eqx.Module):
-    """When the events of S experiments happened, each in order of time.
+    """Times of the events in S experiments, each in order of time.
 
     **Fields**, all on the host; rows are as long as the largest number E of events:
 
-    - `time` (S, E): from the experiments' beginning, the moment at which the limit cycle passes
-      section 0, in the model's unit of time; NaN beyond the last event.
+    - `time` (S, E): time since the limit cycle passes section 0 at the start of the experiment, in
+      the model's unit; NaN beyond the last event.
     - `event` (S, E): indices into `names`, -1 beyond the last event.
-    - `sample` (S, E): the event lies between samples i and i + 1, sections i and i + 1 counted
-      from the beginning; -1 beyond the last event.
-    - `cycle_time` (C,), `cycle_event` (C,): the same of one period of the limit cycle itself, from
-      section 0 on.
-    - `period`: of the limit cycle. `n_sections`: N. `names`: of the system's transitions.
+    - `sample` (S, E): index i of the last sample before the event, counted from the start of the
+      experiment; -1 beyond the last event.
+    - `cycle_time` (C,), `cycle_event` (C,): times and indices of the events in one period of the
+      limit cycle, from section 0 on.
+    - `period`: period of the limit cycle. `n_sections`: N. `names`: names of the transitions.
     """
 
     time: Float[np.ndarray, "S E"]
@@ -53,8 +53,8 @@ class EventTimes(eqx.Module):
 
     def __repr__(self) -> str:
         counts = ((int(np.sum(self.event == k)), name) for k, name in enumerate(self.names))
-        found = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
-        return f"EventTimes({len(self.time)} experiments: {found})"
+        text = ", ".join(f"{count} {name}" for count, name in counts if count) or "no events"
+        return f"EventTimes({len(self.time)} experiments: {text})"
 
     @property
     def count(self) -> Int[np.ndarray, " S"]:
@@ -63,17 +63,17 @@ class EventTimes(eqx.Module):
 
     @property
     def deviations(self) -> Float[np.ndarray, "S E"]:
-        """How much later events are than on the limit cycle, event by event from section 0 on; NaN
-        where another event happened than on the cycle, and beyond the last event."""
+        """Delays relative to the events of the limit cycle, event by event from section 0 on; NaN
+        where the cycle has another event, and beyond the last event."""
         E, C = self.time.shape[1], len(self.cycle_time)
         if C == 0:
             return np.full(self.time.shape, np.nan)
-        turn, place = np.divmod(np.arange(E), C)
-        expected = self.cycle_time[place] + turn * self.period
+        cycle, place = np.divmod(np.arange(E), C)
+        expected = self.cycle_time[place] + cycle * self.period
         return np.where(self.event == self.cycle_event[place], self.time - expected, np.nan)
 
     def of(self, experiment: Index) -> list[ExperimentEvent]:
-        """The events of one experiment, in order.
+        """Return the events of one experiment, in order.
 
         **Raises:** `DefinitionError` for an experiment that does not exist.
         """
@@ -102,17 +102,17 @@ class EventList(NamedTuple):
 
 
 def in_order(log: IntervalEvents, n_sections: int, period: float) -> EventList:
-    """Events one after the other from those between sections, without gaps."""
+    """Return the events between sections as one list per experiment, without gaps."""
     time, event, count = (np.asarray(x) for x in log)
     S, n, K = time.shape
     sample = np.broadcast_to(np.arange(n)[:, None], (n, K))
     time = time.astype(float) + (sample // n_sections) * period
-    here = (np.arange(K) < count[..., None]).reshape(S, n * K)
-    first = np.argsort(~here, axis=1, kind="stable")[:, : here.sum(axis=1).max(initial=0)]
-    kept = np.take_along_axis(here, first, axis=1)
+    valid = (np.arange(K) < count[..., None]).reshape(S, n * K)
+    first = np.argsort(~valid, axis=1, kind="stable")[:, : valid.sum(axis=1).max(initial=0)]
+    kept = np.take_along_axis(valid, first, axis=1)
 
-    def listed(x, beyond):
+    def in_rows(x, fill):
         x = np.broadcast_to(x, (S, n, K)).reshape(S, n * K)
-        return np.where(kept, np.take_along_axis(x, first, axis=1), beyond)
+        return np.where(kept, np.take_along_axis(x, first, axis=1), fill)
 
-    return EventList(listed(time, np.nan), listed(event, -1).astype(int), listed(sample, -1))
+    return EventList(in_rows(time, np.nan), in_rows(event, -1).astype(int), in_rows(sample, -1))

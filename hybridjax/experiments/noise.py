@@ -1,16 +1,21 @@
-"""Noise of any color: a random input beside the excitation, errors of what is measured."""
+"""Noise in experiments: random inputs, simulated linear models with them, errors of measurement."""
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Literal
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index, NonNegative, SectionCount, Seed
+from .._core.boundary.kinds import Index, NonNegative, Numbers, SectionCount, Seed
 from .._core.boundary.values import Reals
 from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
+from .data import ExperimentData
+from .design.design import DISCARD, Design
 
 
 @checked
@@ -22,12 +27,12 @@ class ProcessNoise:
 
     **Fields:**
 
-    - `std`: its standard deviation, in units of the inputs; one number, or N of them, by section
-      (the noise is then cyclostationary).
-    - `seed`.
-    - `memory`: its correlation time in cycles, with which its correlation $e^{-k / (N \tau)}$ from
-      a section to the k-th after it falls; 0 for white noise. It has run forever when an
-      experiment begins.
+    - `std`: standard deviation, in units of the inputs; one number, or N of them, by section (the
+      noise is then cyclostationary).
+    - `seed`: of the random numbers. Default: 0.
+    - `memory`: correlation time in cycles. The correlation of noise k sections apart is
+      $e^{-k / (N \tau)}$. The noise is stationary from the start of an experiment on. Default: 0,
+      white noise.
     """
 
     std: Annotated[Numbers, Reals(sign="nonnegative")]
@@ -47,10 +52,11 @@ class ProcessNoise:
     def draw(
         self, shape: tuple[int, ...], n_sections: SectionCount, first: Index = 0
     ) -> Float[np.ndarray, "S n nu"]:
-        """The noise of some experiments of a set, which begin at section 0.
+        """Return the noise of consecutive experiments of a set, which begin at section 0.
 
-        **Arguments:** `shape`, experiments first; `n_sections`, N; `first`, the number of the first
-        one in the set: each has noise of its own, in whatever parts the set is run.
+        **Arguments:** `shape`: (S, n, nu). `n_sections`: N. `first`: index of the first experiment
+        in the set. The noise of an experiment depends on its index only, so a set can be run in
+        parts.
 
         **Raises:** `DefinitionError` for a `std` of another number of sections.
         """
@@ -63,7 +69,7 @@ class ProcessNoise:
         return std * with_memory(white, self.memory, n_sections)
 
     def require(self, n_sections: SectionCount) -> None:
-        """**Raises:** `DefinitionError` if `std` is one for each section, and these are not N."""
+        """**Raises:** `DefinitionError` if `std` has entries for another number of sections."""
         if np.shape(self.std) not in ((), (n_sections,)):
             raise DefinitionError(
                 f"`process_noise` has a `std` for each of {np.size(self.std)} sections, but the "
@@ -74,12 +80,104 @@ class ProcessNoise:
 def with_memory(
     white: Float[np.ndarray, "S n k"], memory: float, n_sections: int
 ) -> Float[np.ndarray, "S n k"]:
-    """Series of the same variance, stationary, with a correlation time of `memory` cycles."""
+    """Return stationary series of the same variance, with a correlation time of `memory` cycles."""
     if memory == 0 or white.shape[1] == 0:
         return white
     from scipy.signal import lfilter  # takes long to import
 
     step = np.exp(-1 / (n_sections * memory))
     fresh = np.sqrt(-np.expm1(-2 / (n_sections * memory)))
-    found, _ = lfilter([fresh], [1, -step], white[:, 1:], axis=1, zi=step * white[:, :1])
-    return np.concatenate([white[:, :1], found], axis=1)
+    later, _ = lfilter([fresh], [1, -step], white[:, 1:], axis=1, zi=step * white[:, :1])
+    return np.concatenate([white[:, :1], later], axis=1)
+
+
+@checked
+def simulate_experiments(
+    ldtp: LDTP,
+    design: Design,
+    *,
+    discard: Index | None = None,
+    start: Literal["cycle", "periodic"] = "cycle",
+    process_noise: ProcessNoise | None = None,
+) -> ExperimentData:
+    """Run a design on a linear periodic model, from section 0.
+
+    **Arguments:**
+
+    - `ldtp`: the model. `design`: for the same N and number of inputs.
+    - `start`: "cycle" starts at zero, which is the limit cycle, so that a transient decays during
+      the first cycles; "periodic" starts in the periodic response, without a transient.
+    - `discard`: cycles before the window of P periods. Default: 20 from the cycle (as in the
+      paper), 0 from a periodic start.
+    - `process_noise`: a random input beside the excitation, which is not recorded.
+
+    **Returns:** `ExperimentData` with `discard + P` cycles.
+
+    **Raises:** `DefinitionError` if N (also of the process noise) or the number of inputs differ,
+    or if a periodic response does not exist (a multiplier that is a P-th root of one).
+    """
+    if ldtp.n_sections != design.n_sections or len(ldtp.inputs) != len(design.input_names):
+        raise DefinitionError(
+            f"the design is for N = {design.n_sections} and {len(design.input_names)} inputs, the "
+            f"model has N = {ldtp.n_sections} and {len(ldtp.inputs)}."
+        )
+    if discard is None:
+        discard = DISCARD if start == "cycle" else 0
+    u = applied = design.inputs(design.periods + discard)
+    x0 = ldtp.periodic_states(design.inputs(), design.periods) if start == "periodic" else None
+    if process_noise is not None:
+        applied = u + process_noise.draw(u.shape, design.n_sections)
+    return ExperimentData(
+        u,
+        _simulate(ldtp, jnp.asarray(applied), x0),
+        n_sections=design.n_sections,
+        periods=design.periods,
+        inputs=ldtp.inputs,
+        outputs=ldtp.outputs,
+    )
+
+
+@eqx.filter_jit
+def _simulate(
+    ldtp: LDTP, u: Float[Array, "S n nu"], x0: Float[Array, "S d"] | None
+) -> Float[Array, "S n ny"]:
+    return jax.vmap(ldtp.simulate)(u, x0)
+
+
+@checked
+def add_noise(
+    data: ExperimentData,
+    *,
+    std: Annotated[Numbers, Reals(sign="nonnegative")] | None = None,
+    snr: float | None = None,
+    memory: NonNegative = 0.0,
+    seed: Seed = 0,
+) -> ExperimentData:
+    """Add measurement noise to all outputs of all samples, independent from output to output.
+
+    **Arguments:**
+
+    - `std`: standard deviation, one number, one for each output, or (N, ny) also by section; or
+    - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
+      all samples and OK experiments) and of the noise, in dB, for each output.
+    - `memory`: correlation time in cycles, as in `ProcessNoise`. Default: 0, white noise.
+    - `seed`: of the random numbers. Default: 0.
+
+    **Raises:** `DefinitionError` unless exactly one of `std` and `snr` is given, with a shape that
+    fits the outputs and sections.
+    """
+    if snr is not None and std is None:
+        if not data.ok.any():
+            raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
+        std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
+    elif std is None or snr is not None:
+        raise DefinitionError("add_noise needs either `std` or `snr`.")
+    N, ny = data.n_sections, data.y.shape[2]
+    if np.shape(std) not in ((), (ny,), (N, ny)):
+        raise DefinitionError(
+            f"`std` must be one number or {ny}, one for each output, or of shape ({N}, {ny}), not "
+            f"{std}."
+        )
+    white = np.random.default_rng(seed).normal(size=data.y.shape)
+    each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])
+    return eqx.tree_at(lambda d: d.y, data, data.y + each * with_memory(white, memory, N))

@@ -4,15 +4,16 @@ import dataclasses
 from typing import Annotated
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Numbers
+from .._core.boundary.kinds import Numbers, Positive
 from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.text import listed
-from ..engine.settings import EXPERIMENT
+from ..engine.settings import EXPERIMENT, STEADY_START
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
@@ -20,19 +21,21 @@ from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
 from .flow_batch import Response, course, flow_batch
-from .stepping.plan import Accuracy, Stepping, plan_flow
+from .plan import Accuracy, Stepping, plan_flow
+from .start import settle
 
 
-# Steps that a derivative remembers: between two sections at least, and in a period of the cycle.
-# Twice as many need twice the memory, and let experiments go ways that need more steps.
+# Steps that a derivative may use between two sections, and in a period of the cycle. Fewer:
+# experiments far from the cycle fail at the limit on steps. More: derivatives need more memory.
 _STEPS, _STEPS_PER_PERIOD = 32, 1024
 
 
 @checked_methods
 class ResponseFunction(eqx.Module):
-    """From inputs held between sections to outputs at the sections; see `response_function`.
+    """A map from inputs that are held between sections to outputs at the sections; see
+    `response_function`.
 
-    **Fields:** `placed`, the sections; `stepping`, how to step between them; `outputs`.
+    **Fields:** `placed`: the sections. `stepping`: tolerances and step schedule. `outputs`.
     """
 
     placed: PlacedSections
@@ -53,25 +56,22 @@ class ResponseFunction(eqx.Module):
         start: Float[Array, "m S"] | None = None,
         system: HybridSystem | None = None,
     ) -> Response:
-        """**Arguments:** `u`, held from sample to sample, with n a multiple of the N sections;
-        `start`, times and states (padded with zeros) on section 0, by default the cycle's;
-        `system`, one with other parameters: the sections stay where they are.
+        """Return the response of S experiments.
+
+        **Arguments:**
+
+        - `u`: inputs, held from sample to sample, with n a multiple of the N sections.
+        - `start`: times and states (padded with zeros) on section 0. Default: those of the cycle.
+        - `system`: a system with other parameter values. The sections do not move with it.
 
         **Returns:** a `Response`: outputs `y` (S, n, ny) (not deviations), `result` (S,) codes,
-        `failed_at` (S,), estimates `error` (S,), and where experiments `end` (S, m). Nothing is
-        raised for experiments that fail.
+        `failed_at` (S,), error estimates `error` (S,), and final states `end` (S, m). Experiments
+        that fail raise no error.
 
         **Raises:** `DefinitionError` for inputs of another shape.
         """
         require_x64(system)
-        u = jnp.asarray(u, float)
-        N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
-        if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
-            raise DefinitionError(
-                f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple "
-                f"of the {N} sections; got {u.shape}."
-            )
-        placed = self.placed
+        u, placed = self._inputs(u), self.placed
         if system is not None:
             placed = eqx.tree_at(lambda x: x.cycle.system, placed, system)
         if start is None:
@@ -79,6 +79,77 @@ class ResponseFunction(eqx.Module):
         return flow_batch(
             course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
         )
+
+    def steady_start(
+        self,
+        u: Annotated[Numbers, Reals("S n nu")],
+        system: HybridSystem | None = None,
+        *,
+        accuracy: Positive = STEADY_START,
+    ) -> Float[Array, "m S"]:
+        r"""Return the starts from which responses repeat with their inputs.
+
+        ```python
+        start = response.steady_start(u)
+        y = response(u, start).y        # periodic from the first sample on
+        ```
+
+        A start is a zero of $F(x) - x$, with F the nonlinear response over one window of the input,
+        found by Newton's method with the exact Jacobian. Its derivatives with respect to inputs and
+        parameters follow from $(I - F_x)\, dx = F_\theta\, d\theta$ at the solution, in both modes,
+        and under `jit`. `run_experiments(start="steady")` computes it for data without derivatives.
+
+        **Arguments:**
+
+        - `u`: one window of the input, with n a multiple of N.
+        - `system`: a system with other parameter values. The sections do not move with it.
+        - `accuracy`: of the start, relative to the sizes of time and states. Default: 1e-10.
+
+        **Returns:** times and states on section 0, (m, S); NaN for experiments that fail or have no
+        such start nearby.
+
+        **Raises:** `DefinitionError` for inputs of another shape.
+        """
+        require_x64(system)
+        u, m = self._inputs(u), 1 + self.placed.lanes.q.shape[0]
+        cycle = self.placed.section_zero[:, None]
+        # Time is a state on state-based sections of clocked systems only.
+        moves = jnp.ones((m, 1)).at[0].set(jnp.where(self.placed.time_is_state[0], 1.0, 0.0))
+        silent = dataclasses.replace(self, outputs=())
+
+        def defect(x, u, system):
+            return (silent(u, x, system).end.T - x) * moves
+
+        def newton(x, u, system):
+            def column(e):
+                direction = jnp.broadcast_to(e[:, None], x.shape)
+                return jax.jvp(lambda x: defect(x, u, system), (x,), (direction,))
+
+            values, slopes = jax.lax.map(column, jnp.eye(m))
+            slope = jnp.transpose(slopes, (2, 1, 0)) - jnp.diag(1 - moves[:, 0])
+            return solve(slope, values[0]), slope
+
+        def solve(slope, defect):
+            return jnp.linalg.solve(slope, -defect.T[..., None])[..., 0].T
+
+        fixed = jax.lax.stop_gradient((u, system))
+        begin = jnp.broadcast_to(jax.lax.stop_gradient(cycle), (m, len(u)))
+        size = jnp.asarray(self.stepping.scales)[0][:, None]
+        blank = jnp.zeros((len(u), m, m))
+        settled = settle(lambda x: newton(x, *fixed), begin, size, accuracy, blank)
+        start = jnp.where(settled.change <= accuracy, settled.start, jnp.nan)
+        start, slope = jax.lax.stop_gradient((start, settled.slope))
+        return start + solve(slope, defect(start, u, system))
+
+    def _inputs(self, u: Numbers) -> Float[Array, "S n nu"]:
+        u = jnp.asarray(u, float)
+        N, nu = self.placed.n_sections, len(self.placed.cycle.system.inputs)
+        if u.ndim != 3 or u.shape[2] != nu or u.shape[1] % N or 0 in u.shape:
+            raise DefinitionError(
+                f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple "
+                f"of the {N} sections; got {u.shape}."
+            )
+        return u
 
 
 @checked
@@ -89,7 +160,8 @@ def response_function(
     *,
     accuracy: Accuracy = EXPERIMENT,
 ) -> ResponseFunction:
-    """What `run_experiments` computes, as a function for `jit`, `vmap`, `grad` and `jacfwd`.
+    """Return the computation of `run_experiments` as a function for `jit`, `vmap`, `grad` and
+    `jacfwd`.
 
     ```python
     response = hj.response_function(cycle, sections, ("yM", "vM"))
@@ -101,13 +173,14 @@ def response_function(
     ```
 
     It has exact derivatives with respect to inputs, start and parameters, in both modes. Reverse
-    mode stores the states at the sections and computes what lies between them again, so that its
-    memory grows by a few hundred bytes for each sample. Outputs of an experiment are NaN after it
-    failed: leave it out by `result` before a mean is taken.
+    mode stores the states at the sections and recomputes the flow between them, so its memory grows
+    by a few hundred bytes per sample. Outputs of an experiment are NaN after it failed: select
+    experiments by `result` before you average.
 
-    **Arguments:** as for `run_experiments`. The cycle may be unstable, where experiments are short.
+    **Arguments:** as for `run_experiments`. The cycle may be unstable if experiments are short.
 
-    **Raises:** `DefinitionError` for outputs, sections or an accuracy that do not exist.
+    **Raises:** `DefinitionError` for outputs or sections that do not exist, or an accuracy out of
+    range.
     """
     placed = as_placed(cycle, sections)
     z = placed.structure().resolve_outputs(outputs)

@@ -1,140 +1,150 @@
-"""Where experiments start: on the limit cycle, or in a periodic response."""
+"""Initial conditions of experiments: on the limit cycle, or in a periodic response."""
 
-import dataclasses
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Literal, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
-from .._core.execution import Execution
 from .._core.executor import from_host, to_host
 from .._core.memo import Memory
-from .._core.progress import counted
-from ..errors import ComputationError
+from ..engine.settings import Settings
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
 from ..sections.linearize import linearize
 from ..sections.placed import PlacedSections
 from ..systems.output import Output
-from .batches import in_batches
-from .flow_batch import Course
-from .options import StartName
-from .steady import Prediction
-from .stepping.plan import Stepping
+from .flow_batch import Course, flow_batch
+from .plan import Plan, Stepping
 
 
-@dataclasses.dataclass(frozen=True)
-class CycleStart:
-    """All experiments start on the limit cycle."""
+StartName = Literal["cycle", "periodic", "steady"]
 
-    name: ClassVar[StartName] = "cycle"
-    placed: PlacedSections
+# Newton steps. Fewer: large inputs have no steady start. More: it takes longer to report that there
+# is none.
+MOST_STEPS = 12
 
-    def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
-        """Times and states on section 0 in which experiments begin.
-
-        **Arguments:** their inputs, and the number of the first one of them in its set.
-        """
-        return np.repeat(_on_cycle(self.placed), len(u), axis=1)
+# A linear model has at least one output. This one is defined in every chart.
+_TIME = Output("t", lambda t, q, u: t)
+_linearized = Memory()
 
 
-@dataclasses.dataclass(frozen=True)
-class PeriodicStart:
-    """Experiments start in the periodic response that the linearization predicts.
-
-    **Fields:** `model`, the linearization at `placed`; `periods` of the window that repeats.
-    """
-
-    name: ClassVar[StartName] = "periodic"
-    placed: PlacedSections
-    model: LDTP
-    periods: int
-
-    def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
-        """As of `CycleStart`."""
-        embed = to_host(self.placed).frames()[0][0, :, : self.model.A.shape[1]]
-        x0 = self.model.periodic_states(self.window(u), self.periods)
-        return _on_cycle(self.placed) + embed @ np.asarray(x0).T
-
-    def window(self, u: Float[np.ndarray, "S n nu"]) -> Float[np.ndarray, "S window nu"]:
-        """The inputs of one window."""
-        return u[:, : self.periods * self.placed.n_sections]
-
-
-@dataclasses.dataclass(frozen=True)
-class SteadyStart:
-    """Experiments start in the periodic response itself, found from the predicted one.
-
-    **Fields:** `course`; `program`, `settle_batch` compiled; `stepping` and `execution`, how it is
-    run.
-    """
-
-    name: ClassVar[StartName] = "steady"
-    predicted: PeriodicStart
-    course: Course
-    stepping: Stepping
-    execution: Execution
-    program: Callable
-
-    def states(self, u: Float[np.ndarray, "S n nu"], first: int) -> Float[np.ndarray, "m S"]:
-        """As of `CycleStart`. Experiments that fail keep the predicted start.
-
-        **Raises:** `ComputationError` if no periodic response is found near the predicted one.
-        """
-        stepping = self.stepping
-        predicted, window = self.predicted.states(u, first), self.predicted.window(u)
-        prediction = self._prediction()
-
-        def arguments(some):
-            start, u = from_host((predicted[:, some], window[some]))
-            return self.course, stepping.plan, start, u, stepping.settings, prediction
-
-        parts = in_batches(self.program, arguments, len(u), self.execution)
-        batches = -(-len(u) // self.execution.batch) if self.execution.batch else None
-        parts = [part for _, part in counted(parts, "batches of steady starts", batches)]
-        start, change = (np.concatenate(x).astype(float) for x in zip(*parts, strict=True))
-        if (change > stepping.accuracy).any():
-            s = int(np.nanargmax(change))
-            raise ComputationError(
-                f"experiment {first + s}: no periodic response was found near the one that the "
-                f"linearization predicts (Newton's last step is {change[s]:.1e} of the state's "
-                "size): make the input smaller, or discard cycles instead."
-            )
-        return np.where(np.isnan(change), predicted, start.T)
-
-    def _prediction(self) -> Prediction:
-        placed, model = self.predicted.placed, self.predicted.model
-        embed, back = (x[0] for x in to_host(placed).frames())
-        phi = monodromy(to_host(model.A))
-        power, d = np.linalg.matrix_power(phi, self.predicted.periods), len(phi)
-        gain = embed[:, :d] @ np.linalg.solve(np.eye(d) - power, power) @ back[:d]
-        moves = np.ones((len(gain), 1))
-        moves[0] = to_host(placed).time_is_state[0]
-        size = self.stepping.scales[0][:, None]
-        return from_host(Prediction(gain, size, moves, np.array(self.stepping.accuracy)))
-
-
-Start = CycleStart | PeriodicStart | SteadyStart
-
-
-def predict_start(placed: PlacedSections, periods: int) -> PeriodicStart:
-    """The periodic start for windows of so many periods; linearizes once for placed sections.
+def linearized(placed: PlacedSections) -> LDTP:
+    """Return the linearization from which starts are predicted, computed once for placed sections.
 
     **Raises:** as `linearize`.
     """
-    model = _linearized.recall(
-        placed, None, lambda: linearize(placed.cycle, placed, outputs=[_TIME])
-    )
-    return PeriodicStart(placed, model, periods)
+    make = lambda: linearize(placed.cycle, placed, outputs=[_TIME])  # noqa: E731
+    return _linearized.recall(placed, None, make)
 
 
-_linearized = Memory()
-# Starts need no outputs, but a linear model has one at least; this one is defined everywhere.
-_TIME = Output("t", lambda t, q, u: t)
+def periodic_start(
+    placed: PlacedSections, model: LDTP, window: Float[np.ndarray, "S n nu"]
+) -> Float[np.ndarray, "m S"]:
+    """Return times and states on section 0 in the periodic response that `model` predicts to inputs
+    that repeat the `window`."""
+    embed = to_host(placed).frames()[0][0, :, : model.A.shape[1]]
+    x0 = model.periodic_states(window, window.shape[1] // placed.n_sections)
+    return on_cycle(placed) + embed @ np.asarray(x0).T
 
 
-def _on_cycle(placed: PlacedSections) -> Float[np.ndarray, "m 1"]:
-    """Time and state of the limit cycle on section 0."""
+def on_cycle(placed: PlacedSections) -> Float[np.ndarray, "m 1"]:
+    """Return the time and the state of the limit cycle on section 0."""
     lanes = placed.lanes
     return np.concatenate([np.asarray(lanes.t)[None], np.asarray(lanes.q)])[:, :1]
+
+
+class Prediction(NamedTuple):
+    """The linearization of the map from a start to the state one window later."""
+
+    gain: Float[Array, "m m"]
+    r"""$(I - \Phi^P)^{-1} \Phi^P$ in times and states: Newton's step is the defect plus `gain`
+    times the defect."""
+    size: Float[Array, "m 1"]
+    """Characteristic magnitudes of time and states."""
+    moves: Float[Array, "m 1"]
+    """0 for the time where it is no state, else 1."""
+    accuracy: Float[Array, ""]
+
+
+def predict(placed: PlacedSections, model: LDTP, stepping: Stepping, periods: int) -> Prediction:
+    """Return the linearization over a window of `periods` periods."""
+    embed, back = (x[0] for x in to_host(placed).frames())
+    phi = monodromy(to_host(model.A))
+    power, d = np.linalg.matrix_power(phi, periods), len(phi)
+    gain = embed[:, :d] @ np.linalg.solve(np.eye(d) - power, power) @ back[:d]
+    moves = np.ones((len(gain), 1))
+    moves[0] = to_host(placed).time_is_state[0]
+    size = stepping.scales[0][:, None]
+    return Prediction(*from_host((gain, size, moves, np.array(stepping.accuracy))))
+
+
+def settle_batch(
+    course: Course,
+    plan: Plan,
+    start: Float[Array, "m S"],
+    u: Float[Array, "S n nu"],
+    settings: Settings,
+    predicted: Prediction,
+) -> tuple[Float[Array, "S m"], Float[Array, " S"]]:
+    r"""Return starts whose responses to the repeated window `u` are periodic, and the last Newton
+    steps relative to the sizes of the states.
+
+    The Jacobian is that of the linearization, $\Phi^P$, as accurate as the response is linear.
+    """
+
+    def step(x):
+        defect = (flow_batch(course, plan, x, u, settings).end.T - x) * predicted.moves
+        return defect + predicted.gain @ defect, None
+
+    settled = settle(step, start, predicted.size, predicted.accuracy)
+    return settled.start.T, settled.change
+
+
+class NewtonState(NamedTuple):
+    """The iterate of Newton's method for S experiments."""
+
+    start: Float[Array, "m S"]
+    """Times and states on section 0."""
+    change: Float[Array, " S"]
+    """The last step, relative to the sizes of the states; NaN for experiments that failed."""
+    slope: Float[Array, "S m m"] | None
+    """The derivatives of that step, if `step` returns them."""
+
+
+def settle(
+    step: Callable[[Float[Array, "m S"]], tuple[Float[Array, "m S"], Array | None]],
+    start: Float[Array, "m S"],
+    size: Float[Array, "m #S"],
+    accuracy: float | Float[Array, ""],
+    slope: Float[Array, "S m m"] | None = None,
+) -> NewtonState:
+    """Iterate Newton's method in all experiments until no step exceeds `accuracy` times `size`. An
+    experiment that has converged is not changed any more.
+
+    **Arguments:** `step` returns Newton's step and its derivatives or None; `slope`: an array of
+    the shape of these derivatives.
+    """
+
+    def unfinished(carry):
+        settled, k = carry
+        return (k < MOST_STEPS) & jnp.any(settled.change > accuracy)
+
+    def advance(carry):
+        settled, k = carry
+        active = settled.change > accuracy  # False where the change is NaN
+        move, slope = step(settled.start)
+        change = jnp.max(jnp.abs(move) / size, axis=0)
+        new = NewtonState(settled.start + move, change, slope)
+        return jax.tree_util.tree_map(lambda x, y: _choose(active, x, y), new, settled), k + 1
+
+    begin = NewtonState(start, jnp.full(start.shape[1], jnp.inf), slope)
+    return jax.lax.while_loop(unfinished, advance, (begin, 0))[0]
+
+
+def _choose(active: Bool[Array, " S"], x: Array, y: Array) -> Array:
+    """Return `x` for active experiments, else `y`. Experiments are the first of three axes, or the
+    last of one or two."""
+    return jnp.where(active[:, None, None] if x.ndim == 3 else active, x, y)

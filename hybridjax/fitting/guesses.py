@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.pieces.blocks import Blocks
 from .._core.pieces.description import array_digest, digest_of, versions
-from .._core.pieces.layout import Constant, Layout, Variable
-from .._core.pieces.place import filled
+from .._core.pieces.run import DaskClient, fill
+from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.results import Result
 from ..engine.describe import describe
 from ..orbits.cycle import LimitCycle, rough
@@ -71,33 +70,27 @@ class Guesses:
         return find_limit_cycle(system, near, throw=False)
 
     def all(self, store: Any, client: Any) -> Tried:
-        """What becomes of all of them, by workers or in a store; see `fit_model`."""
+        """Return the results of all guesses, by workers or in a store; see `fit_model`."""
+        data = fill(self, store, client).dataset()
+        return Tried(*(data[name].values for name in Tried._fields))
+
+    def begin(self, client: DaskClient | None) -> tuple["Guesses", Layout]:
+        """Return the job, and the form of its results."""
         S, p = self.x.shape
-        description = self.describe()
-
-        def begin():
-            names = np.array(self.problem.parameters.names)
-            variables = {
-                "fitted": Variable("<f8", ("parameter",), (p,)),
-                "cost": Variable("<f8"),
-                **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
-            }
-            constants = {"parameter": Constant(("parameter",), names)}
-            blocks = Blocks((S,), (1,))
-            layout = Layout(("guess",), blocks, variables, constants, ("parameter",), description)
-            return self, layout, self.arrays()
-
-        def again(layout: Layout, start: list[np.ndarray]):
-            return self.restored(start)
-
-        found = filled(begin, again, description, store, client, (0, 1)).dataset()
-        return Tried(*(found[name].values for name in Tried._fields))
+        variables = {
+            "fitted": Variable("<f8", ("parameter",), (p,)),
+            "cost": Variable("<f8"),
+            **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
+        }
+        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names))}
+        blocks, about = Blocks((S,), (1,)), self.description
+        return self, Layout(("guess",), blocks, variables, constants, ("parameter",), about)
 
     def arrays(self) -> list[np.ndarray]:
         """What was computed before the first guess was tried."""
         return [np.asarray(x) for x in jax.tree_util.tree_leaves(self._computed()[0])]
 
-    def restored(self, arrays: list[np.ndarray]) -> "Guesses":
+    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "Guesses":
         """With these numbers of another call."""
         own, rest = self._computed()
         own = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(own), arrays)
@@ -107,8 +100,9 @@ class Guesses:
     def _computed(self) -> Any:
         return eqx.partition((self.problem, self.near), eqx.is_array)
 
-    def describe(self) -> dict[str, Any]:
-        """What makes these fits what they are."""
+    @property
+    def description(self) -> dict[str, Any]:
+        """JSON from which these fits can be told from others."""
         parameters = self.problem.parameters
         return {
             "kind": "guesses",

@@ -20,9 +20,9 @@ from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.flow_batch import course, flow_batch
+from ..experiments.plan import Plan
 from ..experiments.response_function import response_function
-from ..experiments.stepping.plan import Plan
-from ..identify.multipliers.error_weights import check_values, error_weights
+from ..identify.htf_errors import check_values, error_weights
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..sections.abstract import AbstractSections

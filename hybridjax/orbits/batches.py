@@ -21,71 +21,80 @@ from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import toward, until
 from ..systems.system import HybridSystem
 from .coincidence import together
-from .crossing import AtEvent, ListLevels
+from .crossing import AtEvent, to_section
 from .newton import excess, newton_steps
 from .return_map import ReturnMap, Turn
 
 
-# Periods for which a system flows freely before Newton tries again. Doubled, slower transients die
-# out, and each failure takes twice as long.
+# Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
+# remain. More: each failure takes longer.
 _SETTLE = 40
+# Newton steps before a system is given up, or tried again. Fewer: distant cycles are lost. More:
+# hopeless systems cost more.
+_NEWTON = 6
+# Newton steps before a system waits for those that need more steps than most. More: calls run for
+# few of their systems. Fewer: most systems wait.
+_USUAL = 3
+# Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
+# get no slope. Smaller: slopes from rounding. Larger: slopes are biased.
+_RIDGE = 1e-12
+# Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
+# astray. Smaller: few are taken.
+_NEAR = 0.06
+# Largest number of parameters for which guesses from neighbors are quadratic: the number of terms
+# grows with its square. Larger: more neighbors are needed. Smaller: guesses are less accurate.
+_QUADRATIC = 4
 
 
-def _own(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
-    """The return map of a system, begun at the same phase of its own clock."""
-    own = map.at_phase_of(system)
+def _one(map: ReturnMap, system: HybridSystem, anchor: Lanes, expected) -> ReturnMap:
+    """The return map of one system, begun at the same phase of its own clock."""
+    map = map.at_phase_of(system)
     if map.base is not None:
-        own = dataclasses.replace(own, expected=expected)
-    anchor = eqx.tree_at(lambda x: x.t, anchor, own.anchor.t)
-    return dataclasses.replace(own, anchor=anchor)
+        map = dataclasses.replace(map, expected=expected)
+    return dataclasses.replace(map, anchor=anchor._replace(t=map.anchor.t))
 
 
 def _turn(systems, map: ReturnMap, anchor: Lanes, period, wanted):
     """One turn of every system from its anchor, with the Jacobian if it is `wanted`."""
 
-    def one(system, anchor, expected):
-        own = _own(map, system, anchor, expected)
-        turn = own.turn_with_jacobian(own.anchor.q[:, 0], wanted)
+    def turn(*system):
+        each = _one(map, *system)
+        turn = each.turn_with_jacobian(each.anchor.q[:, 0], wanted)
         events = turn.codes.ravel(), turn.times.ravel()
-        return own.anchor, own.expected, turn._replace(codes=None, times=None), *events
+        return each.anchor, each.expected, turn._replace(codes=None, times=None), *events
 
-    return eqx.filter_vmap(one)(systems, anchor, period)
+    return eqx.filter_vmap(turn)(systems, anchor, period)
 
 
 def _verdict(systems, map: ReturnMap, anchor: Lanes, period, turn: Turn):
-    """The anchors ready to be left, periods, and result codes."""
+    """The anchors at the beginning of a turn, periods, and result codes."""
 
-    def one(system, anchor, expected, turn):
-        own, q = _own(map, system, anchor, expected), anchor.q[:, 0]
-        period = own.expected if own.base is None else turn.period
-        return own.departure(q), period, own.judge(q, turn)
+    def judge(system, anchor, expected, turn):
+        each, q = _one(map, system, anchor, expected), anchor.q[:, 0]
+        period = each.expected if each.base is None else turn.period
+        return each.departure(q), period, each.judge(q, turn)
 
-    return eqx.filter_vmap(one)(systems, anchor, period, turn)
+    return eqx.filter_vmap(judge)(systems, anchor, period, turn)
 
 
 def _settled(systems, map: ReturnMap, anchor: Lanes, period):
-    """Where systems are after they have flowed freely for a while, at the guess's phase or
-    section (NaN for those that do not get there), and their expected periods."""
-    base = map.base
+    """The ends of a simulation, at the guess's phase or section (NaN for systems that do not get
+    there), and expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * _SETTLE, map.settings.scale)
 
-    def one(system, anchor, expected):
-        own = _own(map, system, anchor, expected)
-        s, anchor, expected = own.structure, own.anchor, own.expected
+    def settle(*system):
+        each = _one(map, *system)
+        s, anchor, expected = each.structure, each.anchor, each.expected
         u = jnp.zeros((s.nu, 1))
         moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
-        if base is not None:
-            at_event = isinstance(base, AtEvent)
-            event = s.transition_index(base.name) if at_event else -1
-            target = toward(jnp.full(1, jnp.inf), event, moved.lanes.t + 3 * expected)
-            if not at_event:
-                target = dataclasses.replace(target, levels=ListLevels((base,)))
+        if each.base is not None:
+            target = toward(jnp.full(1, jnp.inf), -1, moved.lanes.t + 3 * expected)
+            target = to_section(target, each.base, each.event)
             moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
-        anchor = eqx.tree_at(lambda x: (x.chart, x.q), anchor, (moved.lanes.chart, q))
-        return anchor, expected
+        return anchor._replace(chart=moved.lanes.chart, q=q), expected
 
-    return eqx.filter_vmap(one)(systems, anchor, period)
+    return eqx.filter_vmap(settle)(systems, anchor, period)
 
 
 class Programs(NamedTuple):
@@ -97,40 +106,22 @@ class Programs(NamedTuple):
 
 
 # For few systems, and for many.
-QUICK, FULL = (
-    Programs(*map(jit, (_turn, _verdict, _settled))) for jit in (quick_jit, eqx.filter_jit)
-)
-
-
-# Newton steps before a system is given up, or tried again. Doubled, hopeless systems cost twice as
-# much.
-_NEWTON = 6
-# Newton steps before a system is left until those that need more steps than most go on together.
-# Doubled, few of a call's systems are still going in its last steps.
-_USUAL = 3
-# Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
-# get no slope. Doubled, a few more do not.
-_RIDGE = 1e-12
-# A step with a guessed Jacobian is taken if it is at most this part of the states' sizes. Doubled,
-# more are taken, and more of them lead astray.
-_NEAR = 0.06
-# Up to this many parameters, guesses from neighbors are quadratic: their number of terms grows with
-# the square. Doubled, four times as many neighbors are needed.
-_QUADRATIC = 4
+QUICK = Programs(*map(quick_jit, (_turn, _verdict, _settled)))
+FULL = Programs(*map(eqx.filter_jit, (_turn, _verdict, _settled)))
 
 
 class Rounds(NamedTuple):
-    """What the last Newton step of S systems saw; S is the leading axis of every array."""
+    """The last Newton step of S systems; S is the leading axis of every array."""
 
     anchor: Lanes
     excess: Float[np.ndarray, " S"]
-    """Size of that step relative to the tolerance; infinite where the turn was too long, NaN where
-    it failed."""
+    """Size of that step relative to the tolerance; infinite for a turn that was too long, NaN for
+    one that failed."""
     period: Float[np.ndarray, " S"]
     turn: Turn
-    """Without the codes of events,"""
+    """Without the codes of events, which are in `codes`."""
     codes: Int[np.ndarray, "S E"]
-    """which stand here, filled up with -1."""
+    """Codes of events, padded with -1."""
     together: Bool[np.ndarray, " S"]
     """Whether two of them coincide."""
     result: Int[np.ndarray, " S"]
@@ -140,22 +131,22 @@ class Rounds(NamedTuple):
 class Known(NamedTuple):
     """Cycles of K other systems, from which guesses are taken."""
 
-    systems: HybridSystem
+    systems: HybridSystem | None
     """Their arrays have a leading axis of K systems."""
     anchor: Lanes
     period: Float[np.ndarray, " K"]
     jacobian: Float[np.ndarray, "K d d"]
-    """Of the return map less the identity, in each."""
+    """Jacobian of the return map less the identity, in each."""
     result: Int[np.ndarray, " K"]
 
 
 class Tiles(NamedTuple):
-    """How the systems are solved."""
+    """Systems, and how they are solved."""
 
     systems: HybridSystem
     """Their arrays have a leading axis of S systems."""
     map: ReturnMap
-    """That of the guess, with the settings asked for."""
+    """The return map of the guess, with the settings asked for."""
     size: int
     """Systems in one compiled call."""
     workers: int
@@ -166,8 +157,7 @@ class Tiles(NamedTuple):
     @property
     def parameters(self) -> Float[np.ndarray, "S p"]:
         """The numbers in which the systems differ, each in units of its spread; below them those of
-        the systems that are known. (What is not finite has no neighbors to learn from; it is taken
-        for the mean.)"""
+        the known systems. (Numbers that are not finite are replaced by the mean.)"""
         flat = _numbers(self.systems)
         if self.known is not None:
             flat = np.concatenate([flat, _numbers(self.known.systems)])
@@ -175,47 +165,42 @@ class Tiles(NamedTuple):
         count = np.maximum(good.sum(axis=0), 1)
         flat = np.where(good, flat - np.where(good, flat, 0.0).sum(axis=0) / count, 0.0)
         spread = np.sqrt((flat**2).sum(axis=0) / count)
-        if not spread.any():
-            return flat[:, :1]
-        return flat[:, spread > 0] / spread[spread > 0]
+        return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]
 
     def solve(self, S: int) -> Rounds:
-        """Newton for all systems: first for some, spread over all, from the cycles that are known
-        or the one guess there is, then for as many again from where their neighbors' cycles are,
-        and so on. Systems that fail begin again from the cycle of the nearest one that was found,
-        and in the end from where they are after flowing freely."""
-        parameters, known = self.parameters[:S], self.parameters[S:]
+        """Newton's method for all systems: first for a few, spread over all, from the known cycles
+        or the guess, then for as many again from the cycles of their neighbors, and so on. Systems
+        that fail begin again from the cycle of the nearest one that was found, then from the end of
+        a simulation."""
+        parameters, before = self.parameters[:S], self.parameters[S:]
         order = np.random.default_rng(0).permutation(S)
-        out = None
 
-        def guessed(rows, out, **options):
-            found = known, self.known
+        def neighbors(rows, out: Rounds | None, moved: bool = True):
+            """Guesses for some systems from the known cycles and those of the rounds so far."""
+            sources = [] if self.known is None else [(before, self.known._replace(systems=None))]
             if out is not None:
-                own = parameters[order[: len(out.result)]]
-                found = own, Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
-                if self.known is not None:
-                    found = (
-                        np.concatenate([own, known]),
-                        _join(found[1], self.known._replace(systems=None)),
-                    )
-            return self._by_neighbors(*found, parameters[rows], **options)
+                cycles = Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
+                sources.insert(0, (parameters[order[: len(out.result)]], cycles))
+            return self._by_neighbors(*_join(*sources), parameters[rows], moved)
 
         with working("cycles", S) as call:
+            if self.known is None:
+                call.done, rows = 0, order[: self.size]
+                with uncollected:  # the programs are compiled during this call
+                    out = self._settled(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
+            else:
+                out = None
             while (done := 0 if out is None else len(out.result)) < S:
                 call.done = done
                 more = slice(done, max(2 * done, self.size))
                 rows = order[more]
-                if out is None and self.known is None:
-                    with uncollected:  # here the programs are compiled
-                        given = self._given(len(rows))
-                        out = self._settled(rows, self._newton(rows, *given, _NEWTON))
-                    continue
                 rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
-                begin = self._first_step(rows, *guessed(rows, out))
+                begin = self._first_step(rows, *neighbors(rows, out))
                 part = self._newton(rows, *begin, _USUAL)
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
+        assert out is not None
         late = np.flatnonzero(out.excess > 1)
         if len(late):
             anchor, period = _pick((out.anchor, out.period), late)
@@ -223,7 +208,7 @@ class Tiles(NamedTuple):
             out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
         failed = np.flatnonzero(out.result != Result.OK)
         if len(failed) and (self.known is not None or len(failed) < S):
-            anchor, period, _ = guessed(order[failed], out, moved=False)
+            anchor, period, _ = neighbors(order[failed], out, moved=False)
             part = self._newton(order[failed], anchor, period, _NEWTON)
             better = part.result == Result.OK
             part = part._replace(steps=part.steps + out.steps[failed])
@@ -235,60 +220,60 @@ class Tiles(NamedTuple):
         return jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], count, 0), given)
 
     def _settled(self, rows, out: Rounds) -> Rounds:
-        """Another try for the systems that failed, from where they are after flowing freely."""
+        """Another attempt for the systems that failed, from the end of a simulation."""
         failed = np.flatnonzero(out.result != Result.OK)
         if not len(failed):
             return out
         begin = self._in_tiles(self.programs.settled, rows[failed], *self._given(len(failed)))
-        there = np.isfinite(begin[0].q).all(axis=(1, 2))
-        if not there.any():
+        arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
+        if not arrived.any():
             return out
-        failed, begin = failed[there], _pick(begin, there)
+        failed, begin = failed[arrived], _pick(begin, arrived)
         return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
 
-    def _by_neighbors(self, known, found: Known, wanted, moved: bool = True):
-        """The cycle of the nearest system, unless it should not be `moved` as those around it in
-        the same chart suggest: its anchor, its period, and the Jacobian there (NaN where nothing is
+    def _by_neighbors(self, parameters, cycles: Known, wanted, moved: bool):
+        """The cycle of the nearest system, `moved` as the cycles around it in the same chart
+        suggest, if so asked: its anchor, its period, and the Jacobian there (NaN if no cycle is
         known)."""
-        ok = np.flatnonzero(found.result == Result.OK)
+        ok = np.flatnonzero(cycles.result == Result.OK)
         if not len(ok):
-            blank = np.full((len(wanted), *found.jacobian.shape[1:]), np.nan)
+            blank = np.full((len(wanted), *cycles.jacobian.shape[1:]), np.nan)
             return *self._given(len(wanted)), blank
-        known = known[ok]
-        terms = _powers(known[:1]).shape[1]
-        _, near = cKDTree(known).query(wanted, min(2 * terms + 3, len(ok)))
+        parameters = parameters[ok]
+        terms = _powers(parameters[:1]).shape[1]
+        _, near = cKDTree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
-        anchor, period, jacobian = _pick((found.anchor, found.period, found.jacobian), ok)
+        anchor, period, jacobian = _pick((cycles.anchor, cycles.period, cycles.jacobian), ok)
         if not moved:
             return _pick((anchor, period, jacobian), first)
         flat = jacobian.reshape(len(ok), -1)
         values = np.concatenate([anchor.q[..., 0], period[:, None], flat], axis=1)
         same = anchor.chart[near] == anchor.chart[first][:, None]
-        apart = _powers(known[near] - known[first][:, None]) * same
+        apart = _powers(parameters[near] - parameters[first][:, None]) * same
         change = (values[near] - values[first][:, None]) * same
         across = apart.transpose(0, 2, 1)
         gram = across @ apart
         size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
         ridge = np.where(size > 0, _RIDGE * size, 1.0) * np.eye(gram.shape[-1])
         slope = np.linalg.solve(gram + ridge, across @ change)
-        guess = values[first] + (_powers(wanted - known[first])[:, None] @ slope)[:, 0]
+        guess = values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
         d = anchor.q.shape[1]
-        anchor = eqx.tree_at(lambda x: x.q, _pick(anchor, first), guess[:, :d, None])
+        anchor = _pick(anchor, first)._replace(q=guess[:, :d, None])
         return anchor, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
 
     def _first_step(self, rows, anchor: Lanes, period, jacobian):
-        """Newton's first step, with Jacobians that are guessed, where it is a small one."""
+        """The first Newton step, with Jacobians that are guessed, for systems with a small one."""
         if not np.isfinite(jacobian).any():
             return anchor, period
         anchor, period, turn, *_ = self._turn(rows, anchor, period, wanted=False)
         sizes, step = self._step_from(anchor, turn.residual, jacobian)
         small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
         q = anchor.q[..., 0] + np.where(small, step * sizes, 0.0)
-        return eqx.tree_at(lambda x: x.q, anchor, q[..., None]), period
+        return anchor._replace(q=q[..., None]), period
 
     def _newton(self, rows, anchor: Lanes, period, steps: int) -> Rounds:
-        """Newton's method; systems that are done make room for others."""
+        """Newton's method; systems that have converged make room for others."""
         out = self._step(rows, anchor, period)
         for _ in range(steps - 1):
             going = np.flatnonzero(out.excess > 1)
@@ -310,7 +295,8 @@ class Tiles(NamedTuple):
         extra = turn.closed & (turn.meetings > self.map.multiplicity)
         period[extra] = self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
         size[extra] = np.inf
-        anchor, once = eqx.tree_at(lambda x: x.q, anchor, q[..., None]), np.ones(len(rows), int)
+        once = np.ones(len(rows), int)
+        anchor = anchor._replace(q=q[..., None])
         return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
 
     def _step_from(self, anchor: Lanes, residual, jacobian):
@@ -321,33 +307,34 @@ class Tiles(NamedTuple):
 
     def _turn(self, rows, anchor: Lanes, period, wanted: bool = True):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
+
+        def events(turned):
+            anchor, expected, turn, codes, times = jax.tree_util.tree_map(np.asarray, turned)
+            at_event = isinstance(self.map.base, AtEvent)
+            begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
+            coincide = together(codes, times, begin, turn.period)
+            return anchor, expected, turn, front(codes), coincide
+
         options = (np.asarray(wanted),)
         return self._in_tiles(
-            self.programs.turn, rows, anchor, period, options=options, then=self._seen
+            self.programs.turn, rows, anchor, period, options=options, then=events
         )
-
-    def _seen(self, turned):
-        anchor, expected, turn, codes, times = jax.tree_util.tree_map(np.asarray, turned)
-        at_event = isinstance(self.map.base, AtEvent)
-        begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
-        return anchor, expected, turn, front(codes), together(codes, times, begin, turn.period)
 
     def _in_tiles(self, program, rows, *arguments, options=(), then=lambda x: x):
         """`program` for some systems, in calls of one size, so that there is one for all."""
-        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+        arrays, static = eqx.partition(self.systems, eqx.is_array)
 
         def of_tile(k):
-            some = np.arange(k, k + self.size) % len(rows)
-            systems = eqx.combine(_pick(arrays, rows[some]), rest)
-            return systems, self.map, *_pick(arguments, some), *options
+            tile = np.arange(k, k + self.size) % len(rows)
+            systems = eqx.combine(_pick(arrays, rows[tile]), static)
+            return systems, self.map, *_pick(arguments, tile), *options
 
-        def tile(k):
+        def run(k):
             return _pick(then(program(*of_tile(k))), slice(len(rows) - k))
 
         several = self.workers > 1 and len(rows) > self.size
         alone = not several or is_left_to_lapack(program, *of_tile(0))
-        found = in_threads(tile, range(0, len(rows), self.size), 1 if alone else self.workers)
-        return _join(*found)
+        return _join(*in_threads(run, range(0, len(rows), self.size), 1 if alone else self.workers))
 
 
 def _numbers(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
@@ -372,7 +359,8 @@ def _join(*parts):
 
 
 def _of_one_width(parts):
-    """Arrays with as many columns as the widest, filled up with -1 (codes of events)."""
+    """Codes of events with as many columns as the widest, padded with -1; other arrays as they
+    are."""
     width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
     if all(x.ndim != 2 or x.shape[1] == width for x in parts):
         return parts
@@ -381,7 +369,7 @@ def _of_one_width(parts):
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
-    """`out` with other values in some rows, which are written in place where they fit."""
+    """`out` with other values in some rows, which are written in place if they fit."""
 
     def put(x, y):
         x, y = _of_one_width((x, y))
@@ -392,7 +380,7 @@ def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
 
 
 def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
-    """Codes of events moved to the front of each row, and the columns without any left out."""
+    """Codes of events moved to the front of each row, without the columns that are empty."""
     row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
     count = np.bincount(row, minlength=len(codes))
     out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)

@@ -14,8 +14,8 @@ from .cycle import LimitCycle
 from .limit_cycles import LimitCycles
 
 
-# A multiplier is shown with a point if its modulus is this near to 1; critical ones are 1 to
-# rounding. Doubled, others that are all but critical are shown twice as often.
+# A multiplier is printed with a point if its modulus is this near to 1. Smaller: rounding hides
+# critical ones. Larger: others are printed, too.
 _ON_CIRCLE = 1e-6
 
 Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
@@ -23,7 +23,7 @@ KINDS = get_args(Kind)
 
 
 class BranchPoint(NamedTuple):
-    """Where a multiplier of a branch lies on the unit circle."""
+    """A point of a branch with a multiplier on the unit circle."""
 
     kind: str
     """"fold" (a multiplier +1: the branch turns back), "branch point" (+1: another branch crosses),
@@ -31,36 +31,36 @@ class BranchPoint(NamedTuple):
     index: int
     """Its row in the branch."""
     value: float
-    """Of the parameter."""
+    """The value of the parameter."""
     multipliers: Complex[np.ndarray, " r"]
     """The critical ones among them lie on the unit circle to rounding."""
 
     @property
     def critical(self) -> Complex[np.ndarray, " c"]:
-        """Those of the multipliers."""
+        """The multipliers on the unit circle."""
         return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < _ON_CIRCLE]
 
 
 class BranchEnd(NamedTuple):
-    """Why a branch ends where it does."""
+    """The end of a branch, and the reason."""
 
     value: float
-    """Of the parameter."""
+    """The value of the parameter."""
     result: Result
-    """`Result.OK` where the values end."""
+    """`Result.OK` at the end of the values."""
     message: str
 
 
 @checked_methods
 class Branch(eqx.Module):
-    """Limit cycles along one parameter, in the order in which the branch meets them.
+    """Limit cycles along one parameter, in their order on the branch.
 
     **Fields:**
 
-    - `parameter`: its name. `values` (K,): of it.
+    - `parameter`: its name. `values` (K,): its values.
     - `cycles`: the K cycles; `branch[k]` is one of them, with its system.
-    - `points`: where multipliers cross the unit circle, each a row of the branch of its own.
-    - `ends`: why the branch begins and ends where it does.
+    - `points`: points at which multipliers cross the unit circle, each a row of the branch.
+    - `ends`: the two ends of the branch, with their reasons.
     """
 
     parameter: str = eqx.field(static=True)
@@ -81,16 +81,14 @@ class Branch(eqx.Module):
 
     @remembered
     def multipliers(self) -> Complex[np.ndarray, "K r"]:
-        """Floquet multipliers of every cycle, the largest first, filled up with zeros."""
+        """Floquet multipliers of every cycle, by decreasing modulus, padded with zeros."""
         rows = [self[k].multipliers for k in range(len(self))]
-        out = np.zeros((len(rows), max(map(len, rows))), complex)
-        for row, values in zip(out, rows, strict=True):
-            row[: len(values)] = values
-        return out
+        width = max(map(len, rows))
+        return np.array([np.pad(x.astype(complex), (0, width - len(x))) for x in rows])
 
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
-        """Which cycles are stable. At a marked point itself this is left to rounding."""
+        """Whether each cycle is stable. At a marked point itself rounding decides."""
         return np.array([self[k].stable for k in range(len(self))])
 
     def largest(self, output: str) -> Float[np.ndarray, " K"]:
@@ -102,12 +100,13 @@ class Branch(eqx.Module):
 
     def summary(self) -> str:
         """One line for each marked point and each end."""
-        lines = [f"from {self.parameter} = {self.ends[0].value:.9g}: {self.ends[0].message}"]
+        begin, end = self.ends
+        lines = [f"from {self.parameter} = {begin.value:.9g}: {begin.message}"]
         for p in self.points:
-            on = p.critical
-            at = ", ".join(f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in on)
+            at = (f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.9g}" for z in p.critical)
+            at = ", ".join(at)
             lines.append(f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})")
-        lines.append(f"to {self.parameter} = {self.ends[1].value:.9g}: {self.ends[1].message}")
+        lines.append(f"to {self.parameter} = {end.value:.9g}: {end.message}")
         return "\n  ".join(lines)
 
     def __repr__(self):
@@ -118,18 +117,19 @@ class Branch(eqx.Module):
         largest = np.abs(self.multipliers).max(axis=1)
         marks = [p.index for p in self.points]
         rows = [
-            ("from", f"{self.ends[0].value:.9g}", self.ends[0].message),
-            *(
-                (p.kind, f"{p.value:.9g}", ", ".join(complex_number(z) for z in p.critical))
-                for p in self.points
-            ),
-            ("to", f"{self.ends[1].value:.9g}", self.ends[1].message),
+            (p.kind, f"{p.value:.9g}", ", ".join(complex_number(z) for z in p.critical))
+            for p in self.points
         ]
+        begin, end = (
+            (word, f"{x.value:.9g}", x.message)
+            for word, x in zip(("from", "to"), self.ends, strict=True)
+        )
         curves = [
             Curve(self.values[[0, -1]], np.ones(2), color=COLORS[-1]),
             Curve(self.values, largest),
             Curve(self.values[marks], largest[marks], color=COLORS[1], points=True),
         ]
         drawn = picture(curves, self.parameter, "largest modulus of multipliers")
-        of = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
-        return card("Branch", of, table(("", self.parameter, ""), rows), drawn)
+        title = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
+        rows = [begin, *rows, end]
+        return card("Branch", title, table(("", self.parameter, ""), rows), drawn)

@@ -1,4 +1,4 @@
-"""Continuation: a limit cycle followed along a parameter, by pseudo-arclength.
+"""Continuation of a limit cycle in a parameter, by pseudo-arclength.
 
 H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, 1977; Yu. A.
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
@@ -27,20 +27,21 @@ from .cycle import LimitCycle
 from .limit_cycles import LimitCycles, without_coincidences
 
 
-# A step is halved if the tangent turns by more than the angle of this cosine. (Twice the angle:
-# about half as many points.)
+# A step is halved if the tangent turns by more than the angle of this cosine. Nearer to 1: more
+# points than a plot needs. Smaller: the branch jumps over turns.
 _STRAIGHT = 0.97
-# The next step is longer if Newton needs at most this many. Doubled, it almost always is.
+# The next step is longer if Newton's method needs at most this many. More: steps grow until they
+# fail. Fewer: they stay short.
 _QUICK = 3
-# Where to look for a point instead, as parts of a step: beside a crossing of two branches.
+# Parts of a step by which a test function is evaluated beside a point where Newton's method fails,
+# as it does at a crossing of two branches.
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
-# Test functions below this are rounding errors. Doubled, points twice as close to a degenerate one
-# are not marked.
+# Test functions below this are rounding errors. Smaller: rounding marks points. Larger: points
+# close to a degenerate one are not marked.
 _ROUNDING = 1e-7
-# The first step, relative to the longest. Doubled, a branch is sometimes lost in its first step.
-_FIRST = 0.2
-# The shortest step, relative to the longest. Doubled, branches end twice as far from a grazing.
-_SHORTEST = 1e-5
+# The first and the shortest step, relative to the longest. A longer first step loses the branch; a
+# longer shortest one ends it far from a grazing, a shorter one takes time.
+_FIRST, _SHORTEST = 0.2, 1e-5
 
 
 @checked
@@ -53,11 +54,11 @@ def continuation(
     step: Share = 0.05,
     max_points: Count = 1000,
 ) -> Branch:
-    """Follow a limit cycle along a parameter, and mark where its stability changes.
+    """Continue a limit cycle in a parameter, and mark changes of its stability.
 
-    The branch is traced from the cycle both ways, until the first and the last of the values, by
+    The branch is computed from the cycle both ways, until the first and the last of the values, by
     pseudo-arclength: it may turn back in between. Points at which a multiplier crosses the unit
-    circle are located to rounding errors. Stable or not makes no difference.
+    circle are located to rounding errors. The cycle may be unstable.
 
     ```python
     branch = hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0))
@@ -66,50 +67,46 @@ def continuation(
 
     **Arguments:**
 
-    - `cycle`: where to begin. Its own value of the parameter lies within the values.
+    - `cycle`: the first cycle. Its own value of the parameter lies within the values.
     - `parameter`: the name of a parameter of the system; a part of a part has a path with dots,
         such as `"leg.k"`.
-    - `values`: two or more numbers, ascending or descending, from where to where. The branch has
-        a cycle at each of them, as often as it passes it, and others in between.
+    - `values`: two or more numbers, ascending or descending. The branch ends at the first and the
+        last, has a cycle at each of them, as often as it passes it, and others in between.
     - `step`: the longest step, as a part of the range of values and of the size of the states.
-    - `max_points`: give up after so many cycles each way.
+        Default: 0.05.
+    - `max_points`: largest number of cycles each way. Default: 1000.
 
-    **Returns:** a `Branch`. Nothing is raised where it ends before the values do: `ends` says why
-    (an event that grazes, is lost or comes out of order; no convergence even in the shortest step;
-    rest in place of a cycle).
+    **Returns:** a `Branch`. Nothing is raised if it ends before the values do: `ends` has the
+    reason (an event that grazes, is lost or comes out of order; no convergence even in the
+    shortest step; an equilibrium in place of a cycle).
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of them.
     """
     values = _check(cycle, values)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
-    own = curve.value_of(cycle.system)
-    low, high = values.min(), values.max()
-    if not low <= own <= high:
+    value = curve.value_of(cycle.system)
+    if not values.min() <= value <= values.max():
         raise DefinitionError(
-            f"the cycle has {parameter} = {own:.6g}, outside of the values {values[0]:.6g} to "
+            f"the cycle has {parameter} = {value:.6g}, outside of the values {values[0]:.6g} to "
             f"{values[-1]:.6g}: begin within them."
         )
-    first = curve.first(own)
+    first = curve.first(value)
     if isinstance(first, Failure):
         raise DefinitionError(
-            f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = {own:.6g}: "
-            f"{first.result.message}. Find it anew."
+            f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
+            f"{value:.6g}: {first.result.message}. Find it anew."
         )
+    trace = _Trace(curve, np.sort(values), step, max_points)
     sense = np.sign(values[-1] - values[0])
-    ways = []
-    for sign in (-sense, sense):
-        trace = _Trace(curve, np.sort(values), step, max_points)
-        ways.append(trace.run(first.oriented(sign)))
-    (back, marks_back, begin), (ahead, marks, end) = ways
-    points = [*back[:0:-1], *ahead]
-    shift = len(back) - 1
-    marks = [(shift - k, kind) for k, kind in reversed(marks_back)] + [
-        (shift + k, kind) for k, kind in marks
-    ]
+    back, marks_back, begin = trace.run(first.oriented(-sense))
+    ahead, marks, end = trace.run(first.oriented(sense))
+    points, shift = [*back[:0:-1], *ahead], len(back) - 1
+    marks = [*((-k, kind) for k, kind in reversed(marks_back)), *marks]
     cycles = _stack(curve, points)
     marked = tuple(
-        BranchPoint(kind, k, points[k].value, cycles[k].multipliers) for k, kind in marks
+        BranchPoint(kind, shift + k, points[shift + k].value, cycles[shift + k].multipliers)
+        for k, kind in marks
     )
     return Branch(parameter, np.array([p.value for p in points]), cycles, marked, (begin, end))
 
@@ -134,77 +131,73 @@ def _check(cycle, values) -> np.ndarray:
 
 
 class _Event(NamedTuple):
-    """Something on a segment of the curve: `where` of its length."""
+    """A marked point on a segment of the curve, at the part `where` of its length."""
 
     where: float
     kind: str
     point: Point
 
 
-class _Trace:
-    """One way along the curve."""
+class _Trace(NamedTuple):
+    """A curve between the least and the largest of some values, in steps."""
 
-    def __init__(self, curve: Curve, values: np.ndarray, step: float, max_points: int):
-        self.curve, self.values = curve, values
-        self.step, self.max_points = step, max_points
+    curve: Curve
+    values: np.ndarray
+    step: float
+    max_points: int
 
     def run(self, start: Point) -> tuple[list[Point], list[tuple[int, str]], BranchEnd]:
-        """The points, the marks (row, kind) among them, and why they end."""
+        """The points along a tangent, the marks (row, kind) among them, and the end."""
         points, marks, length, moved = [start], [], _FIRST * self.step, None
         low, high = self.values[0], self.values[-1]
-        if (start.value >= high and start.tangent[-1] > 0) or (
-            start.value <= low and start.tangent[-1] < 0
-        ):
+        upward = start.tangent[-1]
+        if (start.value >= high and upward > 0) or (start.value <= low and upward < 0):
             return points, marks, BranchEnd(start.value, Result.OK, "the values end")
         while len(points) < self.max_points:
-            here = points[-1]
-            say(f"{self.curve.parameter} = {here.value:.5g}, {len(points)} cycles")
-            there = self.curve.step(here, length)
-            over = not isinstance(there, Failure) and not low <= there.value <= high
+            last = points[-1]
+            say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
+            point = self.curve.step(last, length)
+            over = isinstance(point, Point) and not low <= point.value <= high
             if over:
-                there = self.curve.land(here, there, np.clip(there.value, low, high))
-            if not isinstance(there, Failure) and there.cosine(here) < _STRAIGHT:
-                there = Failure(Result.NOT_CONVERGED)
-            if isinstance(there, Failure):
+                point = self.curve.land(last, point, np.clip(point.value, low, high))
+            if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
+                point = Failure(Result.NOT_CONVERGED)
+            if isinstance(point, Failure):
                 length /= 2
                 if length >= _SHORTEST * self.step:
                     continue
-                if there.result in (Result.EVENT_ORDER, Result.GRAZING) and here is not moved:
-                    moved = self.curve.elsewhere(here)
+                if point.result in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
+                    moved = self.curve.elsewhere(last)
                     if moved is not None:
                         points[-1], length = moved, _FIRST * self.step
                         continue
-                return points, marks, BranchEnd(here.value, there.result, there.result.message)
-            for event in self.events(here, there):
+                return points, marks, BranchEnd(last.value, point.result, point.result.message)
+            for event in self.events(last, point):
                 if event.kind:
                     marks.append((len(points), event.kind))
                 points.append(event.point)
-            points.append(there)
+            points.append(point)
             if over:
-                return points, marks, BranchEnd(there.value, Result.OK, "the values end")
-            length = min(self.step, length * (1.5 if there.steps <= _QUICK else 1.0))
-        end = BranchEnd(
-            points[-1].value, Result.STEP_LIMIT, f"{self.max_points} cycles; `max_points` raises it"
-        )
-        return points, marks, end
+                return points, marks, BranchEnd(point.value, Result.OK, "the values end")
+            length = min(self.step, length * (1.5 if point.steps <= _QUICK else 1.0))
+        message = f"{self.max_points} cycles; `max_points` raises it"
+        return points, marks, BranchEnd(points[-1].value, Result.STEP_LIMIT, message)
 
-    def events(self, here: Point, there: Point) -> list[_Event]:
+    def events(self, a: Point, b: Point) -> list[_Event]:
         """Marked points and values between two neighbors, in order."""
-        found = []
+        marked = []
         for kind in KINDS:
-            before, after = here.tests[kind], there.tests[kind]
-            if max(abs(before), abs(after)) < _ROUNDING:
+            before, after = a.tests[kind], b.tests[kind]
+            if max(abs(before), abs(after)) < _ROUNDING or before * after >= 0:
                 continue
-            if before * after >= 0 or (kind == "branch point" and here.folds_before(there)):
-                continue
-            event = self.locate(here, there, kind)
-            if event is not None:
-                found.append(event)
-        found.sort(key=lambda event: event.where)
-        events, before = [], here
-        for event in [*found, _Event(1.0, "", there)]:
-            events += self.landings(before, event.point) + [event]
-            before = event.point
+            if kind == "branch point" and a.tests["fold"] * b.tests["fold"] < 0:
+                continue  # the parameter turns back
+            if (event := self.locate(a, b, kind)) is not None:
+                marked.append(event)
+        events, last = [], a
+        for event in [*sorted(marked, key=lambda event: event.where), _Event(1.0, "", b)]:
+            events += self.landings(last, event.point) + [event]
+            last = event.point
         return events[:-1]
 
     def landings(self, a: Point, b: Point) -> list[_Event]:
@@ -212,36 +205,33 @@ class _Trace:
         passed = [v for v in self.values if (a.value - v) * (b.value - v) < 0]
         passed.sort(key=lambda v: abs(v - a.value))
         points = [self.curve.land(a, b, v) for v in passed]
-        return [_Event(0.0, "", p) for p in points if not isinstance(p, Failure)]
+        return [_Event(0.0, "", p) for p in points if isinstance(p, Point)]
 
-    def locate(self, here: Point, there: Point, kind: str) -> _Event | None:
+    def locate(self, a: Point, b: Point, kind: str) -> _Event | None:
         """The zero of a test function between two points.
 
-        Where two branches cross no point can be found on the crossing itself, but beside it.
+        On the crossing of two branches itself no point can be computed, but beside it.
         """
-        seen, crossing = {0.0: here, 1.0: there}, False
+        points, crossing = {0.0: a, 1.0: b}, False
 
         def test(where):
             nonlocal crossing
-            if where not in seen:
-                for aside in _ASIDE:
-                    seen[where] = self.curve.between(here, there, where + aside)
-                    if not isinstance(seen[where], Failure):
-                        break
-                else:
-                    raise ArithmeticError
-                crossing |= aside != 0
-            return seen[where].tests[kind]
+            for aside in _ASIDE if where not in points else ():
+                point = self.curve.between(a, b, where + aside)
+                if isinstance(point, Point):
+                    points[where] = point
+                    crossing |= aside != 0
+                    break
+            return points[where].tests[kind]
 
         try:
             where = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=1e-14, maxiter=60)
             test(where)
-        except (ArithmeticError, RuntimeError):
+        except (KeyError, RuntimeError):
             return None
-        point = seen[where]
-        if kind == "Neimark-Sacker" and not point.has_pair_on_circle():
+        if kind == "Neimark-Sacker" and not points[where].has_pair_on_circle():
             return None  # two real multipliers with the product 1
-        return _Event(where, "branch point" if crossing else kind, point)
+        return _Event(where, "branch point" if crossing else kind, points[where])
 
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:

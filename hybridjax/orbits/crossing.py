@@ -1,5 +1,6 @@
-"""Single sections: where a function crosses a level, and the state after an event."""
+"""Single sections: the level set of a function, and the state after an event."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -10,10 +11,10 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Scalar, SignalNames
-from .._core.executor import Definition
+from .._core.executor import Definition, namespace
 from .._core.precision import real
 from .._core.text import fields
-from ..engine.target import AbstractLevels
+from ..engine.target import AbstractLevels, Target
 from ..systems.output import Output
 from ..systems.structure import Structure
 
@@ -32,8 +33,9 @@ class Crossing(Definition):
     - `function`: the name of a state, an output or a recorded signal; an `Output`; or a function
       (t, q) -> number.
     - `direction`: "falling" or "rising".
-    - `value`: the level, in the function's unit.
-    - `charts`: names of the charts in which it is crossed; by default all in which it is defined.
+    - `value`: the level, in the function's unit. Default: 0.
+    - `charts`: names of the charts in which it is crossed. Default: all in which the function is
+      defined.
     """
 
     function: str | Output | Callable[..., Any]
@@ -48,8 +50,8 @@ class Crossing(Definition):
         value: Scalar = 0.0,
         charts: SignalNames | None = None,
     ):
-        self.function, self.direction, self.charts = function, direction, charts
-        self.value = real(value)
+        self.function, self.direction, self.value = function, direction, real(value)
+        self.charts = None if charts is None else tuple(charts)
 
     def __str__(self):
         name = self.function
@@ -71,14 +73,13 @@ class Crossing(Definition):
         """Whether it can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
-        if isinstance(self.function, str | Output):
-            return s.resolve_outputs(self.function).defined(a)
-        return True
+        by_name = isinstance(self.function, str | Output)
+        return s.resolve_outputs(self.function).defined(a) if by_name else True
 
     def level(
         self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
     ) -> Float[Array, ""]:
-        """A function of one state of chart a that falls through zero at the section."""
+        """The level of one state of chart a: it falls through zero at the section."""
         if isinstance(self.function, str | Output):
             value = s.resolve_outputs(self.function)(a, t, q, jnp.zeros(s.nu))[0]
         else:
@@ -108,7 +109,7 @@ class AtEvent(eqx.Module):
 
 
 class ListLevels(AbstractLevels):
-    """The level functions of the crossings among some sections."""
+    """The level functions of the crossings in a list of sections."""
 
     items: tuple[Crossing | AtEvent, ...]
 
@@ -123,3 +124,11 @@ class ListLevels(AbstractLevels):
 
         branches = [lambda: jnp.ones(()), *(branch(x) for x in self.items)]
         return jax.lax.switch(i + 1, branches)
+
+
+def to_section(target: Target, section: Crossing | AtEvent | None, event: int = -1) -> Target:
+    """A target that ends on a section: at its level, or after the event of this index."""
+    if isinstance(section, Crossing):
+        return dataclasses.replace(target, levels=ListLevels((section,)))
+    xp = namespace(target.time)
+    return dataclasses.replace(target, event=xp.full(target.event.shape, event, xp.int32))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools as ft
+import itertools
 import operator
 from collections.abc import Iterable
 
@@ -9,41 +10,42 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Float
 
 from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..engine.lanes import Lanes
 from ..errors import DefinitionError
-from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
 from .newton import newton_steps
 from .return_map import ReturnMap, Turn, turn_product
 
 
-# Newton's steps before a point is given up. Doubled, hopeless ones take longer.
+# Newton steps before a point is given up. Fewer: long steps along the branch fail. More: hopeless
+# points last longer.
 _MOST = 8
 # Newton's method ends with a step this small, in sizes of the states; from the second number on,
-# rounding errors may be all that is left. Doubled, it sometimes ends one step earlier.
+# rounding errors may be all that is left. Smaller: it does not end. Larger: points are less
+# accurate.
 _SMALL, _ROUNDING = 1e-11, 1e-8
-# Singular values of Newton's equations below this part of the largest are zero. Doubled, points
-# twice as far from a crossing of branches are refused.
+# Singular values of Newton's equations below this part of the largest are zero. Larger: points near
+# a crossing of branches fail. Smaller: rounding is divided by.
 _SINGULAR = 1e-14
 # States that hardly move on the cycle count as if they moved by these parts of the largest move and
-# of their own size. Doubled, steps are up to twice as long.
+# of their own size. Smaller: they shorten the steps. Larger: steps are longer than the orbit.
 _FLOOR, _SHARE = 1e-3, 0.02
 # Nothing moves if the largest move is at most this part of the largest state, all in sizes.
-# Doubled, cycles twice as large are taken for an equilibrium.
+# Smaller: an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e-6
-# A multiplier is complex, and two are conjugate, up to these differences. Doubled, real pairs with
-# the product 1 that are so close are taken for a Neimark-Sacker point.
+# A multiplier is complex, and two are conjugate, up to these differences. Larger: real pairs with
+# the product 1 that are close are taken for a Neimark-Sacker point. Smaller: rounding hides one.
 _COMPLEX, _CONJUGATE = 1e-9, 1e-6
 
 
 @dataclasses.dataclass
 class Failure:
-    """Why there is no point."""
+    """The reason for a point that was not found."""
 
     result: Result
 
@@ -69,22 +71,18 @@ class Point:
 
     @property
     def value(self) -> float:
-        """Of the parameter."""
+        """The value of the parameter."""
         return float(self.z[-1])
 
     def oriented(self, sign: float) -> "Point":
-        """The same, with a tangent along which the parameter grows (or falls)."""
+        """The point with a tangent along which the parameter grows (or falls)."""
         same = self.tangent[-1] * sign >= 0
         return dataclasses.replace(self, tangent=self.tangent if same else -self.tangent)
 
     def cosine(self, other: "Point") -> float:
-        """Of the angle between two tangents."""
-        theirs = other.tangent * other.size / self.size
-        return float(self.tangent @ theirs / np.linalg.norm(theirs))
-
-    def folds_before(self, other: "Point") -> bool:
-        """Whether the parameter turns back between the two."""
-        return self.tests["fold"] * other.tests["fold"] < 0
+        """The cosine of the angle between two tangents."""
+        tangent = other.tangent * other.size / self.size
+        return float(self.tangent @ tangent / np.linalg.norm(tangent))
 
     @ft.cached_property
     def scaled(self) -> Float[np.ndarray, "d n"]:
@@ -97,28 +95,27 @@ class Point:
         return turn_product(self.turn.factors[None])[0, : self.dim, : self.dim]
 
     @ft.cached_property
-    def eigenvalues(self) -> Inexact[np.ndarray, " m"]:
-        return np.linalg.eigvals(self.monodromy)
+    def pairs(self) -> list[tuple[complex, complex]]:
+        """All pairs of multipliers."""
+        values = np.linalg.eigvals(self.monodromy).astype(complex)
+        return list(itertools.combinations(values, 2))
 
     @ft.cached_property
     def tests(self) -> dict[str, float]:
-        """Functions that change their signs where a multiplier crosses the unit circle."""
+        """Functions that change their signs when a multiplier crosses the unit circle."""
         M = self.monodromy
-        mu, n = self.eigenvalues, len(M)
-        pairs = [mu[i] * mu[j] - 1 for i in range(n) for j in range(i)]
+        products = [x * y - 1 for x, y in self.pairs]
         return {
             "fold": float(self.tangent[-1]),
             "branch point": float(np.linalg.det(np.vstack([self.scaled, self.tangent]))),
-            "flip": float(np.linalg.det(M + np.eye(n))),
-            "Neimark-Sacker": float(np.prod(pairs).real) if pairs else 1.0,
+            "flip": float(np.linalg.det(M + np.eye(len(M)))),
+            "Neimark-Sacker": float(np.prod(products).real) if products else 1.0,
         }
 
     def has_pair_on_circle(self) -> bool:
-        """Whether the pair of eigenvalues whose product is closest to 1 is a complex one."""
-        mu = self.eigenvalues
-        pairs = [(i, j) for i in range(len(mu)) for j in range(i)]
-        i, j = min(pairs, key=lambda p: abs(mu[p[0]] * mu[p[1]] - 1))
-        return bool(abs(mu[i].imag) > _COMPLEX and abs(mu[i] - np.conj(mu[j])) < _CONJUGATE)
+        """Whether the pair of multipliers whose product is closest to 1 is a complex one."""
+        x, y = min(self.pairs, key=lambda pair: abs(pair[0] * pair[1] - 1))
+        return bool(abs(x.imag) > _COMPLEX and abs(x - np.conj(y)) < _CONJUGATE)
 
 
 class Curve:
@@ -126,8 +123,8 @@ class Curve:
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
         self.cycle, self.parameter, self.span = cycle, parameter, span
-        self.map, self.structure = cycle.return_map, Structure(cycle.system)
-        self.sequence = _rotated(cycle.event_sequence)
+        self.map, self.sequence = cycle.return_map, _rotated(cycle.event_sequence)
+        self.structure = self.map.structure
         _leaf(cycle.system, parameter)
         flat = jax.tree_util.tree_map(
             lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, cycle.system
@@ -147,15 +144,15 @@ class Curve:
         size = np.append(np.asarray(self.map.sizes), self.span)
         return self._correct(z, row / size, size, row, self.cycle.anchor)
 
-    def step(self, here: Point, length: float) -> Point | Failure:
+    def step(self, last: Point, length: float) -> Point | Failure:
         """The next point, about `length` further along the tangent."""
-        ahead = length * here.tangent * here.size
+        ahead = length * last.tangent * last.size
         point = self._correct(
-            here.z + ahead, here.tangent / here.size, here.size, here.tangent, here.anchor
+            last.z + ahead, last.tangent / last.size, last.size, last.tangent, last.anchor
         )
         if isinstance(point, Failure):
             return point
-        astray = np.linalg.norm((point.z - here.z - ahead) / here.size)
+        astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
         return point if astray <= 0.5 * length else Failure(Result.NOT_CONVERGED)
 
     def between(self, a: Point, b: Point, where: float) -> Point | Failure:
@@ -175,31 +172,27 @@ class Curve:
             point.z[-1] = value
         return point
 
-    def elsewhere(self, here: Point) -> Point | None:
+    def elsewhere(self, point: Point) -> Point | None:
         """The same cycle, anchored at a phase of the clock that is far from all events.
 
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        codes = here.turn.codes
+        codes = point.turn.codes
         events = np.flatnonzero((codes >= 0).any(axis=1)) + 0.5
         if self.map.base is not None or not len(events):
             return None
         K = len(codes)
         apart = np.abs(np.arange(K)[:, None] - events)
         k = int(np.argmax(np.min(np.minimum(apart, K - apart), axis=1)))
-        legs = here.turn.legs
-        phase = legs.t[k : k + 1] / here.turn.period * float(self.map.expected)
-        anchor = eqx.tree_at(
-            lambda x: (x.t, x.chart),
-            here.anchor,
-            (jnp.asarray(phase), jnp.asarray(legs.chart[[k]])),
-        )
-        row = np.append(np.zeros(len(here.z) - 1), 1.0)
-        forward = row * np.sign(here.tangent[-1])
-        z = np.append(legs.q[:, k], here.value)
-        point = self._correct(z, row / here.size, here.size, forward, anchor)
-        return None if k == 0 or isinstance(point, Failure) else point
+        legs = point.turn.legs
+        phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
+        anchor = point.anchor._replace(t=jnp.asarray(phase), chart=jnp.asarray(legs.chart[[k]]))
+        row = np.append(np.zeros(len(point.z) - 1), 1.0)
+        forward = row * np.sign(point.tangent[-1])
+        z = np.append(legs.q[:, k], point.value)
+        moved = self._correct(z, row / point.size, point.size, forward, anchor)
+        return None if k == 0 or isinstance(moved, Failure) else moved
 
     def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Failure:
         """Newton's method for a point with row @ (z - z0) = 0."""
@@ -260,11 +253,11 @@ class Curve:
         s, legs, sizes = self.structure, point.turn.legs, self._sizes(point)
         moves, largest = np.zeros(s.d), np.zeros(s.d)
         for k, name in enumerate(s.charts[int(point.anchor.chart[0])].states):
-            seen = [point.z[k]]
+            values = [point.z[k]]
             for a, chart in enumerate(s.charts):
                 if name in chart.states:
-                    seen.extend(legs.q[chart.states.index(name), legs.chart == a])
-            moves[k], largest[k] = np.ptp(seen) / sizes[k], np.max(np.abs(seen)) / sizes[k]
+                    values.extend(legs.q[chart.states.index(name), legs.chart == a])
+            moves[k], largest[k] = np.ptp(values) / sizes[k], np.max(np.abs(values)) / sizes[k]
         return moves, largest
 
 
@@ -274,8 +267,8 @@ def _turn_along(
 ) -> tuple[Lanes, Turn]:
     """The lane at the beginning, and one turn with derivatives by the state and along `direction`
     in the parameters: so one program serves all parameters."""
-    own = map.at_phase_of(system)
-    return own.departure(q), own.turn_with_jacobian(q, direction=direction)
+    map = map.at_phase_of(system)
+    return map.departure(q), map.turn_with_jacobian(q, direction=direction)
 
 
 def _scaled(turn: Turn, size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "d n"]:
@@ -295,28 +288,17 @@ def _leaf(system: HybridSystem, parameter: str):
 
     **Raises:** `DefinitionError` if there is none.
     """
+    leaves = jax.tree_util.tree_leaves_with_path(system)
+    is_number = lambda x: eqx.is_inexact_array(x) and x.shape == ()  # noqa: E731
+    names = (jax.tree_util.keystr(path).lstrip(".") for path, x in leaves if is_number(x))
+    name, text = type(system).__name__, f"parameters are {', '.join(names)}."
     try:
         value = operator.attrgetter(parameter)(system)
     except (AttributeError, TypeError) as error:
-        raise DefinitionError(
-            f"{type(system).__name__} has no parameter '{parameter}'; parameters are "
-            f"{', '.join(_names(system))}."
-        ) from error
-    if not eqx.is_inexact_array(value) or value.shape != ():
-        raise DefinitionError(
-            f"'{parameter}' of {type(system).__name__} is no single floating-point number; "
-            f"parameters are {', '.join(_names(system))}."
-        )
+        raise DefinitionError(f"{name} has no parameter '{parameter}'; {text}") from error
+    if not is_number(value):
+        raise DefinitionError(f"'{parameter}' of {name} is no single floating-point number; {text}")
     return value
-
-
-def _names(system):
-    leaves = jax.tree_util.tree_leaves_with_path(system)
-    return [
-        jax.tree_util.keystr(path).lstrip(".")
-        for path, x in leaves
-        if eqx.is_inexact_array(x) and x.shape == ()
-    ]
 
 
 def _with(system, parameter: str, value):

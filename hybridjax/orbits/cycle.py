@@ -1,5 +1,6 @@
 """Limit cycles: fixed points of the return map, with their multipliers."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -27,12 +28,13 @@ from .small_multipliers import fine_factors, log_determinant, weakest
 
 
 # Singular values of a factor, in sizes of the states, below this part of its largest one count as
-# zero. Doubled, weaker multipliers are taken for zeros of resets.
+# zero. Smaller: rounding is taken for multipliers. Larger: weak multipliers are taken for zeros.
 _RANK = 1e-9
-# A piece of the turn contracts too much if its weakest direction keeps less than this: of 16
-# digits, so many are lost. Doubled, one more turn is computed a little more often.
+# A piece of the turn contracts too much if its weakest direction keeps less than this. Smaller:
+# small multipliers lose digits. Larger: one more turn is computed for cycles that do not need it.
 _CONTRACTS = 1e-6
-# Multipliers below this are lost in the errors of implicit steps. Doubled, so are larger ones.
+# Multipliers below this are lost in the errors of implicit steps. Smaller: errors are taken for
+# multipliers. Larger: multipliers that are accurate are given as 0.
 _LEAST_OF_IMPLICIT = 1e-10
 
 
@@ -48,14 +50,14 @@ class LimitCycle(eqx.Module):
     - `legs`: states at the beginnings of the K pieces into which the turn is cut.
     - `factors`: Jacobians of the flow over the pieces, padded with zeros. The valid block of
         `factors[n]` is [:dims[n+1], :dims[n]].
-    - `residual`: largest distance between `anchor` and where it is after one period, in sizes of
-        the states.
-    - `iterations`: Newton steps that found it.
+    - `residual`: largest distance between `anchor` and the end of one period, in sizes of the
+        states.
+    - `iterations`: number of Newton steps.
     - `result`: a `Result` code.
     - `event_sequence`: transitions of one turn, by index, in order from the anchor.
     - `settings`: accuracy of the flow, with the sizes of the states.
     - `conserved`: values of conserved quantities that were asked for, by name.
-    - `multiplicity`: periods of the clock, or meetings with the section, in one period of the
+    - `multiplicity`: periods of the clock, or crossings of the section, in one period of the
         cycle.
     """
 
@@ -75,17 +77,24 @@ class LimitCycle(eqx.Module):
 
     @property
     def return_map(self) -> ReturnMap:
-        """The map that the cycle is a fixed point of."""
+        """The map that has the cycle as a fixed point."""
         return ReturnMap(
             self.system, self.settings, self.anchor, self.base, self.period, self.conserved,
             self.multiplicity,
         )  # fmt: skip
 
     @property
+    def structure(self) -> Structure:
+        """The system by the indices of its charts and transitions. (Made anew: it holds values of
+        one trace that are invalid in the next.)"""
+        return Structure(self.system)
+
+    @property
     def scale(self) -> dict[str, float]:
-        """What counts as 1 in each state, by name: its size on the cycle, unless it was given."""
+        """The size of each state on the cycle, by name, unless it was given: errors are judged
+        relative to it."""
         _require_values(self, "scale")
-        return sizes_of(Structure(self.system), self.settings.scale)
+        return sizes_of(self.structure, self.settings.scale)
 
     @property
     def clocked(self) -> bool:
@@ -96,73 +105,59 @@ class LimitCycle(eqx.Module):
     def dims(self) -> Int[np.ndarray, " K"]:
         """Numbers of states at the beginnings of the pieces."""
         _require_values(self, "dims")
-        return np.array(Structure(self.system).dims)[np.asarray(self.legs.chart)]
+        return np.array(self.structure.dims)[np.asarray(self.legs.chart)]
 
     @remembered
     def multipliers(self) -> Complex[np.ndarray, " r"]:
-        """The non-zero Floquet multipliers, the largest first (on the host).
+        """The non-zero Floquet multipliers, by decreasing modulus (on the host).
 
-        Computed from the factors without forming their product, so that small ones are right
-        too; where one of the pieces contracts so much that it drowns in rounding, from single
-        steps of one more turn. Zeros that stem from resets and sections are counted by rank and
-        left out; 0 stands for what is too small for a number, below 1e-308, or with an implicit
-        method for what its steps forget, below 1e-10. Each conserved quantity
-        that the cycle was chosen by stands for a multiplier of exactly 1.
+        Computed from the factors without forming their product, so that small ones are accurate;
+        if a piece contracts so much that they drown in rounding, from single steps of one more
+        turn. Zeros that stem from resets and sections are counted by rank and left out; 0 stands
+        for values below 1e-308, or with an implicit method, whose steps lose them, below 1e-10.
+        Each conserved quantity that the cycle was selected by has a multiplier of exactly 1.
         """
         _require_values(self, "multipliers")
-        blocks = self._blocks()
-        # (Of an autonomous flow, the weakest direction is its own, which was taken out.)
-        besides = 0 if self.clocked else 1
-        went_round = np.isfinite(self.residual)
-        strong = went_round and min(weakest(block, besides) for block in blocks) < _CONTRACTS
+        # The factors in sizes of the states, without padding.
+        dims, scale = self.dims, np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
+        after = np.roll(np.arange(len(dims)), -1)
+        factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
+        blocks = [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
+        # (The weakest direction of an autonomous flow is its own, which was projected out.)
+        weaker = 0 if self.clocked else 1
+        strong = np.isfinite(self.residual)
+        strong = strong and min(weakest(block, weaker) for block in blocks) < _CONTRACTS
         if strong:
             blocks = fine_factors(self.return_map)
         values = product_eigenvalues(blocks, rtol=_RANK)
-        if strong and self._implicit:
-            values = self._resolved(values)
+        if strong and has_implicit(self.structure):
+            lost = np.abs(values) < _LEAST_OF_IMPLICIT
+            values = np.where(lost, 0.0, values)
+            if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
+                rest = np.prod(values[~lost]).real
+                values[lost] = np.exp(log_determinant(self.return_map)) / rest
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
         return values
 
-    @property
-    def _implicit(self) -> bool:
-        """Whether an implicit method goes through a chart, which forgets what decays fast."""
-        return has_implicit(Structure(self.system))
-
     @remembered
     def log_multipliers(self) -> Float[np.ndarray, " r"]:
-        """Natural logarithms of the moduli of `multipliers`, also of one that is too small for a
-        number if the cycle has no events: by Liouville's formula, the sum of all is the divergence
-        of the field, integrated over one turn. Otherwise it is minus infinity."""
+        """Natural logarithms of the moduli of `multipliers`.
+
+        One that is below 1e-308 follows by Liouville's formula if the cycle has no events: the sum
+        of all is the divergence of the field, integrated over one turn. Otherwise it is minus
+        infinity."""
         with np.errstate(divide="ignore"):
             logs = np.log(np.abs(self.multipliers))
         if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:
             logs[-1] = log_determinant(self.return_map) - np.sum(logs[:-1])
         return logs
 
-    def _resolved(self, values: Complex[np.ndarray, " r"]) -> Complex[np.ndarray, " r"]:
-        """The multipliers that implicit steps resolve; 0 for the others. If only one is not, and
-        there are no events, it follows from the product of all."""
-        lost = np.abs(values) < _LEAST_OF_IMPLICIT
-        values = np.where(lost, 0.0, values)
-        if lost.sum() == 1 and not self.event_sequence:
-            others = np.prod(values[~lost]).real
-            values[lost] = np.exp(log_determinant(self.return_map)) / others
-        return values
-
-    def _blocks(self) -> list[np.ndarray]:
-        """The factors in sizes of the states, without padding."""
-        dims, factors = self.dims, np.asarray(self.factors)
-        sizes = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
-        after = np.roll(np.arange(len(dims)), -1)  # the piece that follows
-        factors = factors * sizes[:, None, :] / sizes[after, :, None]
-        return [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
-
     @property
     def stable(self) -> bool:
         """Whether all multipliers lie inside the unit circle, but for those of exactly 1 that
-        stand for conserved quantities."""
+        belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
 
@@ -171,55 +166,47 @@ class LimitCycle(eqx.Module):
         """The state at `anchor`, by name."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
-        chart = Structure(self.system).charts[int(anchor.chart[0])]
+        chart = self.structure.charts[int(anchor.chart[0])]
         return dict(zip(chart.states, anchor.q[:, 0].tolist(), strict=False))
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot."""
         _require_values(self, "trajectory")
-        s, anchor = Structure(self.system), to_host(self.anchor)
+        s, anchor = self.structure, to_host(self.anchor)
         a = int(anchor.chart[0])
         return simulate(
-            self.system,
-            s.names[a],
-            anchor.q[: s.dims[a], 0],
-            float(self.period) * periods,
-            time=float(anchor.t[0]),
-            settings=self.settings,
-        )
+            self.system, s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods,
+            time=float(anchor.t[0]), settings=self.settings,
+        )  # fmt: skip
 
     def __repr__(self):
         if is_traced(self):
             return f"LimitCycle({type(self.system).__name__}, traced)"
-        said = self._facts()
-        start, state = list(said.items())[1]
-        least = "1e-10" if self._implicit else "1e-308"
+        least = "1e-10" if has_implicit(self.structure) else "1e-308"
         multipliers = ", ".join(_format(z, least) for z in self.multipliers) or "none but zero"
         if self.conserved:
             multipliers += f" (1: conserved {', '.join(self.conserved)})"
-        return (
-            f"LimitCycle({type(self.system).__name__}: {Result(int(self.result)).message})\n"
-            f"  period       {said['period']}\n"
-            f"  {start}   {state}\n"
-            f"  events       {said['events']}\n"
-            f"  multipliers  {multipliers}\n"
-            f"  residual     {said['residual']}"
-            + "".join(f"\n  stiff        {said[name]}" for name in said if name == "stiff")
+        lines = (
+            f"\n  {name}   {value}" if name.startswith("at t") else f"\n  {name:<11}  {value}"
+            for name, value in self._facts({"multipliers": multipliers}).items()
         )
+        return f"LimitCycle({self._title()}){''.join(lines)}"
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        of = f"{type(self.system).__name__}: {Result(int(self.result)).message}"
         if self.result != Result.OK:
-            return card("LimitCycle", of, facts(self._facts()))
+            return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
         orbit = orbit_picture(self.trajectory())
-        return card("LimitCycle", of, facts(self._facts()), orbit, *multipliers)
+        return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
 
-    def _facts(self) -> dict[str, str]:
-        """What prints besides the multipliers, by what it is called."""
-        s, time, anchor = Structure(self.system), self.system.time_unit, to_host(self.anchor)
+    def _title(self) -> str:
+        return f"{type(self.system).__name__}: {Result(int(self.result)).message}"
+
+    def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
+        """The printed lines, by their headings."""
+        s, time, anchor = self.structure, self.system.time_unit, to_host(self.anchor)
         names = [tr.name for tr in s.transitions]
         units = map(unit_of, s.states(int(anchor.chart[0])))
         stiff = stiff_charts(s, to_host(self.legs), float(self.period))
@@ -235,6 +222,7 @@ class LimitCycle(eqx.Module):
                 for (name, x), unit in zip(self.state.items(), units, strict=True)
             ),
             "events": ", ".join(names[g] for g in self.event_sequence) or "none",
+            **multipliers,
             "residual": f"{float(self.residual):.2g} after {int(self.iterations)} Newton steps",
             **({"stiff": "; ".join(sentences)} if stiff else {}),
         }
@@ -254,28 +242,39 @@ def _format(z: complex, least: str) -> str:
     return f"{z.real:.9g}" if z.imag == 0 else f"{z.real:.9g}{z.imag:+.9g}j"
 
 
+def rough(cycle: LimitCycle) -> dict[str, Any]:
+    """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
+    chart = int(np.asarray(cycle.anchor.chart)[0])
+    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
+    return {
+        "period": f"{float(cycle.period):.5g}",
+        "time": f"{float(cycle.anchor.t[0]):.5g}",
+        "chart": chart,
+        "state": [f"{x:.4f}" for x in (q / size).round(4) + 0.0],
+    }
+
+
 def orbit_picture(
     orbit: Trajectory,
     sections: tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]]
     | None = None,
 ) -> str:
-    """An SVG, in the plane of the first two states that every chart has, or of time and the only
-    one; "" where there is no such state.
+    """An SVG for notebooks, in the plane of the first two states that every chart has, or of time
+    and the only one; "" if there is no such state. (`hj.plot.cycle` draws a large figure.)
 
-    **Arguments:** `sections`: times, charts and states at which the orbit meets some, as of
-    `Trajectory.dense`.
+    **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
     s, turn = Structure(orbit.system), orbit.dense()
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
 
-    def seen(t, chart, q):
+    def axes(t, chart, q):
         columns = [np.array([s.charts[a].states.index(x) for a in chart]) for x in names]
         values = [np.take_along_axis(q, c[:, None], axis=1)[:, 0] for c in columns]
         return values if len(names) == 2 else [t, *values]
 
-    (t, chart, _), (x, y) = turn, seen(*turn)
+    (t, chart, _), (x, y) = turn, axes(*turn)
     cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
     named: set[int] = set()
     curves = []
@@ -286,21 +285,8 @@ def orbit_picture(
         k = k[thinned(len(k), len(k) / len(t))]
         curves.append(Curve(x[k], y[k], name, COLORS[a % len(COLORS)]))
     if sections is not None:
-        curves.append(Curve(*seen(*sections), color="currentColor", points=True))
+        curves.append(Curve(*axes(*sections), color="currentColor", points=True))
     labels = [with_unit(x, unit_of(x)) for x in names]
     if len(names) == 1:
         labels.insert(0, with_unit("t", orbit.system.time_unit))
     return picture(curves, *labels)
-
-
-def rough(cycle: LimitCycle) -> dict[str, Any]:
-    """A cycle in words that are the same however it was found: its period, and where it begins, in
-    sizes of the states."""
-    chart = int(np.asarray(cycle.anchor.chart)[0])
-    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
-    return {
-        "period": f"{float(cycle.period):.5g}",
-        "time": f"{float(cycle.anchor.t[0]):.5g}",
-        "chart": chart,
-        "state": [f"{x:.4f}" for x in (q / size).round(4) + 0.0],
-    }

@@ -1,11 +1,10 @@
-"""Finding a limit cycle, by Newton's method on the return map with its exact Jacobian."""
+"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian."""
 
 import dataclasses
 from collections.abc import Mapping
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
@@ -23,33 +22,20 @@ from .checks import check_clock, check_conserved, check_times, explain
 from .coincidence import check_begin, coincident, commutes, events_of
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
-from .guess import begin, check_section, guessed_lane, own_guess
-from .newton import Solution, solve, solve_damped
+from .guess import return_map_near
+from .newton import Solution, search, solve
 from .return_map import ReturnMap
-from .scale import (
-    Sizes,
-    given_sizes,
-    has_implicit,
-    scale_of,
-    sizes_near,
-    sizes_of,
-    sizes_on,
-    slow_time,
-    stiff_charts,
-)
+from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
 
 
-# An autonomous system is given up if it does not return within so many of the times in which the
-# states change by their sizes at the guess. Doubled, a search in vain takes twice as long.
-_PATIENCE = 1000.0
-# With an implicit method, a piece of a turn may take so many steps at least, since there may be a
-# fast jump in it. Doubled, faster ones than that of van der Pol's oscillator at mu = 1000.
+# Least bound on the steps of a piece of a turn with an implicit method. Smaller: a fast jump, such
+# as that of van der Pol's oscillator at mu = 1000, reaches it. Larger: vain searches last longer.
 _JUMP = 1024
-# A cycle is computed anew in the sizes that states have on it if a rough one was larger by more
-# than this factor. Doubled, errors may be twice as large.
+# A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
+# this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
-# A state keeps its rough size if on the cycle it is smaller than this part of it: it rests.
-# Doubled, so do states that move twice as far.
+# A state keeps its rough size if on the cycle it is smaller than this part of it. Smaller: a state
+# at rest gets its rounding errors for a size. Larger: states that move little lose accuracy.
 _VANISHING = 1e-6
 
 
@@ -68,59 +54,66 @@ def find_limit_cycle(
     settings: Settings | None = None,
     throw: bool = True,
 ) -> LimitCycle:
-    """Find a limit cycle by Newton on the return map; stable or not makes no difference.
+    """Find a stable or unstable limit cycle by Newton's method on the return map.
 
-    Where Newton fails, as it does if it steps out of the domain of the return map, the search is
-    repeated with the smaller steps of Levenberg and Marquardt.
+    If Newton's method fails, as it does if a step leaves the domain of the return map, the search
+    is repeated with the smaller steps of the Levenberg-Marquardt method.
 
-    A clocked system has its clock's period, and the return map is taken at the guess's phase of
-    the clock. The period of an autonomous one is found; its return map lives on `section`.
+    A clocked system has the period of its clock, and the return map is taken at the guess's phase
+    of the clock. The period of an autonomous system is computed; its return map is taken on
+    `section`.
 
     **Arguments:**
 
-    - `guess`: a rough `Guess`, by default the model's own. A `LimitCycle` of a similar system is
-        the best guess: a clocked system begins at the same phase of its own clock. It goes without
-        `settle` and `max_period`.
-    - `section`: for autonomous systems: where the return map is taken, e.g. `Crossing("v",
-        "falling")` or `AtEvent("heelstrike")`. By default right after the event that the guess
-        names (`Guess(..., after="heelstrike")`), or else on the plane through the guess across the
-        flow. Newton starts at the guess if it lies on the section, else where the flow from the
-        guess first meets it.
-    - `multiplicity`: periods of the clock, or returns to the section, until the cycle closes: 2
-        for the cycle that a period doubling leaves behind. By default 1, or the guess's.
-    - `conserved`: the values at which conserved quantities are wanted, by the names of outputs,
-        e.g. `{"energy": 1784.8}`. Cycles then come in families, with a multiplier of exactly 1 for
-        each quantity, and this picks one of them. By default none, or the guess's.
-    - `settle`: time to simulate before Newton begins, so that transients die out (the paper
-        takes 60 s). No help where the cycle is unstable.
-    - `max_period`: for autonomous systems: give up if no return is seen in this time, by default a
-        thousand times that in which the states change at the guess (in charts with an implicit
-        method, the slowest of them).
-    - `scale`: sizes of states by name, such as `{"y": 1e-6}`: errors that are small compared to
-        them do not matter. By default each state's largest modulus on the cycle, so that results
-        do not depend on units (under a JAX transformation, on the guess).
-    - `settings`: accuracy of the flow, 1e-12 by default, how many steps it may take, which
-        `linearize` takes over, and its `solver`; "auto" takes an implicit one in those charts that
-        are stiff on the cycle.
-    - `throw`: raise on failure; otherwise the cycle's `result` says what went wrong.
+    - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
+        From a cycle, a clocked system begins at the same phase of its own clock, and `settle` and
+        `max_period` must be left out. Default: the model's own guess.
+    - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
+        "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
+        the section, else where the flow from the guess first crosses it. Default: the section
+        right after the event that the guess names (`Guess(..., after="heelstrike")`), or else the
+        plane through the guess across the flow.
+    - `multiplicity`: number of periods of the clock, or returns to the section, after which the
+        cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
+        cycle that is the guess.
+    - `conserved`: values of conserved quantities, by the names of outputs, e.g.
+        `{"energy": 1784.8}`. Cycles then form families, with a multiplier of exactly 1 for each
+        quantity, and these values select one of them. Default: none, or those of the cycle that is
+        the guess.
+    - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
+        takes 60 s). It does not help if the cycle is unstable. Default: 0.
+    - `max_period`: for autonomous systems, the time after which the search for a return to the
+        section is given up. Default: 1000 times the time scale of the states at the guess (in
+        charts with an implicit method, that of the slowest mode).
+    - `scale`: sizes of states by name, such as `{"y": 1e-6}`; errors are judged relative to them.
+        Default: each state's largest modulus on the cycle, so that results do not depend on units
+        (under a JAX transformation, those of the guess).
+    - `settings`: accuracy of the flow (Default: 1e-12), the largest number of its steps, which
+        `linearize` uses too, and its `solver`; "auto" takes an implicit method in those charts
+        that are stiff on the cycle.
+    - `throw`: raise an error on failure; otherwise the cycle's `result` holds the reason.
+        Default: True.
 
-    **Raises:** `DefinitionError` for bad arguments, and for functions that depend on time otherwise
-    than `system.period()` states; `ComputationError` if no isolated cycle is found: no
-    convergence, an event or section that does not come, events that coincide, grazing, an
-    equilibrium in place of a cycle, or a singular J - I (there is a whole family of cycles, from a
+    **Raises:** `DefinitionError` for bad arguments, and for functions whose dependence on time
+    contradicts `system.period()`; `ComputationError` if no isolated cycle is found: no
+    convergence, an event or section that is not reached, events that coincide, grazing, an
+    equilibrium in place of a cycle, or a singular J - I (cycles form a family, because of a
     conserved quantity or a symmetry; see `conserved`).
 
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
-    followed by implicit differentiation. Its `result` says whether it was found; derivatives of a
-    cycle that was not found mean nothing, and are NaN as a rule.
+    differentiated implicitly. Its `result` reports success; derivatives of a cycle that was not
+    found are meaningless, and usually NaN.
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        options = {
-            "section": section, "multiplicity": multiplicity, "conserved": conserved,
-            "scale": scale, "throw": throw,
-        }  # fmt: skip
-        return _find_by_itself(system, guess, settle, max_period, settings, options)
+        options = dict(
+            section=section,
+            multiplicity=multiplicity,
+            conserved=conserved,
+            scale=scale,
+            throw=throw,
+        )
+        return _find_with_auto(system, guess, settle, max_period, settings, options)
     system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
@@ -132,59 +125,47 @@ def find_limit_cycle(
         settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, _JUMP))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
-    check_section(s, section)
+    if section is not None:
+        if system.period() is not None:
+            raise DefinitionError(
+                "a clocked system returns to itself after its clock's period: leave out `section` "
+                "(sections of any kind are for linearize and run_experiments)."
+            )
+        section.check(s)
     if not traced:
-        check_clock(system)
+        check_clock(s)
     if isinstance(guess, LimitCycle):
-        _check_fits(guess, s, multiplicity, settle, max_period)
+        _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
         conserved = guess.conserved if conserved is None else conserved
-        settings = _in_sizes(settings, s, given, guess.settings.scale)
         map = guess.return_map.at_phase_of(system)
-        map = dataclasses.replace(
-            map, settings=settings, base=map.base if section is None else section
-        )
+        settings = dataclasses.replace(settings, scale=scale_of(s, given, guess.settings.scale))
+        base = map.base if section is None else section
+        map = dataclasses.replace(map, settings=settings, base=base)
     elif traced:
         raise DefinitionError(
             "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
             "one outside, and pass it as `guess`."
         )
     else:
-        multiplicity = 1 if multiplicity is None else multiplicity
-        guess = own_guess(system) if guess is None else guess
-        lane, period = guessed_lane(system, guess), system.period()
-        near = sizes_near(
-            system, int(np.asarray(lane.chart)[0]), np.asarray(lane.t)[0], np.asarray(lane.q)[:, 0],
-            None if period is None else float(period),
-        )  # fmt: skip
-        settings = _in_sizes(settings, s, near.sizes | given)
-        charts = np.arange(len(s.charts))
-        times = np.full(len(charts), float(np.asarray(lane.t)[0]))
-        check_times(system, times, charts, near.points.T, settings.scale, near.time)
-        if max_period is None:
-            max_period = _PATIENCE * max(near.time, slow_time(s, times[0], near.points))
-        anchor, base, expected = begin(
-            system, lane, guess.after, section, multiplicity, settle, max_period, settings,
-            near.time,
-        )  # fmt: skip
-        map = ReturnMap(system, settings, anchor, base, expected, {}, multiplicity)
-    conserved = {k: real(v) for k, v in (conserved or {}).items()}
-    map = dataclasses.replace(map, conserved=conserved)
-    if traced:
+        map = return_map_near(
+            s, guess, section, multiplicity or 1, settle, max_period, settings, given
+        )
+    map = dataclasses.replace(map, conserved={k: real(v) for k, v in (conserved or {}).items()})
+    if isinstance(guess, LimitCycle) and traced:
         return _cycle(map, solve(map, True), guess.event_sequence)
-    s.resolve_outputs(tuple(conserved)).require(int(np.asarray(map.anchor.chart)[0]))
+    s.resolve_outputs(tuple(map.conserved)).require(int(np.asarray(map.anchor.chart)[0]))
     if isinstance(map.base, AtEvent):
         check_begin(map)
-    map, solution = _in_own_sizes(map, _solve(map), given)
+    map, solution = _in_own_sizes(map, search(map), given)
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
-    found = int(solution.result) in (Result.OK, Result.SINGULAR)
-    if found and coincident(map, solution.turn):
+    if solution.is_fixed_point and coincident(map, solution.turn):
         if commutes(cycle):
-            say("events coincide, in either order with the same outcome")
+            say("events coincide, and commute")
         else:
             code = jax.device_put(np.int32(Result.COINCIDENCE))
             cycle = dataclasses.replace(cycle, result=code)
     code, legs = Result(int(cycle.result)), to_host(cycle.legs)
-    check_times(system, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
+    check_times(s, legs.t, legs.chart, legs.q, map.settings.scale, float(cycle.period))
     if code in (Result.OK, Result.SINGULAR):
         check_begin(cycle.return_map)
         if conserved:
@@ -194,67 +175,45 @@ def find_limit_cycle(
     return cycle
 
 
-def _find_by_itself(system, guess, settle, max_period, settings, options) -> LimitCycle:
+def _find_with_auto(system, guess, settle, max_period, settings, options) -> LimitCycle:
     """The cycle with an implicit method in those charts that are stiff on it."""
     settings = dataclasses.replace(settings, solver=None)
-    everywhere = integrated(system, Radau())
     cycle = find_limit_cycle(
-        everywhere, guess, settle=settle, max_period=max_period, settings=settings, **options
+        integrated(system, Radau()), guess, settle=settle, max_period=max_period,
+        settings=settings, **options,
+    )  # fmt: skip
+    stiff = stiff_charts(
+        Structure(integrated(system, None)), to_host(cycle.legs), float(cycle.period)
     )
-    s = Structure(integrated(system, None))
-    stiff = stiff_charts(s, to_host(cycle.legs), float(cycle.period))
-    if cycle.result != Result.OK or len(stiff) == len(s.names):
+    if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
     return find_limit_cycle(fitting, cycle, settings=settings, **options)
 
 
-def _in_sizes(
-    settings: Settings,
-    s: Structure,
-    sizes: Sizes,
-    otherwise: Float[Array, "A d"] | None = None,
-) -> Settings:
-    return dataclasses.replace(settings, scale=scale_of(s, sizes, otherwise))
-
-
-def _solve(map: ReturnMap) -> Solution:
-    """Newton's method, with smaller steps or another period where it fails."""
-    say("Newton's method")
-    solution = solve(map)
-    if int(solution.result) == Result.EXTRA_TURNS:
-        turn = solution.turn
-        expected = turn.period * map.multiplicity / turn.meetings
-        solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
-    if int(solution.result) not in (Result.OK, Result.SINGULAR, Result.EQUILIBRIUM):
-        # Newton may have stepped out of the domain of the return map: smaller steps.
-        say("steps of Levenberg and Marquardt")
-        second = solve_damped(map)
-        solution = second if int(second.result) == Result.OK else solution
-    return solution
-
-
 def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:
-    """A cycle in the sizes that states have on it, for one that was found in rough ones."""
-    if int(solution.result) not in (Result.OK, Result.SINGULAR):
+    """A cycle that was found in rough sizes, in the sizes that states have on it."""
+    if not solution.is_fixed_point:
         return map, solution
-    s, legs, period = map.structure, solution.turn.legs, float(solution.turn.period)
-    rough = sizes_of(s, map.settings.scale)
-    sizes = sizes_on(map.system, legs.t, legs.chart, legs.q, period)
+    s, period, rough = (
+        map.structure,
+        solution.turn.period,
+        sizes_of(map.structure, map.settings.scale),
+    )
+    sizes = sizes_on(s, solution.turn.legs, float(period))
     sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
-    expected = map.expected if map.base is None else solution.turn.period
-    own = dataclasses.replace(
-        map, settings=_in_sizes(map.settings, s, sizes), anchor=solution.anchor, expected=expected
+    fine = dataclasses.replace(
+        map,
+        settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
+        anchor=solution.anchor,
+        expected=map.expected if map.base is None else period,
     )
     if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
-        size = np.asarray(own.settings.scale)[np.asarray(map.anchor.chart)[0]]
-        distance = real(np.max(np.abs(solution.turn.residual) / size))
-        return own, solution._replace(turn=solution.turn._replace(distance=distance))
+        distance = real(np.max(np.abs(solution.turn.residual) / np.asarray(fine.sizes)))
+        return fine, solution._replace(turn=solution.turn._replace(distance=distance))
     say("Newton's method, in the sizes of the cycle")
-    again = solve(own)
-    if int(again.result) not in (Result.OK, Result.SINGULAR):
-        return map, solution
-    return own, again._replace(steps=solution.steps)
+    again = solve(fine)
+    return (fine, again._replace(steps=solution.steps)) if again.is_fixed_point else (map, solution)
 
 
 def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) -> LimitCycle:
@@ -267,21 +226,15 @@ def _cycle(map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]) 
     )  # fmt: skip
 
 
-def _check_fits(
-    guess: LimitCycle,
-    s: Structure,
-    multiplicity: int | None,
-    settle: float,
-    max_period: float | None,
-) -> None:
-    """Raise for what makes no sense where a cycle is the guess."""
+def _check_fits(guess: LimitCycle, s: Structure, multiplicity: int | None, waits: bool) -> None:
+    """**Raises:** `DefinitionError` for arguments that contradict a cycle as the guess."""
     if multiplicity not in (None, guess.multiplicity):
         raise DefinitionError(
             f"the guess has multiplicity {guess.multiplicity}, not {multiplicity}: give a Guess."
         )
     if guess.clocked != (s.system.period() is not None):
         raise DefinitionError("of the guess and the system, only one has a clock: give a Guess.")
-    if max_period is not None or settle:
+    if waits:
         raise DefinitionError(
             "the search begins on the cycle that is the guess, and knows its period: leave out "
             "`settle` and `max_period`, or give a Guess."

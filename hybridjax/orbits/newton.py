@@ -1,8 +1,10 @@
-"""Newton's method on the return map, under transformations and on the host.
+"""Newton's method on the return map, and further attempts where it fails.
 
-Steps are taken, and convergence is judged, in sizes of the states.
+Steps are taken, and convergence is tested, in sizes of the states. `search` lists the attempts: an
+attempt of another kind, such as a restart from a random state, is added there.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,48 +14,69 @@ from jaxtyping import Float, Int
 
 from .._core.compilation import host_first, quick_jit
 from .._core.executor import Array, on_host
+from .._core.progress import say
+from .._core.results import Result
 from ..engine.lanes import Lanes
 from .return_map import SINGULAR, ReturnMap, Turn
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
-# Doubled, it sometimes ends one step earlier; halved, rounding may keep it from ending.
+# Larger: it ends one step too early. Smaller: rounding keeps it from ending.
 _ATOL, _RTOL = 1e-12, 1e-11
-# Newton steps before a cycle is given up. Doubled, hopeless ones take twice as long.
+# Steps before a cycle is given up. Fewer: cycles far from the guess are lost. More: hopeless
+# searches last longer.
 MAX_STEPS = 32
-# Steps of Levenberg and Marquardt before it is given up.
-_DAMPED_STEPS = 64
 
 
 class Solution(NamedTuple):
-    """Where Newton's method ended."""
+    """The end of Newton's method."""
 
     anchor: Lanes
-    """The lane there, ready to be left."""
+    """The lane at the beginning of the last turn."""
     turn: Turn
-    """The last turn that it saw."""
+    """The last turn."""
     steps: Int[Array, ""]
     result: Int[Array, ""]
     """`Result` code: whether this is a cycle."""
+
+    @property
+    def is_fixed_point(self) -> bool:
+        """Whether the turn closes, on an isolated cycle or on one of a family."""
+        return int(self.result) in (Result.OK, Result.SINGULAR)
+
+
+def search(map: ReturnMap) -> Solution:
+    """Newton's method from the anchor's state; where it fails, with another period, then with the
+    smaller steps of Levenberg and Marquardt."""
+    say("Newton's method")
+    solution = solve(map)
+    if int(solution.result) == Result.EXTRA_TURNS:
+        turn = solution.turn
+        expected = turn.period * map.multiplicity / turn.meetings
+        solution = solve(dataclasses.replace(map, anchor=solution.anchor, expected=expected))
+    if not solution.is_fixed_point and int(solution.result) != Result.EQUILIBRIUM:
+        # Newton's method may have left the domain of the return map.
+        say("Levenberg-Marquardt steps")
+        second = _solve_damped(map)
+        solution = second if int(second.result) == Result.OK else solution
+    return solution
 
 
 @host_first
 def solve(map: ReturnMap, once_more: bool = False) -> Solution:
     """Newton's method from the anchor's state.
 
-    **Arguments:** `once_more` goes round once more on the cycle found, so that what is seen has the
-    derivatives of the cycle.
+    **Arguments:** `once_more`: whether to compute one more turn on the cycle, so that the result
+    has the derivatives of the cycle.
     """
     q, turn, steps = root(map, False, MAX_STEPS)
-    if once_more:
-        turn = map.turn_with_jacobian(q)
+    turn = map.turn_with_jacobian(q) if once_more else turn
     return Solution(map.departure(q), turn, steps, map.judge(q, turn))
 
 
 @quick_jit
-def solve_damped(map: ReturnMap) -> Solution:
-    """As `solve`, by the smaller steps of Levenberg and Marquardt."""
-    q, turn, steps = root(map, True, _DAMPED_STEPS)
+def _solve_damped(map: ReturnMap) -> Solution:
+    q, turn, steps = root(map, True, 2 * MAX_STEPS)
     return Solution(map.departure(q), turn, steps, map.judge(q, turn))
 
 
@@ -62,8 +85,8 @@ def newton_steps(
     residual: Float[np.ndarray, "S n"],
     rcond: float = SINGULAR,
 ) -> Float[np.ndarray, "S n"]:
-    """Newton's steps of S systems of equations, on the host: the shortest that are left where a
-    system is singular, NaN where it is not finite."""
+    """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
+    NaN for systems that are not finite."""
     step = np.full(residual.shape, np.nan)
     good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
@@ -79,7 +102,7 @@ def excess(q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]) -> Float
 def root(
     map: ReturnMap, damped: bool, max_steps: int
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
-    """The state that the return map leaves where it is, the turn from there, and steps taken.
+    """The fixed point of the return map, the turn from it, and the number of steps.
 
     Differentiable once and twice; only the state has derivatives.
     """
@@ -87,7 +110,7 @@ def root(
 
 
 def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method as that of optimistix."""
+    """Newton's method with the steps and the test of optimistix."""
     sizes, x, steps = map.sizes, map.anchor.q[:, 0] / map.sizes, 0
     while True:
         turn = map.turn_with_jacobian(x * sizes)
@@ -101,7 +124,7 @@ def _root_on_host(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.
 
 @eqx.filter_custom_jvp
 def _root(map, damped, max_steps):
-    import optimistix as optx  # (a fifth of a second, here as below)
+    import optimistix as optx  # (a fifth of a second, as lineax below)
 
     if damped:
         solver = optx.LevenbergMarquardt(rtol=_RTOL, atol=_ATOL)
@@ -116,8 +139,8 @@ def _root(map, damped, max_steps):
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
-    """Implicit: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (optimistix's own derivative raises
-    where it is taken twice, since JAX cannot vectorize the derivative of `flow_jacobian`.)"""
+    """The implicit derivative: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (The derivative of
+    optimistix cannot be taken twice, since JAX cannot vectorize that of `flow_jacobian`.)"""
     import lineax as lx
 
     map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
@@ -126,25 +149,23 @@ def _root_jvp(primals, tangents):
     t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
     _, by_parameters = eqx.filter_jvp(lambda map: map.turn(q).residual, (map,), (t_map,))
     jacobian = map.turn_with_jacobian(q).jacobian * sizes / sizes[:, None]
-    jacobian, by_parameters = lx.MatrixLinearOperator(jacobian), by_parameters / sizes
-    found = lx.linear_solve(jacobian, by_parameters, _linear_solver(), throw=False)
-    t_q = -found.value * sizes
+    operator = lx.MatrixLinearOperator(jacobian)
+    step = lx.linear_solve(operator, by_parameters / sizes, _linear_solver(), throw=False)
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
-    return (q, turn, steps), (t_q, *nothing)
+    return (q, turn, steps), (-step.value * sizes, *nothing)
 
 
 def _linear_solver():
-    """Along a direction in which J - I is singular, neither Newton nor a derivative moves."""
+    """A solver with no step along directions in which J - I is singular."""
     import lineax as lx
 
     return lx.SVD(rcond=SINGULAR)
 
 
 def _residual(x, map: ReturnMap):
-    """(P(q) - q) in sizes for q = x sizes, whose derivative is the Jacobian of the turn's pieces,
-    and the `Turn`.
+    """(P(q) - q) in sizes for q = x sizes, and the `Turn`.
 
-    The Jacobian comes with the value, so that the turn need not be traced again for it.
+    Its derivative is the Jacobian that comes with the turn, which is not traced again for it.
     """
     fixed = jax.lax.stop_gradient(x * map.sizes)
     turn = map.turn_with_jacobian(fixed)

@@ -1,7 +1,7 @@
 """The return map of a cycle.
 
-One turn is cut into pieces, whose Jacobians are found together with the pieces: their product is
-the Jacobian of the return map, and they themselves are the factors of the monodromy.
+One turn is cut into pieces. The Jacobians of the pieces are computed with the pieces: their product
+is the Jacobian of the return map, and they are the factors of the monodromy matrix.
 """
 
 import dataclasses
@@ -19,81 +19,82 @@ from .._core.executor import Array, namespace, on_host, scan, singular_values, s
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.events import arm, start_lanes
+from ..engine.events import arm
 from ..engine.jacobian import flow_jacobian
-from ..engine.lanes import Lanes
-from ..engine.move import move, retrace
+from ..engine.lanes import Lanes, start_lanes
+from ..engine.move import move
+from ..engine.replay import replay
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
-from ..engine.watch import slopes, watch
+from ..engine.watch import Watch, slopes, watch
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from .crossing import AtEvent, Crossing, ListLevels
+from .crossing import AtEvent, Crossing, to_section
 
 
-# Pieces into which one turn is cut: their Jacobians are the factors of the monodromy. Doubled, a
-# program runs a little longer, and strong contraction is seen a little better.
+# Pieces of one turn. Fewer: strong contraction drowns in the product of the steps of a piece. More:
+# programs run longer.
 LEGS = 16
-# An autonomous system flows freely up to this part of its last turn, then to the section. Nearer
-# to 1, a shorter return is missed.
+# The part of the last period up to which an autonomous system flows freely, then to the section.
+# Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
 _FREE = 0.75
-# J - I, in sizes of the states, is singular if its smallest singular value is below this. Doubled,
-# cycles half as isolated are refused.
+# Smallest singular value of J - I, in sizes of the states, at which it is singular. Smaller: cycles
+# of a family pass for isolated ones. Larger: cycles with a multiplier near 1 are rejected.
 SINGULAR = 1e-7
-# A turn closes if no state is further from where it began than this part of its size. Doubled,
-# sweeps accept cycles of half the accuracy.
+# Largest distance, in sizes of the states, at which a turn closes. Smaller: rounding rejects cycles
+# of sweeps. Larger: turns that Newton's method has not finished are accepted.
 _CLOSED = 2e-8
-# A system rests if no state moves by this many times what the accuracy leaves undecided. Doubled,
-# cycles twice as large are taken for an equilibrium.
+# Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
+# for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
 
 
 class Return(NamedTuple):
-    """Where one turn leads."""
+    """The end of one turn."""
 
     residual: Float[Array, " d"]
-    """P(q) - q, less the step back to the values of conserved quantities (see `held`); NaN where
-    the turn fails, or ends in another chart."""
+    """P(q) - q, less the step back to the values of conserved quantities (see `held`); NaN if the
+    turn fails, or ends in another chart."""
     period: Float[Array, ""]
-    """Time that the turn took."""
+    """Duration of the turn."""
     result: Int[Array, ""]
     """`Result` code of the flow."""
 
 
 class Turn(NamedTuple):
-    """One turn with its derivatives: what Newton's method sees."""
+    """One turn with its derivatives, for Newton's method."""
 
     residual: Float[Array, " d"]
     """As in `Return`."""
     jacobian: Float[Array, "d d"]
-    """Derivative of the residual by the state."""
+    """Derivative of the residual with respect to the state."""
     by_parameter: Float[Array, " d"] | None
-    """Derivative of the residual along a direction in the parameters, if one was given."""
+    """Derivative of the residual along a direction of the parameters, if one was given."""
     legs: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
     """Jacobians of the flow over the pieces; for an autonomous system on the states modulo the
     direction of the flow."""
     codes: Int[Array, "K R"] | None
-    """Events of each piece, by index of the transition; negative where there is none."""
+    """Events of each piece, by index of the transition; negative for none."""
     times: Float[Array, "K R"] | None
-    """When they happened."""
+    """Times of these events."""
     period: Float[Array, ""]
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
     result: Int[Array, ""]
     meetings: Int[Array, ""]
-    """How often the turn met the section that it ended on, as far as its pieces show it."""
+    """Number of crossings of the section on which the turn ended, as far as its pieces show."""
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
-        """Whether it came back to where it began (also of many turns at once, on the host)."""
+        """Whether the turn ends at its beginning (also of many turns at once, on the host)."""
         return self.distance <= _CLOSED
 
 
 class ReturnMap(eqx.Module):
-    """The return map P of a system, and which of its fixed points is meant.
+    """The return map P of a system, with the data that select one of its fixed points.
 
     **Fields:**
 
@@ -103,9 +104,9 @@ class ReturnMap(eqx.Module):
     - `base`: the section of an autonomous system; `None` for a clocked one, whose section is the
         phase of the clock at the anchor.
     - `expected`: the period of one turn; for an autonomous system a rough value.
-    - `conserved`: values of conserved quantities, by the name of the output; they choose one
+    - `conserved`: values of conserved quantities, by the name of the output; they select one
         cycle of a family.
-    - `multiplicity`: periods of the clock, or meetings with the section, in one turn.
+    - `multiplicity`: periods of the clock, or crossings of the section, in one turn.
     """
 
     system: HybridSystem
@@ -122,53 +123,53 @@ class ReturnMap(eqx.Module):
 
     @property
     def sizes(self) -> Float[Array, " d"]:
-        """What counts as 1 in each state of the anchor's chart."""
-        return self.sizes_in(self.anchor.chart)[0]
-
-    def sizes_in(self, chart: Int[Array, " L"]) -> Float[Array, "L d"]:
-        """What counts as 1 in each state of some charts."""
-        return self.settings.scale[chart]
+        """Sizes of the states of the anchor's chart."""
+        return self.settings.scale[self.anchor.chart][0]
 
     @property
     def valid(self) -> Bool[Array, " d"]:
-        """Which entries of the padded state the anchor's chart has."""
-        s = self.structure
+        """The entries of the padded state that the anchor's chart has."""
         chart = self.anchor.chart[0]
-        return np.arange(s.d) < namespace(chart).asarray(s.dims)[chart]
+        return np.arange(self.structure.d) < namespace(chart).asarray(self.structure.dims)[chart]
+
+    @property
+    def event(self) -> int:
+        """Index of the transition with which every turn begins and ends; -1 for none."""
+        at_event = isinstance(self.base, AtEvent)
+        return self.structure.transition_index(self.base.name) if at_event else -1
 
     def at_phase_of(self, system: HybridSystem) -> "ReturnMap":
-        """That of another system; a clocked one begins at the same phase of its own clock."""
+        """The map of another system; a clocked one begins at the same phase of its own clock."""
         if self.base is not None:
             return dataclasses.replace(self, system=system)
         expected = self.multiplicity * jnp.asarray(system.period(), float)
-        time = self.anchor.t * (expected / self.expected)
-        anchor = eqx.tree_at(lambda x: x.t, self.anchor, time)
+        anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
         return dataclasses.replace(self, system=system, anchor=anchor, expected=expected)
 
+    def watch(self, lanes: Lanes, target: Target) -> Watch:
+        """Guards and levels at lanes, without input."""
+        xp, L = namespace(lanes.t), lanes.t.shape[0]
+        u, everywhere = xp.zeros((self.structure.nu, L)), xp.ones(L, bool)
+        return watch(self.structure, lanes.t, lanes.chart, lanes.q, u, target, everywhere)
+
+    def slopes(self, lanes: Lanes) -> Float[Array, "d L"]:
+        """The vector field at lanes, without input."""
+        u = namespace(lanes.t).zeros((self.structure.nu, lanes.t.shape[0]))
+        return slopes(self.structure, lanes.t, lanes.chart, lanes.q, u)
+
     def departure(self, q: Float[Array, " d"]) -> Lanes:
-        """The lane at the beginning of a turn: an event that was just there is not due again."""
+        """The lane at the beginning of a turn; an event that has just happened is not armed."""
         s, anchor = self.structure, self.anchor
-        lanes, xp = start_lanes(s, anchor.t, anchor.chart, q[:, None]), namespace(q)
-        u, everywhere = xp.zeros((s.nu, 1)), xp.ones(1, bool)
-        seen = watch(s, lanes.t, lanes.chart, lanes.q, u, until(lanes.t), everywhere)
-        lanes = arm(s, lanes, seen, self.expected[None])
-        if isinstance(self.base, AtEvent):
-            own = np.arange(len(s.transitions))[:, None] == s.transition_index(self.base.name)
-            lanes = lanes._replace(armed=lanes.armed & ~own)
-        return lanes
+        lanes = start_lanes(s, anchor.t, anchor.chart, q[:, None])
+        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), self.expected[None])
+        other = np.arange(len(s.transitions))[:, None] != self.event
+        return lanes._replace(armed=lanes.armed & other) if self.event >= 0 else lanes
 
     def turn(self, q: Float[Array, " d"]) -> Return:
         """One turn from a state on the section."""
-
-        def flow(lanes, target, h, result):
-            u = namespace(q).zeros((self.structure.nu, 1))
-            moved = move(
-                self.structure, lanes, u, target, self.settings, h, result, new_input=False
-            )
-            return moved, None
-
-        there, _ = self.travel(q, flow)
-        return there
+        s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
+        flow = lambda *x: (move(s, x[0], u, x[1], self.settings, *x[2:], new_input=False), None)  # noqa: E731
+        return self.travel(q, flow)[0]
 
     def turn_with_jacobian(
         self,
@@ -178,62 +179,67 @@ class ReturnMap(eqx.Module):
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
-        **Arguments:** `wanted`: whether derivatives by the state are; otherwise they mean nothing.
-        `direction`: in the parameters, a system whose numbers are the direction (the phase of the
-        clock at the anchor stays what it is).
+        **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
+        otherwise they are meaningless. `direction`: a system whose numbers are a direction of the
+        parameters (the phase of the clock at the anchor is held).
         """
         s, n, xp = self.structure, q.shape[0], namespace(q)
-        growth = self._growth_of_times(direction)
+        moved_system = lambda step: jax.tree_util.tree_map(  # noqa: E731
+            lambda x, v: x + step * v if eqx.is_inexact_array(x) else x, self.system, direction
+        )
+        growth = 0.0  # relative change of all times with the parameter, as the clock's period
+        if direction is not None and self.base is None:
+            period = lambda step: jnp.asarray(moved_system(step).period(), float)  # noqa: E731
+            growth = _derivative(period) / period(0.0)
 
         def flow(lanes, target, h, result):
             jacobian, moved, tape = flow_jacobian(
-                s, lanes, target, self.settings, h, result, of_states=True, new_input=False,
-                wanted=wanted,
+                s, lanes, target, self.settings, h, result,
+                of_states=True, new_input=False, wanted=wanted,
             )  # fmt: skip
             factor = jacobian[0, 1 : n + 1]
             if direction is not None:
 
                 def end(step):
                     grown = 1 + growth * step
-                    begin = eqx.tree_at(lambda x: x.t, lanes, lanes.t * grown)
+                    begin = lanes._replace(t=lanes.t * grown)
                     time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
                     to = dataclasses.replace(target, time=time)
-                    moved = Structure(_moved(self.system, direction, step))
-                    return retrace(moved, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
+                    other = dataclasses.replace(self, system=moved_system(step)).structure
+                    return replay(other, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
 
-                # The parameter as one more state, which stays what it is.
-                column = _derivative(end)[:, None]
+                # The parameter is one more state, which is constant.
                 last = jnp.zeros((1, n + 1)).at[0, n].set(1.0)
-                factor = jnp.concatenate([jnp.concatenate([factor, column], axis=1), last])
+                factor = jnp.concatenate([jnp.column_stack([factor, _derivative(end)]), last])
             return moved, (lanes, factor, tape.code, tape.t)
 
-        there, (legs, factors, codes, times) = self.travel(q, flow)
+        end, (legs, factors, codes, times) = self.travel(q, flow)
         legs = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), legs)
         codes, product = codes[..., 0], monodromy(factors)
         off, by_state = self.held(q)
         jacobian = xp.where(self.valid[:, None], product[:n, :n], 0.0) - np.eye(n) - by_state
         by_parameter = None
         if direction is not None:
-            hold = lambda step: self._with(_moved(self.system, direction, step)).held(q)[0]  # noqa: E731
+            hold = lambda x: dataclasses.replace(self, system=moved_system(x)).held(q)[0]  # noqa: E731
             by_parameter = jnp.where(self.valid, product[:n, n], 0.0) - _derivative(hold)
         factors = factors[:, :n, :n]
         if self.base is not None:
             factors = self._across(legs, factors)
-        defect = xp.abs(there.residual) + xp.abs(off)
+        defect = xp.abs(end.residual) + xp.abs(off)
         return Turn(
-            there.residual, jacobian, by_parameter, legs, factors, codes, times[..., 0],
-            there.period, xp.max(defect / self.sizes), there.result, self._meetings(legs, codes),
+            end.residual, jacobian, by_parameter, legs, factors, codes, times[..., 0],
+            end.period, xp.max(defect / self.sizes), end.result, self._meetings(legs, codes),
         )  # fmt: skip
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
-        """Whether a state lies on a cycle, and what is wrong if it does not: a `Result` code."""
+        """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
         sizes, valid, xp = self.sizes, self.valid, namespace(q)
         defect = monodromy(turn.factors) - xp.diag(valid * 1.0) - self.held(q)[1]
         singular = singular_values(defect * sizes / sizes[:, None])
         smallest = xp.min(xp.where(np.arange(len(q)) < valid.sum(), singular, np.inf))
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
-        found = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(turn.closed, found, code)
+        closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
+        code = xp.where(turn.closed, closed, code)
         if self.base is not None:
             same = turn.legs.chart == self.anchor.chart
             apart = xp.max(xp.abs(turn.legs.q - q[:, None]) / sizes[:, None], axis=0)
@@ -248,12 +254,12 @@ class ReturnMap(eqx.Module):
         """The step of the state that takes conserved quantities away from their values, as far as
         they are away, and its derivative (with the direction of the step held fixed).
 
-        Along P(q) - q nothing that is conserved changes, so that P(q) - q and this step can add up
-        to zero only where both are zero; and J - I is regular once the derivative is taken from it.
+        Conserved quantities do not change along P(q) - q. So P(q) - q and this step can add up to
+        zero only if both are zero; and J - I is regular once the derivative is subtracted from it.
         """
-        s, xp, sizes = self.structure, namespace(q), self.sizes
+        xp, sizes = namespace(q), self.sizes
         if not self.conserved:
-            return xp.zeros_like(q), xp.zeros((s.d, s.d))
+            return xp.zeros_like(q), xp.zeros((len(q), len(q)))
         excess, gradient = self._excess(q)
         steep = xp.linalg.norm(gradient * sizes, axis=1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
@@ -269,90 +275,70 @@ class ReturnMap(eqx.Module):
             a = int(self.anchor.chart[0])
             n = s.dims[a]
             point = t[None], q[:n, None], np.zeros((s.nu, 1))
-            found = kernels.outputs(s, a, names, *point)[..., 0]
-            gradient = np.zeros((len(names), s.d))
-            gradient[:, :n] = found[:, 2 : 2 + n]
-            return found[:, 0] - values, gradient
+            rows = kernels.outputs(s, a, names, *point)[..., 0]
+            return rows[:, 0] - values, np.pad(rows[:, 2 : 2 + n], [(0, 0), (0, s.d - n)])
         outputs, u = s.resolve_outputs(names), jnp.zeros(s.nu)
         branches = [lambda q, a=a: outputs(a, t, q[: s.dims[a]], u) for a in range(len(s.charts))]
         excess = lambda q: jax.lax.switch(self.anchor.chart[0], branches, q) - values  # noqa: E731
         return excess(q), jax.jacfwd(excess)(q)
 
-    def _with(self, system: HybridSystem) -> "ReturnMap":
-        return dataclasses.replace(self, system=system)
-
     def travel(self, q: Float[Array, " d"], flow: Callable) -> tuple[Return, Any]:
-        """One turn, piece by piece, each done by `flow`, and what `flow` returned besides."""
-        targets, xp = self._leg_targets(), namespace(q)
-        each, common = eqx.partition(targets, _per_lane(targets))
+        """One turn, piece by piece, each computed by `flow`, and the other results of `flow`.
 
-        def leg(carry, target):
+        The pieces end at K - 1 times, then on the section on which the turn began.
+        """
+        xp, t0, expected = namespace(q), self.anchor.t[0], self.expected
+        k = xp.arange(1, LEGS + 1)
+        if self.base is None:
+            ends = toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+        else:
+            free = 1 - (1 - _FREE) / self.multiplicity
+            time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
+            ends = toward(time, -1, t0 + 3 * expected)
+            section = to_section(ends, self.base, self.event)
+            last = k == LEGS
+            ends = dataclasses.replace(
+                section,
+                event=xp.where(last, section.event, -1).astype(np.int32),
+                index=xp.where(last, section.index, -1).astype(np.int32),
+            )
+
+        def leg(carry, end):
             lanes, h, result = carry
-            target = jax.tree_util.tree_map(lambda x: x[None], target)
-            moved, extra = flow(lanes, eqx.combine(target, common), h, result)
+            target = Target(*(x[None] for x in end), None, ends.levels, ends.missed)
+            moved, extra = flow(lanes, target, h, result)
             return (moved.lanes, moved.h, moved.result), extra
 
-        first_step = (0.5 * self.expected / LEGS)[None]
-        begin = (self.departure(q), first_step, xp.zeros(1, xp.int32))
+        begin = self.departure(q), (0.5 * expected / LEGS)[None], xp.zeros(1, xp.int32)
+        each = ends.time, ends.index, ends.event, ends.limit
         (end, _, result), extra = scan(leg, begin, each)
         same = (result[0] == Result.OK) & (end.chart[0] == self.anchor.chart[0])
         residual = xp.where(self.valid, end.q[:, 0], 0.0) - q - self.held(q)[0]
         residual = xp.where(same, residual, np.nan)
-        return Return(residual, end.t[0] - self.anchor.t[0], result[0]), extra
-
-    def _leg_targets(self) -> Target:
-        """Targets of the pieces of one turn: K - 1 times, then the section it began on."""
-        xp, t0, expected = namespace(self.anchor.t), self.anchor.t[0], self.expected
-        k = xp.arange(1, LEGS + 1)
-        if self.base is None:
-            return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
-        free = 1 - (1 - _FREE) / self.multiplicity
-        time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
-        target = toward(time, -1, t0 + 3 * expected)
-        last = k == LEGS
-        if isinstance(self.base, AtEvent):
-            event = self.structure.transition_index(self.base.name)
-            event = xp.where(last, event, -1).astype(np.int32)
-            return dataclasses.replace(target, event=event)
-        index = xp.where(last, 0, -1).astype(np.int32)
-        return dataclasses.replace(target, index=index, levels=ListLevels((self.base,)))
+        return Return(residual, end.t[0] - t0, result[0]), extra
 
     def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
-        s, xp = self.structure, namespace(codes)
+        xp = namespace(codes)
         if self.base is None:
             return xp.asarray(self.multiplicity, dtype=np.int32)
-        if isinstance(self.base, AtEvent):
-            own = codes == s.transition_index(self.base.name)
-            return xp.sum(own, dtype=np.int32)
-        K = legs.t.shape[0]
-        target = dataclasses.replace(until(legs.t), levels=ListLevels((self.base,)))
-        u, everywhere = xp.zeros((s.nu, K)), xp.ones(K, bool)
-        level = watch(s, legs.t, legs.chart, legs.q, u, target, everywhere).value[-1]
+        if self.event >= 0:
+            return xp.sum(codes == self.event, dtype=np.int32)
+        level = self.watch(legs, to_section(until(legs.t), self.base)).value[-1]
         falls = (level[1:-1] > 0) & (level[2:] <= 0) & (legs.events[1:-1] == legs.events[2:])
         return 1 + xp.sum(falls, dtype=np.int32)
 
     def _across(self, legs: Lanes, factors: Float[Array, "K d d"]) -> Float[Array, "K d d"]:
         """The factors on the states modulo the direction of the flow.
 
-        Along the flow of an autonomous system nothing contracts. Taken out of every factor, that
-        direction cannot drown a strong contraction across it.
+        Nothing contracts along the flow of an autonomous system. Projected out of every factor,
+        that direction cannot drown a strong contraction across it.
         """
-        s, xp, sizes = self.structure, namespace(factors), self.sizes_in(legs.chart)
-        f = slopes(s, legs.t, legs.chart, legs.q, xp.zeros((s.nu, legs.t.shape[0]))).T / sizes
+        xp, sizes = namespace(factors), self.settings.scale[legs.chart]
+        f = self.slopes(legs).T / sizes
         f = f / xp.linalg.norm(f, axis=1, keepdims=True)
-        project = np.eye(s.d) - f[:, :, None] * f[:, None, :]
+        project = np.eye(f.shape[1]) - f[:, :, None] * f[:, None, :]
         project = project * sizes[:, :, None] / sizes[:, None, :]
         return xp.roll(project, -1, axis=0) @ factors @ project
-
-    def _growth_of_times(self, direction: HybridSystem | None) -> Float[Array, ""]:
-        """How fast all times of a turn grow, relatively, along a direction in the parameters:
-        with the period of the clock, if there is one."""
-        if direction is None or self.base is not None:
-            return np.zeros(())
-        period = lambda step: jnp.asarray(  # noqa: E731
-            _moved(self.system, direction, step).period(), float
-        )
-        return _derivative(period) / period(0.0)
 
 
 def turn_product(factors: Float[np.ndarray, "S K d d"]) -> Float[np.ndarray, "S d d"]:
@@ -361,19 +347,5 @@ def turn_product(factors: Float[np.ndarray, "S K d d"]) -> Float[np.ndarray, "S 
 
 
 def _derivative(function: Callable[[Array], Array]) -> Array:
-    """Of a function of one number, at zero."""
+    """The derivative of a function of one number, at zero."""
     return jax.jvp(function, (jnp.zeros(()),), (jnp.ones(()),))[1]
-
-
-def _moved(system: HybridSystem, direction: HybridSystem, step) -> HybridSystem:
-    """`system`, with its parameters moved by `step` along `direction`."""
-    return jax.tree_util.tree_map(
-        lambda x, v: x + step * v if eqx.is_inexact_array(x) else x, system, direction
-    )
-
-
-def _per_lane(targets: Target) -> Target:
-    """Mark the leaves of a `Target` that have one entry per lane."""
-    marks = jax.tree_util.tree_map(lambda _: False, targets)
-    fields = lambda x: (x.time, x.index, x.event, x.limit)  # noqa: E731
-    return eqx.tree_at(fields, marks, (True,) * 4)

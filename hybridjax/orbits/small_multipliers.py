@@ -1,4 +1,7 @@
-"""The monodromy in factors that each contract little, for multipliers that are all but zero."""
+"""Multipliers that are all but zero: the monodromy in factors that each contract little, and the
+product of all multipliers by Liouville's formula."""
+
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +15,8 @@ from .return_map import ReturnMap
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# Steps of the flow are multiplied as long as the weakest direction of their product keeps so much:
-# twice as much makes more factors, and half loses a bit of small multipliers.
+# Steps of the flow are multiplied as long as their product keeps this part of its weakest
+# direction. Larger: more factors. Smaller: small multipliers lose digits.
 _WEAKEST = 1e-4
 
 
@@ -24,18 +27,7 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
     map = to_host(map)
-    s, moves = map.structure, []
-
-    def flow(lanes, target, h, result):
-        u = np.zeros((s.nu, 1))
-        moved, tape = record(
-            s, lanes, u, target, map.settings, h, result, new_input=False, tangents=True
-        )
-        moves.extend(links(s, lanes, target, tape))
-        return moved, None
-
-    with at_ease():
-        map.travel(map.anchor.q[:, 0], flow)
+    moves = [move for piece in _pieces(map, links, tangents=True) for move in piece]
     frames = [_frame(map, move) for move in moves]
     factors: list[Matrix] = []
     for k, move in enumerate(moves):
@@ -47,6 +39,34 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
         else:
             factors.append(factor)
     return factors
+
+
+def log_determinant(map: ReturnMap) -> float:
+    """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
+    of the field, integrated over one turn.
+
+    Steps of an implicit method lose a mode that decays within them; this gives its decay.
+    """
+    return float(
+        np.sum(_pieces(to_host(map), lambda s, lanes, _, tape: divergence(s, lanes, tape)))
+    )
+
+
+def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:
+    """`measure(structure, lanes, target, tape)` of each piece of one turn."""
+    s, parts = map.structure, []
+
+    def flow(lanes, target, h, result):
+        u = np.zeros((s.nu, 1))
+        moved, tape = record(
+            s, lanes, u, target, map.settings, h, result, new_input=False, tangents=tangents
+        )
+        parts.append(measure(s, lanes, target, tape))
+        return moved, None
+
+    with at_ease():
+        map.travel(map.anchor.q[:, 0], flow)
+    return parts
 
 
 def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
@@ -63,30 +83,10 @@ def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
     return to.T, back
 
 
-def weakest(factor: Matrix, besides: int = 0) -> float:
-    """What a factor leaves of its weakest direction, besides so many weaker ones, as a part of
-    what it leaves of the strongest, or of 1 if that shrinks, too."""
+def weakest(factor: Matrix, weaker: int = 0) -> float:
+    """The gain of a factor in its weakest direction but for so many `weaker` ones, relative to the
+    gain in its strongest, or to 1 if that is smaller."""
     singular = np.linalg.svd(factor, compute_uv=False)
-    if len(singular) <= besides:
+    if len(singular) <= weaker:
         return np.inf
-    return singular[-1 - besides] / max(singular[0], 1.0)
-
-
-def log_determinant(map: ReturnMap) -> float:
-    """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
-    of the field, integrated over one turn.
-
-    Steps of an implicit method forget a mode that decays within them; this is how it decays.
-    """
-    map = to_host(map)
-    s, parts = map.structure, []
-
-    def flow(lanes, target, h, result):
-        u = np.zeros((s.nu, 1))
-        moved, tape = record(s, lanes, u, target, map.settings, h, result, new_input=False)
-        parts.append(divergence(s, lanes, tape))
-        return moved, None
-
-    with at_ease():
-        map.travel(map.anchor.q[:, 0], flow)
-    return float(np.sum(parts))
+    return singular[-1 - weaker] / max(singular[0], 1.0)

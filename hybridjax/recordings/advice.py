@@ -14,12 +14,11 @@ from .._core.results import Result
 from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import RecordedData
-from ..identify.multipliers.compare import compare_multipliers
+from ..identify.multiplier_estimate import compare_multipliers
 from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refuse_order
-from ..identify.series.cycle_grid import CycleGrid
+from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.parts import Parts
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.validation.validate import Validation
 from .beats.response import PhaseResponse
 from .data import SectionData
@@ -56,7 +55,7 @@ def plain_regression(data: RecordedData, order: Order) -> Complex[np.ndarray, " 
 
     To see by how much: `fit_series` has no such bias.
     """
-    parts = Parts(data)
+    parts = PreparedRecords(data)
     problem = OutputErrorProblem.from_data(parts, order, parts.n_sections, free_start=True)
     return ordinary_least_squares(delayed_outputs(problem, order))
 
@@ -104,11 +103,11 @@ def advise(
     """
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    parts = Parts(data)
+    parts = PreparedRecords(data)
     overhang = R - 1 - fit.lead - d * N
     problem = OutputErrorProblem.from_data(parts, d, overhang, free_start=True)
     delayed, grid = delayed_outputs(problem, d), parts.whole()
-    sampled = int(np.isfinite(grid.y).all(axis=3).sum(axis=(0, 1)).min())
+    sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
     unknown = R * nu + len(grid.y) * (d + 1)
     plain = ordinary_least_squares(delayed)
     bias = float(compare_multipliers(plain, fit.multipliers).max_error)
@@ -120,7 +119,7 @@ def advise(
             "record more, take fewer sections, or excite fewer inputs."
         )
     try:
-        refuse_order(delayed.rescale(fit.noise / problem.scale))
+        refuse_order(delayed, fit.noise / problem.scale)
     except DefinitionError:
         warnings.append(
             f"Order: the data do not carry {d} multipliers. The weakest may be noise alone (or "
@@ -180,8 +179,9 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
 
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[str]:
     """Whether two of them are one number."""
-    for i, j in combinations(range(grid.y.shape[3]), 2):
-        if _correlation(grid.y[..., i], grid.y[..., j]) > _SAME_OUTPUTS:
+    y = np.where(grid.sampled, grid.y, np.nan)
+    for i, j in combinations(range(y.shape[3]), 2):
+        if _correlation(y[..., i], y[..., j]) > _SAME_OUTPUTS:
             yield (
                 f"Outputs: where sections are crossed, {fit.outputs[i]} and {fit.outputs[j]} are "
                 "two sides of one number, as signals are whose angle is the phase. Cycles from "

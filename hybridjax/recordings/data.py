@@ -102,7 +102,6 @@ class SectionData(eqx.Module):
             periods=periods,
             inputs=self.inputs,
             outputs=self.outputs,
-            label="recorded",
         )
 
     def _repr_html_(self) -> str:

@@ -8,13 +8,12 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
-from ..identify.multipliers.denominator import Denominator
+from ..identify.denominator import Denominator
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import assemble, fit_series
+from ..identify.series.fit import SeriesFit, assemble, fit_series
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.parts import Parts
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.records import PreparedRecords
 from ..identify.validation.simulation import can_be_compared, simulate_record
 from ..identify.validation.validate import Validation, validate
 from .data import SectionData
@@ -41,7 +40,7 @@ def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
     early, late = _split(data, share)
-    parts = Parts(early)
+    parts = PreparedRecords(early)
     rest = uninterrupted_records(late)
     fits = []
     for d in range(1, most + 1):

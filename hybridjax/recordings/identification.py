@@ -9,13 +9,12 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import fit_series
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.fit import SeriesFit, fit_series
 from .advice import Advice, advise
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .drift import DriftCycles, without_drift
-from .held_out import CYCLES_LOOKED_AT, HeldOut, choose_order, hold_out
+from .held_out import HeldOut, choose_order, hold_out
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.finding import Finding
 from .inspection.look import inspect, inspect_cycles, refuse
@@ -115,11 +114,8 @@ def identify_recording(
     order = choose_order(data) if order is None else order
     say("fit to the first three quarters")
     held = hold_out(data, order)
-    # Where the held-out fit saw only the beginning of a long recording and found no part of second
-    # order that pays, the whole is not asked again.
-    known = data.cycles > CYCLES_LOOKED_AT and not held.fit.distortion
     say("fit to all")
-    fit = fit_series(data, order, check=False, distortion=False if known else None)
+    fit = fit_series(data, order, check=False)
     curve = _curve(recording, found, data)
     return Identification(
         recording=recording,

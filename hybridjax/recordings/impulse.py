@@ -12,7 +12,7 @@ from .._core.boundary.kinds import Positive
 from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
-from ..identify.series.series_fit import SeriesFit
+from ..identify.series.fit import SeriesFit
 from .data import SectionData
 from .spectra import input_band
 

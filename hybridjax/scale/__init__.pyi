@@ -1,1 +1,1 @@
-from .points import Points as Points, sobol_points as sobol_points
+from .family import Points as Points

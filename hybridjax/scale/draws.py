@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, ExperimentCount, Index, Path, Seed
-from .._core.pieces.blocks import Blocks
+from .._core.boundary.kinds import Count, ExperimentCount, Path, Seed
 from .._core.pieces.description import function_digest, versions
-from .._core.pieces.layout import Constant, Layout, Variable
-from .._core.pieces.place import filled
-from .._core.pieces.run import DaskClient, call
+from .._core.pieces.run import DaskClient, Workers, call, fill
+from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
 
 
-# Pieces of a call, unless it is told how many draws each has. Doubled, twice the files, and half as
-# much is lost with a worker.
+# Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
+# files.
 _PIECES = 256
+# Draws that may fail before the first success. Fewer: computations that fail often are refused.
+# More: it takes longer to report that none succeeds.
+_ATTEMPTS = 20
 
 
 @checked
@@ -31,8 +32,7 @@ def monte_carlo(
     *,
     chunk: Count | None = None,
     store: Path | None = None,
-    client: DaskClient | None = None,
-    share: tuple[Index, ExperimentCount] = (0, 1),
+    client: Workers | None = None,
 ) -> Any:
     """Draw a random computation many times.
 
@@ -45,123 +45,127 @@ def monte_carlo(
     errors.value.std("draw")
     ```
 
-    Draw i has a stream of random numbers of its own, that of
+    Draw i has its own stream of random numbers, that of
     `numpy.random.SeedSequence(seed, spawn_key=(i,))`. So results do not depend on the number of
-    processes, nor on interruptions, and more draws leave the first ones what they are.
+    processes nor on interruptions, and with more draws the first ones stay the same.
 
     **Arguments:**
 
-    - `function` of a `numpy.random.Generator`: gives a number, an array, or a mapping of names to
-        such; always of the same shapes. A draw that raises `ComputationError` is NaN.
-    - `draws`: how many. `seed`, of all of them.
-    - `chunk`: draws in one piece.
-    - `store`, `client`, `share`: as of `sweep`.
+    - `function` of a `numpy.random.Generator`: returns a number, an array, or a mapping of names to
+        numbers and arrays, with the same names and shapes in every draw. A draw that raises
+        `ComputationError` is NaN.
+    - `draws`: their number. `seed`: of all of them. Default: 0.
+    - `chunk`: number of draws in a piece. Default: a 256th of all.
+    - `store`, `client`: as for `sweep`.
 
     **Returns:** an `xarray.Dataset` along `draw`, with the variables that `function` names, or
     `value`; and `failed`, 1 for draws that raised `ComputationError`.
 
-    **Raises:** `DefinitionError` for results that are no numbers, or change their names, their
+    **Raises:** `DefinitionError` for results that are no numbers, or that change their names, their
     shapes, or from real to complex ones, and as `sweep`; `ComputationError` if the first draws
-    fail, so that it is not known what results look like; what else `function` raises.
+    fail, so that the form of results is unknown; any other error that `function` raises.
     """
     blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
-    description = {
-        "kind": "monte_carlo",
-        "versions": versions(),
-        "function": function_digest(function),
-        "draws": draws,
-        "seed": seed,
-        "piece": list(blocks.block),
-    }
-    job = Draws(function, seed, blocks)
-
-    def begin() -> tuple[Draws, Layout, list[np.ndarray]]:
-        variables = call(job, "first", client)
-        number = {"draw": Constant(("draw",), np.arange(draws))}
-        layout = Layout(("draw",), blocks, variables, number, ("draw",), description)
-        return dataclasses.replace(job, variables=variables), layout, []
-
-    def again(layout: Layout, start: list[np.ndarray]) -> Draws:
-        return dataclasses.replace(job, variables=layout.variables)
-
-    return filled(begin, again, description, store, client, share).dataset()
-
-
-# Draws after which nobody hopes for one that succeeds. Doubled, twice as many.
-_HOPE = 20
+    return fill(Draws(function, seed, blocks), store, client).dataset()
 
 
 @dataclasses.dataclass(frozen=True)
 class Draws:
-    """**Fields:** `function`, drawn with streams of `seed`, in `blocks`; `variables`, what it
-    gives."""
+    """**Fields:** `function`, drawn with streams of `seed`, in `blocks`; `variables`: the form of
+    its results."""
 
     function: Callable[[np.random.Generator], Any]
     seed: int
     blocks: Blocks
     variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """JSON from which the draws can be told from others."""
+        return {
+            "kind": "monte_carlo",
+            "versions": versions(),
+            "function": function_digest(self.function),
+            "draws": self.blocks.shape[0],
+            "seed": self.seed,
+            "piece": list(self.blocks.block),
+        }
+
+    def begin(self, client: DaskClient | None) -> tuple["Draws", Layout]:
+        """Return the job with the form of its results."""
+        variables = call(self, "first", client)
+        number = {"draw": (("draw",), np.arange(self.blocks.shape[0]))}
+        layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
+        return dataclasses.replace(self, variables=variables), layout
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return nothing: draws depend on their numbers only."""
+        return []
+
+    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "Draws":
+        """Return the job with the form of results in a store."""
+        return dataclasses.replace(self, variables=layout.variables)
+
     def first(self) -> dict[str, Variable]:
-        """What results look like, from the first draw that succeeds."""
-        for i in range(min(_HOPE, *self.blocks.shape)):
+        """Return the form of results, from the first draw that succeeds."""
+        failure = None
+        for i in range(min(_ATTEMPTS, *self.blocks.shape)):
             try:
                 values = self._draw(i)
             except ComputationError as error:
                 failure = error
                 continue
-            found = {
+            variables = {
                 name: Variable(x.dtype.str, tuple(f"{name}_{j}" for j in range(x.ndim)), x.shape)
                 for name, x in values.items()
             }
-            return found | {"failed": Variable("<i8")}
+            return variables | {"failed": Variable("<i8")}
         raise ComputationError(f"the first draws all failed, the last because {failure}")
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
-        """The draws of piece k."""
+        """Return the draws of piece k."""
         (rows,) = self.blocks.slices(k)
         count = rows.stop - rows.start
-        found = {
+        drawn = {
             name: np.full((count, *x.shape), x.fill, x.dtype) for name, x in self.variables.items()
         }
         for i in range(count):
             try:
                 values = self._draw(rows.start + i)
             except ComputationError:
-                found["failed"][i] = 1
+                drawn["failed"][i] = 1
                 continue
-            found["failed"][i] = 0
-            unlike = _difference(values, self.variables)
-            if unlike is not None:
+            drawn["failed"][i] = 0
+            change = self._change(values)
+            if change is not None:
                 raise DefinitionError(
                     "`function` must always give arrays of the same names and shapes, and real or "
-                    f"complex ones only: draw {rows.start + i} has {unlike}."
+                    f"complex ones only: draw {rows.start + i} has {change}."
                 )
             for name, x in values.items():
-                found[name][i] = x
-        return found
+                drawn[name][i] = x
+        return drawn
 
     def _draw(self, i: int) -> dict[str, np.ndarray]:
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))
         values = self.function(np.random.default_rng(stream))
-        named = values if isinstance(values, Mapping) else {"value": values}
-        found = {}
-        for name, value in named.items():
+        arrays = {}
+        for name, value in (values if isinstance(values, Mapping) else {"value": values}).items():
             x = np.asarray(value)
             if x.dtype.kind not in "biufc" or name in ("failed", "draw"):
                 raise DefinitionError(
                     f"`function` must give numbers, by names other than `failed` and `draw`, not "
                     f"`{name}`: a {type(value).__name__}."
                 )
-            found[name] = x.astype(complex if x.dtype.kind == "c" else float)
-        return found
+            arrays[name] = x.astype(complex if x.dtype.kind == "c" else float)
+        return arrays
 
-
-def _difference(values: Mapping[str, np.ndarray], variables: Mapping[str, Variable]) -> str | None:
-    """What a draw gives that the first one did not, in words."""
-    for name, x in values.items():
-        if name not in variables or x.shape != variables[name].shape:
-            return f"`{name}` of the shape {x.shape}"
-        if x.dtype.kind == "c" and np.dtype(variables[name].dtype).kind != "c":
-            return f"`{name}` with complex numbers"
-    missing = [name for name in variables if name not in (*values, "failed")]
-    return f"no `{missing[0]}`" if missing else None
+    def _change(self, values: Mapping[str, np.ndarray]) -> str | None:
+        """Return the first difference of a draw from the form of results, in words."""
+        for name, x in values.items():
+            if name not in self.variables or x.shape != self.variables[name].shape:
+                return f"`{name}` of the shape {x.shape}"
+            if x.dtype.kind == "c" and np.dtype(self.variables[name].dtype).kind != "c":
+                return f"`{name}` with complex numbers"
+        missing = [name for name in self.variables if name not in (*values, "failed")]
+        return f"no `{missing[0]}`" if missing else None

@@ -1,16 +1,23 @@
-"""Systems as a function of parameters."""
+"""Systems as a function of parameters, and the points at which a sweep evaluates them."""
 
+import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from .._core.arguments import Numbers
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import ExperimentCount, Seed
+from .._core.boundary.values import Reals
 from .._core.fingerprint import IndescribableError, program_digest
 from .._core.pieces.description import digest_of, function_digest
+from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..engine.describe import describe
 from ..errors import DefinitionError
@@ -18,25 +25,111 @@ from ..systems.check import check_system
 from ..systems.system import HybridSystem, unit_of_parameter
 
 
+Axes = Mapping[str, Annotated[Numbers, Reals("n")]]
+"""Values of parameters by name."""
+
+
+@checked
+class Points:
+    """A list of points for `sweep`, each with one value of every parameter."""
+
+    def __init__(self, values: Axes):
+        """**Arguments:** `values` of each parameter by name, all of one length.
+
+        **Raises:** `DefinitionError` if there are none, or lengths differ.
+        """
+        self.values = {name: np.asarray(x, float) for name, x in values.items()}
+        lengths = sorted({len(x) for x in self.values.values()})
+        if len(lengths) != 1 or lengths == [0]:
+            raise DefinitionError(
+                f"`values` must hold at least one point, and as many values of each parameter, "
+                f"not {', '.join(map(str, lengths)) or 'none'}."
+            )
+
+    @classmethod
+    def sobol(
+        cls, ranges: Mapping[str, tuple[float, float]], count: ExperimentCount, *, seed: Seed = 0
+    ) -> "Points":
+        """Return points that cover a box evenly, from a scrambled Sobol sequence (Owen 1998).
+
+        **Arguments:** `ranges`: the lowest and the highest value of each parameter. `count`: number
+        of points, best a power of two. `seed`: of the scrambling. Default: 0.
+
+        **Raises:** `DefinitionError` for an empty range.
+        """
+        from scipy.stats import qmc  # takes long to import
+
+        for name, (low, high) in ranges.items():
+            if not low < high:
+                message = f"the range of `{name}` must go up, not from {low} to {high}."
+                raise DefinitionError(message)
+        if not ranges:
+            raise DefinitionError("`ranges` must name at least one parameter.")
+        sequence = qmc.Sobol(len(ranges), rng=np.random.default_rng(seed))
+        unit = sequence.random_base2(max(count - 1, 0).bit_length())[:count]
+        low, high = np.array(list(ranges.values())).T
+        return cls(dict(zip(ranges, (low + (high - low) * unit).T, strict=True)))
+
+    def __len__(self) -> int:
+        return len(next(iter(self.values.values())))
+
+    def __repr__(self) -> str:
+        return f"Points({len(self)} of {', '.join(self.values)})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """The points of a sweep: all combinations of the values on the `axes` if `grid`, else a list of
+    points."""
+
+    axes: Mapping[str, Float[np.ndarray, " n"]]
+    grid: bool
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the dimensions of results."""
+        return tuple(self.axes) if self.grid else ("point",)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of points along the dimensions."""
+        return tuple(map(len, self.axes.values()))[: len(self.dims)]
+
+    def at(self, index: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
+        """Return the parameters at some points, given one index array per dimension."""
+        each = index if self.grid else index * len(self.axes)
+        return {name: x[i] for (name, x), i in zip(self.axes.items(), each, strict=True)}
+
+    def constants(self, units: Mapping[str, str]) -> dict[str, Constant]:
+        """Return the parameters as coordinates of results."""
+        return {
+            name: (
+                (name if self.grid else "point",),
+                x,
+                {"units": units[name]} if units[name] else {},
+            )
+            for name, x in self.axes.items()
+        }
+
+
 class Family:
-    """What `sweep` is given: a system of which some parameters take other values, or a function of
-    parameters that returns a system."""
+    """A system some of whose parameters vary, or a function of parameters that returns a system."""
 
     def __init__(self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]):
         self.model, self.names = model, tuple(names)
-        known, required = _parameters(model)
+        allowed, required = _parameters(model)
         for name in self.names:
-            if known is not None and name not in known:
+            if allowed is not None and name not in allowed:
                 raise DefinitionError(
                     f"`{name}` is no parameter of the model; its parameters are "
-                    f"{', '.join(known) or 'none'}."
+                    f"{', '.join(allowed) or 'none'}."
                 )
         for name in required:
             if name not in self.names:
                 raise DefinitionError(f"the model needs `{name}`: give it an axis.")
 
     def system(self, values: Mapping[str, Any]) -> Any:
-        """The system at one point."""
+        """Return the system at one point."""
         if not isinstance(self.model, HybridSystem):
             return self.model(**values)
         paths = [name.split(".") for name in self.names]
@@ -47,13 +140,13 @@ class Family:
         )
 
     def systems(self, values: Mapping[str, np.ndarray]) -> HybridSystem:
-        """The systems at some points: one whose arrays have a leading axis."""
+        """Return the systems at several points as one, whose arrays have a leading axis."""
         return eqx.filter_vmap(self.system)({name: jnp.asarray(x) for name, x in values.items()})
 
     def check(self, values: Mapping[str, float]) -> HybridSystem:
-        """The system at a point.
+        """Return the system at one point.
 
-        **Raises:** `DefinitionError` if there is none.
+        **Raises:** `DefinitionError` if `model` returns something else, or a bad system.
         """
         system = self.system({name: jnp.asarray(x) for name, x in values.items()})
         if not isinstance(system, HybridSystem):
@@ -66,23 +159,23 @@ class Family:
         return system
 
     def units(self, system: HybridSystem) -> dict[str, str]:
-        """Of the parameters, "" where none is known."""
-        found = {}
+        """Return the units of the parameters, "" if unknown."""
+        units = {}
         for name in self.names:
             try:
-                found[name] = unit_of_parameter(system, name)
+                units[name] = unit_of_parameter(system, name)
             except (AttributeError, KeyError):  # a parameter of a function
-                found[name] = ""
-        return found
+                units[name] = ""
+        return units
 
-    def describe(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """The model in words and digests, at a point."""
-        found = describe(self.check(values))
+    def describe(self, system: HybridSystem, values: Mapping[str, float]) -> dict[str, Any]:
+        """Return JSON from which the model can be told from others, given the system at a point."""
+        model = describe(system)
         if isinstance(self.model, HybridSystem):
             for name in self.names:
-                del found["numbers"][name]
-            return found
-        return found | {"from parameters": self._of_parameters(values)}
+                del model["numbers"][name]
+            return model
+        return model | {"from parameters": self._of_parameters(values)}
 
     def _of_parameters(self, values: Mapping[str, float]) -> str:
         def numbers(values):
@@ -96,7 +189,7 @@ class Family:
 
 
 def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
-    """Names that may be given (None: any), and those that have to be."""
+    """Return the names of all parameters (None: any name) and of those without a default."""
     if isinstance(model, HybridSystem):
         leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(model, eqx.is_inexact_array))[0]
         scalars = [path for path, leaf in leaves if leaf.shape == ()]

@@ -1,139 +1,130 @@
-"""What a sweep keeps of limit cycles."""
+"""Quantities that a sweep keeps of limit cycles."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .._core.pieces.layout import Constant, Variable
+from .._core.pieces.store import Constant, Variable
 from .._core.results import Result
 from .._core.signal import unit_of
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
 from ..systems.structure import Structure
+from ..systems.system import HybridSystem
 
 
 Want = Literal["period", "state", "multipliers", "spectral_radius", "events", "residual"]
 Measure = Callable[[LimitCycle], Any]
 
-# Events of a cycle that are kept, for each of those that the longest one of the coarse pass has.
+# Events of a cycle that are kept, for each event of the longest cycle of the coarse pass. Fewer:
+# the last events of longer cycles are lost. More: files are larger.
 _MORE_EVENTS = 4
 
 
 class Wanted:
-    """What is kept of each cycle: quantities by name, and what users' functions say of it."""
+    """Quantities to keep of each cycle: those with a name, and users' functions."""
 
-    def __init__(self, names: Sequence[Want], measures: Mapping[str, Measure]):
-        self.names, self.measures = tuple(dict.fromkeys(names)), dict(measures)
-        for name in {*self.names, "result", "chart"} & set(self.measures):
-            raise DefinitionError(
-                f"`measures` has a function of the name `{name}`, which is taken."
-            )
+    def __init__(self, want: Want | Measure | Sequence[Want | Measure], system: HybridSystem):
+        items = [want] if isinstance(want, str) or callable(want) else list(want)
+        self.names = tuple(dict.fromkeys(x for x in items if isinstance(x, str)))
+        functions = [x for x in items if not isinstance(x, str)]
+        self.measures = {getattr(f, "__name__", ""): f for f in functions}
+        taken = {*get_args(Want), "result", "chart", "state_name", "state_unit"}
+        for name in self.measures:
+            if not name.isidentifier() or name in taken or len(functions) > len(self.measures):
+                raise DefinitionError(
+                    "each function of `want` needs a name of its own, under which its values are "
+                    f"kept, other than {', '.join(sorted(taken))}: define it by `def`."
+                )
+        # (Words only: workers get a copy.)
+        s = Structure(system)
+        self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
+        self._states = [tuple(s.states(a)) for a in range(len(s.charts))]
+        self._all_states = list(dict.fromkeys(x for names in self._states for x in names))
+        self._events = [t.name for t in s.transitions]
 
     def variables(self, cycles: LimitCycles) -> dict[str, Variable]:
-        """What results look like, as a few cycles show.
+        """Return the form of results, given some cycles.
 
-        **Raises:** `ComputationError` if none of these was found, where that has to be known.
+        **Raises:** `ComputationError` if a function succeeds on none of them.
         """
-        s = Structure(cycles[0].system)
-        codes = {"flag_values": [int(x) for x in Result], "flag_meanings": _meanings(Result)}
-        found = {"result": Variable("<i8", attributes=codes)}
-        unit = {"units": str(s.system.time_unit)} if s.system.time_unit else {}
-        d = cycles.multipliers.shape[1]
-        charts = {"flag_values": list(range(len(s.names))), "flag_meanings": " ".join(s.names)}
-        names = [t.name for t in s.transitions]
-        events = {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
-        known: dict[str, dict[str, Variable]] = {
-            "period": {"period": Variable("<f8", attributes=unit)},
-            "state": {
-                "state": Variable("<f8", ("state_name",), (len(_states(s)),)),
-                "chart": Variable("<i8", attributes=charts),
-            },
-            "multipliers": {"multipliers": Variable("<c16", ("multiplier",), (d,))},
-            "spectral_radius": {"spectral_radius": Variable("<f8")},
-            "events": {
-                "events": Variable(
-                    "<i8", ("event",), (_MORE_EVENTS * cycles.codes.shape[1],), events
-                )
-            },
-            "residual": {"residual": Variable("<f8")},
+        width = _MORE_EVENTS * cycles.codes.shape[1]
+        values = self._values(cycles, width)
+        for name, measure in self.measures.items():
+            values[name] = self._first(cycles, name, measure)[None]
+        dims = {"state": "state_name", "multipliers": "multiplier", "events": "event"}
+        attributes = {
+            "result": _flags([x.name.lower() for x in Result], [int(x) for x in Result]),
+            "period": {"units": self._time_unit} if self._time_unit else {},
+            "chart": _flags(self._charts),
+            "events": _flags(self._events),
         }
-        for name in self.names:
-            found |= known[name]
-        for name, values in self._first(cycles).items():
-            dims = tuple(f"{name}_{i}" for i in range(values.ndim))
-            found[name] = Variable(values.dtype.str, dims, values.shape)
-        return found
+        return {
+            name: Variable(
+                x.dtype.str,
+                (dims[name],) if name in dims else tuple(f"{name}_{i}" for i in range(x.ndim - 1)),
+                x.shape[1:],
+                attributes.get(name, {}),
+            )
+            for name, x in values.items()
+        }
 
-    def constants(self, cycles: LimitCycles) -> dict[str, Constant]:
-        """Coordinates of results, beside the parameters."""
+    def constants(self) -> dict[str, Constant]:
+        """Return the coordinates of results beside the parameters."""
         if "state" not in self.names:
             return {}
-        states = _states(Structure(cycles[0].system))
-        units = np.array([str(unit_of(x)) for x in states])
-        return {
-            "state_name": Constant(("state_name",), np.array([str(x) for x in states])),
-            "state_unit": Constant(("state_name",), units),
-        }
-
-    def _first(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
-        """What users' functions say of the first cycle on which they succeed."""
-        found: dict[str, np.ndarray] = {}
-        for name, measure in self.measures.items():
-            error = None
-            for i in np.flatnonzero(cycles.ok):
-                try:
-                    found[name] = _numbers(name, measure(cycles[i]))
-                    break
-                except ComputationError as failure:
-                    error = failure
-            else:
-                raise ComputationError(
-                    f"`{name}` succeeds on none of {len(cycles)} points that are spread over all, "
-                    f"so it is not known what it gives ({error or 'none has a limit cycle'})."
-                )
-        return found
+        names = np.array([str(x) for x in self._all_states])
+        units = np.array([str(unit_of(x)) for x in self._all_states])
+        return {"state_name": (("state_name",), names), "state_unit": (("state_name",), units)}
 
     def values(
         self, cycles: LimitCycles, variables: Mapping[str, Variable]
     ) -> dict[str, np.ndarray]:
-        """Results of some cycles."""
-        found: dict[str, np.ndarray] = {"result": np.asarray(cycles.result, int)}
-        for name in self.names:
-            found |= getattr(self, f"_{name}")(cycles, variables)
+        """Return the results of some cycles."""
+        width = variables["events"].shape[0] if "events" in variables else 0
+        values = self._values(cycles, width)
         for name, measure in self.measures.items():
-            found[name] = self._measured(cycles, name, measure, variables[name])
-        return found
+            values[name] = self._measured(cycles, name, measure, variables[name])
+        return values
 
-    def _period(self, cycles, variables):
-        return {"period": np.where(cycles.ok, cycles.period, np.nan)}
+    def _values(self, cycles: LimitCycles, width: int) -> dict[str, np.ndarray]:
+        """Return the quantities with a name, with `width` events of each cycle."""
+        ok, size = cycles.ok, np.abs(cycles.multipliers)
+        codes = np.where(ok[:, None], cycles.codes, -1)[:, :width].astype(int)
+        q, chart = np.asarray(cycles.anchor.q)[..., 0], np.asarray(cycles.anchor.chart)[:, 0]
+        state = np.full((len(ok), len(self._all_states)), np.nan)
+        for a, names in enumerate(self._states):
+            rows = np.flatnonzero(ok & (chart == a))
+            columns = np.array([self._all_states.index(x) for x in names], int)
+            state[np.ix_(rows, columns)] = q[rows, : len(names)]
+        every = {
+            "period": np.where(ok, cycles.period, np.nan),
+            "state": state,
+            "multipliers": cycles.multipliers,
+            "spectral_radius": size.max(axis=1),
+            "events": np.pad(codes, ((0, 0), (0, width - codes.shape[1])), constant_values=-1),
+            "residual": np.asarray(cycles.residual),
+        }
+        values: dict[str, np.ndarray] = {"result": np.asarray(cycles.result, int)}
+        values |= {name: every[name] for name in self.names}
+        if "state" in self.names:
+            values["chart"] = np.where(ok, chart, -1).astype(int)
+        return values
 
-    def _residual(self, cycles, variables):
-        return {"residual": np.asarray(cycles.residual)}
-
-    def _multipliers(self, cycles, variables):
-        return {"multipliers": cycles.multipliers}
-
-    def _spectral_radius(self, cycles, variables):
-        return {"spectral_radius": np.abs(cycles.multipliers).max(axis=1)}
-
-    def _events(self, cycles, variables):
-        width = variables["events"].shape[0]
-        codes = np.where(cycles.ok[:, None], cycles.codes, -1)[:, :width]
-        fill = ((0, 0), (0, width - codes.shape[1]))
-        return {"events": np.pad(codes.astype(int), fill, constant_values=-1)}
-
-    def _state(self, cycles, variables):
-        s = Structure(cycles[0].system)
-        names, chart = _states(s), np.asarray(cycles.anchor.chart)[:, 0]
-        q = np.asarray(cycles.anchor.q)[..., 0]
-        state = np.full((len(cycles), len(names)), np.nan)
-        for a in np.unique(chart[cycles.ok]):
-            rows = np.flatnonzero(cycles.ok & (chart == a))
-            own = [names.index(x) for x in s.charts[a].states]
-            state[np.ix_(rows, own)] = q[rows, : len(own)]
-        return {"state": state, "chart": np.where(cycles.ok, chart, -1).astype(int)}
+    def _first(self, cycles: LimitCycles, name: str, measure: Measure) -> np.ndarray:
+        """Return the value of a function on the first cycle on which it succeeds."""
+        error = None
+        for i in np.flatnonzero(cycles.ok):
+            try:
+                return _numbers(name, measure(cycles[i]))
+            except ComputationError as failure:
+                error = failure
+        raise ComputationError(
+            f"`{name}` succeeds on none of {len(cycles)} points that are spread over all, so the "
+            f"shape of its values is unknown ({error or 'none has a limit cycle'})."
+        )
 
     def _measured(self, cycles, name: str, measure: Measure, variable: Variable) -> np.ndarray:
         out = np.full((len(cycles), *variable.shape), variable.fill, variable.dtype)
@@ -157,16 +148,13 @@ class Wanted:
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:
-    found = np.asarray(values)
-    if found.dtype.kind not in "biufc":
+    array = np.asarray(values)
+    if array.dtype.kind not in "biufc":
         raise DefinitionError(f"`{name}` must give numbers, not a {type(values).__name__}.")
-    return found.astype(complex if found.dtype.kind == "c" else float)
+    return array.astype(complex if array.dtype.kind == "c" else float)
 
 
-def _states(s: Structure) -> list[str]:
-    """Names of the states of all charts."""
-    return list(dict.fromkeys(x for a in range(len(s.charts)) for x in s.states(a)))
-
-
-def _meanings(codes: Any) -> str:
-    return " ".join(x.name.lower() for x in codes)
+def _flags(names: Sequence[str], values: Sequence[int] | None = None) -> dict[str, Any]:
+    """Return the attributes of integers that stand for names."""
+    values = range(len(names)) if values is None else values
+    return {"flag_values": list(values), "flag_meanings": " ".join(names)}

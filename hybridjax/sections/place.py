@@ -17,7 +17,7 @@ from .._core.lanes import by_lane
 from .._core.precision import require_x64
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.hermite import interpolate
+from ..engine.cubic import interpolate
 from ..engine.lanes import Lanes, for_each_chart, only
 from ..engine.move import record
 from ..engine.search.search import Moved

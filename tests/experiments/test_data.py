@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
 
 from ..linear.conftest import blocks_at_random, simulate_blocks
 
@@ -58,7 +59,7 @@ def test_failed_experiments_are_named():
         n_sections=32,
         periods=64,
         result=result,
-        simulated=hj.experiments.Simulated(failed_at),
+        simulated=Simulated(failed_at),
     )
     assert data.summary() == (
         "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"

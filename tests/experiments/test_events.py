@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments.events import in_order
+from hybridjax.experiments.data import Simulated
+from hybridjax.experiments.events import EventTimes, in_order
 from hybridjax.experiments.flow_batch import IntervalEvents
 
 
@@ -25,7 +26,7 @@ def events():
     count = np.array([[1, 1, 1, 1], [0, 2, 1, 0]])
     event = np.where(time < 6, 0, 1)
     listed = in_order(IntervalEvents(time, event, count), N, PERIOD)
-    return hj.experiments.EventTimes(
+    return EventTimes(
         *listed, CYCLE, np.array([0, 1]), np.array(PERIOD), n_sections=N, names=("up", "down")
     )
 
@@ -52,7 +53,7 @@ def test_the_events_of_one_experiment_are_named(events):
 
 def test_events_are_saved_with_the_data(events, tmp_path):
     y = np.zeros((2, 4, 1))
-    about = hj.experiments.Simulated(np.array([-1, 2]), None, events)
+    about = Simulated(np.array([-1, 2]), None, events)
     data = hj.ExperimentData(
         y, y, n_sections=N, periods=1, result=[0, hj.Result.GRAZING], simulated=about
     )
@@ -83,7 +84,8 @@ def test_experiments_record_their_events(hopper_cycle, placed_isochrons, tmp_pat
     without = hj.run_experiments(*arguments, discard=0)
     assert without.events is None
     np.testing.assert_allclose(without.y, data.y, rtol=0, atol=1e-13)
-    stored = hj.run_experiments(*arguments, store=tmp_path, discard=0, record_events=True, chunk=2)
+    options = hj.experiments.Options(discard=0, record_events=True)
+    stored = hj.experiments.stream_experiments(*arguments, options, store=tmp_path, chunk=2)
     for part, rows in zip(stored, (slice(0, 2), slice(2, 3)), strict=True):
         count = part.events.time.shape[1]
         np.testing.assert_allclose(part.events.time, events.time[rows, :count], atol=1e-11)

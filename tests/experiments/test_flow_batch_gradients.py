@@ -12,7 +12,7 @@ import hybridjax as hj
 from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments.flow_batch import course, flow_batch
-from hybridjax.experiments.stepping.plan import make_plan
+from hybridjax.experiments.plan import make_plan
 
 from ..conftest import APEX, OUTPUTS
 

@@ -6,7 +6,7 @@ import pytest
 import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax.engine.settings import Settings
-from hybridjax.experiments.stepping import plan
+from hybridjax.experiments import plan
 from hybridjax.sections.place import PATIENCE
 
 from ..conftest import APEX

@@ -233,7 +233,7 @@ def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
 
 
 def test_sections_that_are_too_far_apart_for_the_steps_allowed(hopper_cycle, monkeypatch):
-    monkeypatch.setattr("hybridjax.experiments.stepping.plan.PATIENCE", 3)
+    monkeypatch.setattr("hybridjax.experiments.plan.PATIENCE", 3)
     settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     cycle = dataclasses.replace(hopper_cycle, settings=settings)
     with pytest.raises(hj.ComputationError, match="from section 0 to .*limit on steps .*max_steps"):

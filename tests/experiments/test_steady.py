@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.experiments import steady
+from hybridjax.experiments import start as steady
 
 from ..conftest import no_compilation
 
@@ -26,7 +26,7 @@ def response(vanderpol_cycle):
 def settled(response):
     @eqx.filter_jit
     def run(u, system):
-        start = hj.experiments.steady_start(response, u, system)
+        start = response.steady_start(u, system)
         return response(jnp.concatenate([u, u], axis=1), start, system).y
 
     return run
@@ -98,8 +98,8 @@ def test_the_root_has_exact_derivatives(vanderpol_cycle, settled):
 
 
 def test_bad_inputs(response):
-    with pytest.raises(hj.DefinitionError, match="a multiple of the 4 sections"):
-        hj.experiments.steady_start(response, np.zeros((1, 5, 1)))
+    with pytest.raises(hj.DefinitionError, match="multiple of the 4 sections"):
+        response.steady_start(np.zeros((1, 5, 1)))
 
 
 def test_process_noise_acts_but_is_not_recorded(vanderpol_cycle):

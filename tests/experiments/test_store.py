@@ -9,8 +9,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments import StoredExperiments
-from hybridjax.experiments.options import Options
-from hybridjax.experiments.stored.pieces import prepare_pieces
+from hybridjax.experiments.campaign import Options
+from hybridjax.experiments.stored import prepare_pieces
 
 from ..conftest import OUTPUTS
 
@@ -20,6 +20,7 @@ pytest.importorskip("zarr")
 COUNT = 100
 DESIGN = hj.multisine(experiments=COUNT)
 BATCH = {"execution": hj.Execution(batch=40)}
+stream = hj.experiments.stream_experiments
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def whole(arguments):
 @pytest.fixture(scope="module")
 def made(arguments, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stores") / "records.zarr"
-    return hj.run_experiments(*arguments, store=folder, chunk=40, **BATCH)
+    return stream(*arguments, Options(**BATCH), store=folder, chunk=40)
 
 
 @pytest.fixture
@@ -81,16 +82,15 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     with pytest.raises(hj.errors.FileFormatError, match="piece 2 .* is damaged in `u`"):
         stored[2]
     before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
-    again = hj.run_experiments(*arguments, store=stored.address, chunk=40, **BATCH)
+    again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=40)
     np.testing.assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
 def test_processes_share_the_chunks(arguments, whole, tmp_path):
     for rank in (0, 1):
-        stored = hj.run_experiments(
-            *arguments, store=tmp_path / "records.zarr", chunk=40, share=(rank, 2), **BATCH
-        )
+        options, store = Options(**BATCH), tmp_path / "records.zarr"
+        stored = stream(*arguments, options, store=store, chunk=40, client=(rank, 2))
         assert stored.missing() == ([] if rank else [1])
     np.testing.assert_array_equal(records(stored), whole.y)
 
@@ -113,8 +113,9 @@ def test_processes_share_the_chunks(arguments, whole, tmp_path):
 def test_other_experiments_are_refused(made, arguments, change, what):
     names = ("cycle", "sections", "design", "outputs")
     call = dict(zip(names, arguments, strict=True)) | dict(chunk=40) | BATCH | change
+    options = {name: call.pop(name) for name in [*call] if hasattr(Options, name)}
     with pytest.raises(hj.DefinitionError, match=f"holds other results: .*`{what}"):
-        hj.run_experiments(**call, store=made.address)
+        stream(**call, options=Options(**options), store=made.address)
 
 
 def test_another_system_is_refused(made, arguments):
@@ -122,7 +123,7 @@ def test_another_system_is_refused(made, arguments):
     other = eqx.tree_at(lambda p: p.cycle.system.k, placed, jnp.asarray(10.001, float))
     with pytest.raises(hj.DefinitionError, match="`model.numbers.k` is 10.0, not 10.001"):
         call = other.cycle, other, design, outputs
-        hj.run_experiments(*call, store=made.address, chunk=40, **BATCH)
+        stream(*call, Options(**BATCH), store=made.address, chunk=40)
 
 
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
@@ -132,7 +133,8 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     design = hj.experiments.single_cosine([0.25, 0.75], 32, 4)
     options = Options(start=start)
     job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
-    sent = cloudpickle.loads(cloudpickle.dumps(job.restored(job.arrays())))
+    _, layout = job.begin(None)
+    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     here, there = job.run(0, None), sent.run(0, 1)
     assert here.keys() == there.keys()
     for name, values in here.items():
@@ -143,7 +145,7 @@ def test_events_are_kept(hopper_cycle, tmp_path):
     design = hj.experiments.single_cosine([0.25, 0.75, 1.25], 4, 4)
     call = hopper_cycle, hj.ClockPhase(4), design, "yM"
     store = tmp_path / "records.zarr"
-    stored = hj.run_experiments(*call, store=store, chunk=2, record_events=True)
+    stored = stream(*call, Options(record_events=True), store=store, chunk=2)
     whole = hj.run_experiments(*call, record_events=True)
     assert [len(part.u) for part in stored] == [2, 1]
     np.testing.assert_allclose(stored[0].events.time, whole.events.time[:2], rtol=1e-9)
@@ -156,8 +158,8 @@ def test_what_is_no_store(tmp_path, arguments):
         StoredExperiments(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.DefinitionError, match="file"):
-        hj.run_experiments(*arguments, store=tmp_path / "file", **BATCH)
+        stream(*arguments, store=tmp_path / "file")
     with pytest.raises(hj.DefinitionError, match="0 <= rank < size"):
-        hj.run_experiments(*arguments, store=tmp_path / "s", share=(2, 2), **BATCH)
-    with pytest.raises(hj.DefinitionError, match="a `share` needs a `store`"):
-        hj.run_experiments(*arguments, share=(0, 2), **BATCH)
+        stream(*arguments, store=tmp_path / "s", client=(2, 2))
+    with pytest.raises(hj.DefinitionError, match="a `client` needs a `store`"):
+        stream(*arguments, client=(0, 2))

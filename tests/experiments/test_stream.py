@@ -8,6 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments.batches import divide
+from hybridjax.experiments.campaign import Options
 
 from ..conftest import OUTPUTS, no_compilation
 
@@ -41,7 +42,7 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
-    parts = list(hj.experiments.stream_experiments(*arguments, chunk=40, **BATCH))
+    parts = list(hj.experiments.stream_experiments(*arguments, Options(**BATCH), chunk=40))
     assert [len(part.u) for part in parts] == [40, 40, 20]
     np.testing.assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
@@ -53,7 +54,7 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
 def test_process_noise_does_not_depend_on_the_chunks(arguments):
     noise = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
     whole = hj.run_experiments(*arguments, **BATCH, **noise)
-    parts = hj.experiments.stream_experiments(*arguments, chunk=40, **BATCH, **noise)
+    parts = hj.experiments.stream_experiments(*arguments, Options(**BATCH, **noise), chunk=40)
     np.testing.assert_array_equal(records(parts), whole.y)
 
 
@@ -62,7 +63,7 @@ def test_inputs_may_lie_on_disk(arguments, whole, tmp_path):
     u = np.load(tmp_path / "u.npy", mmap_mode="r")
     cycle, placed, _, outputs = arguments
     parts = hj.experiments.stream_experiments(
-        cycle, placed, u, outputs, chunk=80, discard=20, **BATCH
+        cycle, placed, u, outputs, Options(discard=20, **BATCH), chunk=80
     )
     np.testing.assert_array_equal(records(parts), whole.y)
 
@@ -88,13 +89,6 @@ def test_batches_are_alike_and_keep_all_workers_busy():
                 assert used == workers and number * size < 1.2 * S
     assert divide(1000, hj.Execution(256, 8)) == hj.Execution(256, 4)
     assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
-
-
-def test_arguments_that_do_not_exist(arguments):
-    with pytest.raises(
-        TypeError, match="stream_experiments has no argument 'stat'; .* chunk, start"
-    ):
-        hj.experiments.stream_experiments(*arguments, stat="cycle")
 
 
 def test_estimates_of_parts_that_do_not_fit_together(whole):

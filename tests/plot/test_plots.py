@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
 
 
 def labeled(ax):
@@ -189,7 +190,7 @@ def test_failed_experiment():
         n_sections=2,
         periods=2,
         result=[hj.Result.GRAZING],
-        simulated=hj.experiments.Simulated(np.array([5])),
+        simulated=Simulated(np.array([5])),
     )
     figure = hj.plot.experiment(data).figure
     assert "grazing" in figure.axes[0].get_title()

@@ -138,7 +138,7 @@ def test_order_and_advice(hopper_recording, angle):
     assert any("plain regression (ARX) would give" in w for w in advice.warnings)
     assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
     assert (np.diff(advice.expected[:, 0]) <= 0).all()
-    fast = {"check": False, "distortion": False}
+    fast = {"check": False}
     too_many = hj.recordings.advise(data, hj.fit_series(data.records, order=3, **fast)).warnings
     order = "Order: the data do not carry 3 multipliers"
     assert any(w.startswith(order) for w in too_many)

@@ -114,7 +114,7 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
             recording, hj.Crossing("vM", "falling"), inputs="u", outputs=("yM", "vM"),
             n_sections=16,
         )  # fmt: skip
-        fits.append(hj.fit_series(data, order=2, distortion=False))
+        fits.append(hj.fit_series(data, order=2))
     struck = [int((a != b).sum()) for a, b in zip(
         clean.trials[0].values.T, dirty.trials[0].values.T, strict=True)]  # fmt: skip
     assert np.abs(np.subtract(data.spikes, struck)).max() <= 0.05 * max(struck) + 1

@@ -112,8 +112,8 @@ def test_draws_must_stay_alike():
         hj.monte_carlo(lambda rng: next(turns), 2)
     with pytest.raises(hj.DefinitionError, match="draw 1 has no `value`"):
         hj.monte_carlo(lambda rng: next(turns), 2)
-    with pytest.raises(hj.DefinitionError, match="a `share` needs a `store`"):
-        hj.monte_carlo(walk, DRAWS, share=(1, 2))
+    with pytest.raises(hj.DefinitionError, match=r"`client` of \(rank, size\) needs a `store`"):
+        hj.monte_carlo(walk, DRAWS, client=(1, 2))
 
 
 def drawn(rng, size=1.0, *, offset=0.0):
@@ -211,16 +211,15 @@ def experiments():
 
 
 def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
-    call = {"discard": 2, "chunk": 2}
-    stored = hj.run_experiments(*experiments, store=tmp_path / "a.zarr", client=client, **call)
-    alone = hj.run_experiments(*experiments, store=tmp_path / "b.zarr", **call)
+    call = {"options": hj.experiments.Options(discard=2), "chunk": 2}
+    stream = hj.experiments.stream_experiments
+    stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
+    alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
     assert len(stored) == 3 and stored.missing() == []
     for mine, theirs in zip(alone, stored, strict=True):
         np.testing.assert_array_equal(mine.y, theirs.y)
     data = list(stored)
-    parts, whole = (hj.fit_series(x, 2, distortion=False, check=False) for x in (stored, data))
+    parts, whole = (hj.fit_series(x, 2, check=False) for x in (stored, data))
     np.testing.assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
     assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))
-    with pytest.raises(hj.DefinitionError, match="`data` are in memory"):
-        hj.fit_series(stored, 2, distortion=True)

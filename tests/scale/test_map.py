@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.scale import Points, sobol_points
+from hybridjax.scale import Points
 
 
 pytest.importorskip("xarray")
@@ -76,10 +76,10 @@ def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path
 
 def test_processes_share_a_store(whole, options, tmp_path):
     store = tmp_path / "map.zarr"
-    half = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, share=(0, 2), **options)
+    half = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, client=(0, 2), **options)
     assert np.isnan(half.period).any() and np.isfinite(half.period).any()
     assert (half.result == -1).any()
-    both = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, share=(1, 2), **options)
+    both = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, client=(1, 2), **options)
     assert both.load().identical(whole)
 
 
@@ -118,12 +118,12 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     def model(slope, spokes=8.0):
         return hj.models.RimlessWheel(slope=slope, spokes=spokes)
 
-    def first(cycle):
+    def twice(cycle):
         if float(cycle.system.slope) > 0.08:
             raise hj.ComputationError("too steep")
         return jnp.stack([cycle.period, 2 * cycle.period])
 
-    found = hj.sweep(model, points, "period", guess=wheel, chunk=4, measures={"twice": first})
+    found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
     assert found.period.dims == ("point",) and list(found.coords) == ["slope", "spokes"]
     np.testing.assert_allclose(found.period, np.diag(whole.period.values[::2, ::2]), rtol=1e-9)
     np.testing.assert_allclose(found.twice[0], float(found.period[0]) * np.array([1, 2]))
@@ -132,13 +132,13 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
 
 def test_points_of_sobol_fill_the_box_and_are_always_the_same():
     ranges = {"k": (8.0, 13.0), "b": (3.0, 7.0)}
-    points = sobol_points(ranges, 48, seed=3)
+    points = Points.sobol(ranges, 48, seed=3)
     for name, (low, high) in ranges.items():
         values = points.values[name]
         assert len(points) == 48 and low <= values.min() and values.max() <= high
         assert np.histogram(values, 4, (low, high))[0].tolist() == pytest.approx([12] * 4, abs=2)
-        np.testing.assert_array_equal(values, sobol_points(ranges, 48, seed=3).values[name])
-        assert (values != sobol_points(ranges, 48, seed=4).values[name]).all()
+        np.testing.assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
+        assert (values != Points.sobol(ranges, 48, seed=4).values[name]).all()
 
 
 WRONG = {
@@ -149,10 +149,10 @@ WRONG = {
                  "1e.09 points, .* hours .* GB: say `force=True`"),
     "no client": ({"slope": [0.08]}, {"client": "tcp://here"}, "`client` must be .* `submit`"),
     "a store below a file": ({"slope": [0.08]}, {"store": "{}/file/map.zarr"}, "file"),
-    "no share": ({"slope": [0.08]}, {"share": (2, 2)}, "0 <= rank < size"),
-    "a share of nothing": ({"slope": [0.08]}, {"share": (0, 2)}, "a `share` needs a `store`"),
+    "no share": ({"slope": [0.08]}, {"client": (2, 2)}, "0 <= rank < size"),
+    "a share of nothing": ({"slope": [0.08]}, {"client": (0, 2)}, "needs a `store`"),
     "no want": ({"slope": [0.08]}, {"want": "speed"}, "`want` must be"),
-    "a taken name": ({"slope": [0.08]}, {"measures": {"period": float}}, "which is taken"),
+    "no name": ({"slope": [0.08]}, {"want": lambda cycle: 1.0}, "needs a name of its own"),
 }  # fmt: skip
 
 

@@ -283,7 +283,7 @@ class Design(eqx.Module):
     def with_negatives(self) -> "Design":
         """Every experiment followed by the same with the sign changed.
 
-        In half the difference of their responses (`odd_part`) all even-order distortion cancels.
+        All even-order distortion cancels in `ExperimentData.odd_part`.
         """
         phase = np.stack([self.phase, (self.phase + np.pi) % (2 * np.pi)])
         return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))

@@ -1,9 +1,11 @@
-"""The usual designs: multisines over a band, the paper's, single cosines."""
+"""Multisines over a band, the paper's design, single cosines; phases for a low crest factor."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from scipy.optimize import minimize
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
@@ -35,9 +37,15 @@ Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
 
-# Rounding of the edges of a band, in lines. Twice as much changes nothing unless an edge lies that
-# close to a line.
+# Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at
+# the edges. Larger: a line outside of the band is taken.
 _EDGE = 1e-9
+# Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
+# (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
+_POWERS = (4, 8, 16, 32, 64, 128)
+# Steps of the minimization at each power. Fewer: higher crest factors. Twice as many: hardly lower
+# ones, in twice the time.
+_STEPS = 100
 
 
 @checked
@@ -87,8 +95,8 @@ def multisine(
       with fewer cosines each, and so less distortion; with the fewest of all lines, every
       second-order product falls on a line of the same experiment, so amplitudes must be small.
     - `highest_harmonic`: M, beyond which harmonics are taken as zero. Then 2 M + 1 experiments may
-      do instead of 20; what they assume is said by `predict_leakage`, if a model is at hand. The
-      estimate needs to know: `estimate_htf(data, highest=M)`.
+      do instead of 20; the estimate needs the same
+      number: `estimate_htf(data, highest=M)`.
     - `inputs`: their number or names; `experiments` is the number for all inputs together.
 
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too
@@ -292,3 +300,68 @@ def single_cosine(
         channels=[[i] for i in range(len(names)) for _ in each],
         inputs=names,
     )
+
+
+@checked
+def optimize_phases(design: Design, seed: Seed = 0) -> Design:
+    r"""Return the design with phases that give each signal a low crest factor max |u| / rms(u).
+
+    The peak is approached by norms $\sum |u|^p$ of growing p, minimized over the phases (Guillaume,
+    Schoukens, Pintelon and Kollar, IEEE Trans. Instrum. Meas. 40, 1991). For 31 lines this gives
+    2.2 where random phases give 3.5, so that the same peak carries 2.5 times the power.
+    These phases are not random: the scatter over realizations of them does not show the distortion.
+    Phases of lines that are measured in several experiments together (multiples of 1/2, orthogonal
+    experiments) are kept.
+
+    **Arguments:** `seed`: of the random phases at the start of the minimization. Default: 0.
+
+    **Raises:** `DefinitionError` if there is no phase to choose.
+    """
+    nu, length = len(design.input_names), design.n_sections * design.periods
+    _, pair, count = np.unique(
+        design.line * nu + design.channel, return_inverse=True, return_counts=True
+    )
+    real = is_real(design.line, design.periods, design.n_sections)
+    free = (count[pair] == 1) & ~real
+    if not free.any():
+        raise DefinitionError(
+            "the phases of this design belong together in several experiments (or have a fixed "
+            "sign), so none of them can be chosen for the crest factor."
+        )
+    where = design.experiment * nu + design.channel
+    size = np.where(real, 2.0, 1.0) * 0.5 * length * np.asarray(design.amplitude)
+    rng = np.random.default_rng(seed)
+    phase = np.where(free, rng.uniform(0, 2 * np.pi, len(free)), design.phase)
+    for signal in np.unique(where):
+        k = np.flatnonzero(where == signal)
+        if free[k].any():
+            phase[k[free[k]]] = _lower(phase[k], free[k], design.line[k], size[k], length)
+    return dataclasses.replace(design, phase=phase % (2 * np.pi))
+
+
+def _lower(phase, free, line, size, length: int):
+    """Return the free phases of one signal that minimize its peak."""
+    spectrum, best, least = np.zeros(length // 2 + 1, complex), phase[free], np.inf
+
+    def signal(x):
+        value = size * np.exp(1j * np.where(free, 0.0, phase))
+        value[free] = size[free] * np.exp(1j * x)
+        spectrum[line] = value
+        return np.fft.irfft(spectrum, length)
+
+    def norm(x, p):
+        """Return the logarithm of the p-norm and its derivatives."""
+        u = signal(x)
+        peak = np.abs(u).max()
+        v = np.abs(u) / peak
+        total = np.sum(v**p)
+        slope = np.fft.rfft(v ** (p - 1) * np.sign(u) / (peak * total))[line[free]]
+        turn = np.real(1j * size[free] * np.exp(1j * x) * slope.conj())
+        return np.log(peak) + np.log(total) / p, 2 / length * turn
+
+    x = phase[free]
+    for p in _POWERS:
+        x = minimize(norm, x, p, "L-BFGS-B", jac=True, options={"maxiter": _STEPS}).x
+        if (peak := np.abs(signal(x)).max()) < least:
+            best, least = x, peak
+    return best

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ...identify.multipliers.covariance import Covariance, sandwich
+from ...identify.denominator import Covariance, sandwich
 from .intervals import Intervals
 from .phase_model import Forecast, Table, forecast
 from .smoothness import Smoothness, smoothness_of

@@ -1,0 +1,344 @@
+"""Results of many independent points, in memory or in a Zarr group that any processes fill.
+
+A piece is a block of points, and a chunk of each variable. A chunk appears complete or not at all,
+and holds its own checksum. A piece is present when all its chunks are, so no list of finished
+pieces can be wrong.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import DefinitionError, FileFormatError
+from ..arguments import package
+from ..progress import counted
+from .description import difference
+
+
+_ABOUT = "hybridjax"
+# The group of the arrays that only this package reads.
+_START = "start"
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """A grid of `shape`, cut into blocks of the shape `block`; the last ones may be smaller."""
+
+    shape: tuple[int, ...]
+    block: tuple[int, ...]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of blocks along each axis."""
+        return tuple(-(-n // b) for n, b in zip(self.shape, self.block, strict=True))
+
+    def __len__(self) -> int:
+        return math.prod(self.counts)
+
+    def place(self, k: int) -> tuple[int, ...]:
+        """Return the indices of block k along each axis."""
+        return tuple(map(int, np.unravel_index(k, self.counts)))
+
+    def slices(self, k: int) -> tuple[slice, ...]:
+        """Return the part of the grid that is block k."""
+        sides = zip(self.place(k), self.block, self.shape, strict=True)
+        return tuple(slice(i * b, min((i + 1) * b, n)) for i, b, n in sides)
+
+
+def near_cube(shape: Sequence[int], most: int) -> tuple[int, ...]:
+    """Return the shape of a block of at most `most` points that are neighbors: the longest side is
+    halved until it fits."""
+    block = list(shape)
+    while math.prod(block) > most:
+        longest = max(range(len(block)), key=block.__getitem__)
+        block[longest] = -(-block[longest] // 2)
+    return tuple(block)
+
+
+class Variable(NamedTuple):
+    """An array with a value for each point.
+
+    **Fields:** `dims` and `shape`: axes of each value beside those of the points. `attributes`:
+    units for example.
+    """
+
+    dtype: str
+    dims: tuple[str, ...] = ()
+    shape: tuple[int, ...] = ()
+    attributes: Mapping[str, Any] = {}
+
+    @property
+    def fill(self) -> Any:
+        """The value of points that have not been computed."""
+        return -1 if np.dtype(self.dtype).kind == "i" else np.nan
+
+
+Constant = tuple[Sequence[str], np.ndarray] | tuple[Sequence[str], np.ndarray, Mapping[str, Any]]
+"""Dimensions, values and attributes of an array that exists before anything is computed."""
+
+
+class Layout(NamedTuple):
+    """Names, shapes and units of results.
+
+    **Fields:** `dims`: axes of the points. `blocks`: the pieces. `variables` and `constants` by
+    name. `coordinates`: the constants that are coordinates. `description`: JSON from which the
+    results can be told from others.
+    """
+
+    dims: tuple[str, ...]
+    blocks: Blocks
+    variables: Mapping[str, Variable]
+    constants: Mapping[str, Constant]
+    coordinates: tuple[str, ...]
+    description: Mapping[str, Any]
+
+    def array(self, name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Return all dimensions of a variable and its shape."""
+        x = self.variables[name]
+        return (*self.dims, *x.dims), (*self.blocks.shape, *x.shape)
+
+
+class MemoryStore:
+    """Results in the memory of this process."""
+
+    address: str | None = None
+
+    def __init__(self, layout: Layout):
+        self.layout = layout
+        self._arrays = {
+            name: np.full(layout.array(name)[1], x.fill, x.dtype)
+            for name, x in layout.variables.items()
+        }
+
+    def missing(self) -> list[int]:
+        """Return the pieces to compute: all of them."""
+        return list(range(len(self.layout.blocks)))
+
+    def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
+        """Keep piece k."""
+        for name, x in values.items():
+            self._arrays[name][self.layout.blocks.slices(k)] = x
+
+    def dataset(self) -> Any:
+        """Return all results as `xarray.Dataset`."""
+        z = self.layout
+        variables = {
+            name: (z.array(name)[0], x, dict(z.variables[name].attributes))
+            for name, x in self._arrays.items()
+        }
+        coordinates = {name: z.constants[name] for name in z.coordinates}
+        constants = {name: x for name, x in z.constants.items() if name not in coordinates}
+        about = {_ABOUT: json.dumps(z.description)}
+        return package("xarray").Dataset({**variables, **constants}, coordinates, about)
+
+
+class ZarrStore:
+    """Results in a Zarr group; `address` is a path, or an address for fsspec ("s3://bucket/a.zarr").
+
+    **Fields:** `layout`, without constants; `start`: the arrays that the store was begun with.
+    """
+
+    def __init__(self, address: str):
+        self.address = address
+        with _writing(address):
+            self._group = _group(address, "r+")
+            about = json.loads(self._group.attrs[_ABOUT])
+            # (Zarr would leave out chunks that hold nothing but the fill value.)
+            self._arrays = {
+                name: self._group[name].with_config({"write_empty_chunks": True})
+                for name in about["variables"]
+            }
+        first, p = next(iter(self._arrays.values())), len(about["dims"])
+        variables = {
+            name: Variable(x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:])
+            for name, x in self._arrays.items()
+        }
+        blocks = Blocks(first.shape[:p], first.chunks[:p])
+        dims = tuple(about["dims"])
+        self.layout = Layout(dims, blocks, variables, {}, (), about["description"])
+
+    @property
+    def start(self) -> list[np.ndarray]:
+        kept = self._group[_START]
+        return [np.asarray(kept[f"{i}"][...]) for i in range(len(list(kept.array_keys())))]
+
+    def missing(self) -> list[int]:
+        """Return the pieces of which a chunk is missing."""
+        pieces = set(range(len(self.layout.blocks)))
+        return sorted(pieces - set.intersection(*map(self._present, self._arrays.values())))
+
+    def has(self, k: int) -> bool:
+        """Return whether piece k is present."""
+        return all(_sync(x.store.exists(self._chunk(x, k))) for x in self._arrays.values())
+
+    def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
+        """Keep piece k."""
+        with _writing(self.address):
+            for name, array in self._arrays.items():
+                array[(*self.layout.blocks.slices(k), ...)] = values[name]
+
+    def read(self, k: int) -> dict[str, np.ndarray]:
+        """Return piece k.
+
+        **Raises:** `FileFormatError` if it is damaged.
+        """
+        values = {}
+        for name, array in self._arrays.items():
+            try:
+                values[name] = array[(*self.layout.blocks.slices(k), ...)]
+            except Exception as error:  # (of many kinds: checksums, sizes, headers)
+                raise FileFormatError(
+                    f"piece {k} of '{self.address}' is damaged in `{name}`: make the call that "
+                    "wrote it again, and it will be run again."
+                ) from error
+        return values
+
+    def array(self, name: str) -> np.ndarray | None:
+        """Return a variable of all pieces, or a constant; None if there is none of this name."""
+        return np.asarray(self._group[name][...]) if name in self._group else None
+
+    def discard_damaged(self) -> None:
+        """Delete pieces whose checksums are wrong."""
+        missing = set(self.missing())
+        present = [k for k in range(len(self.layout.blocks)) if k not in missing]
+        for k in counted(present, "pieces checked", len(present)):
+            try:
+                self.read(k)
+            except FileFormatError:
+                for x in self._arrays.values():
+                    _sync(x.store.delete(self._chunk(x, k)))
+
+    def dataset(self) -> Any:
+        """Return all results as `xarray.Dataset`, whose values are read when they are used."""
+        data = package("xarray").open_zarr(self.address, consolidated=False, chunks=None)
+        constants = [name for name in data.data_vars if name not in self._arrays]
+        description = json.dumps(self.layout.description)
+        return data[[*self._arrays, *constants]].assign_attrs({_ABOUT: description})
+
+    def _chunk(self, array: Any, k: int) -> str:
+        place = self.layout.blocks.place(k)
+        beside = (0,) * (array.ndim - len(place))  # one chunk along all other axes
+        return "/".join((array.path, "c", *map(str, (*place, *beside)))).removeprefix("/")
+
+    def _present(self, array: Any) -> set[int]:
+        """Return the pieces that have a chunk of an array."""
+        blocks, prefix = self.layout.blocks, f"{array.path}/c/".removeprefix("/")
+
+        async def listed() -> list[str]:
+            return [key async for key in array.store.list_prefix(prefix)]
+
+        places = (key.removeprefix(prefix).split("/") for key in _sync(listed()))
+        return {
+            int(np.ravel_multi_index(tuple(map(int, x[: len(blocks.shape)])), blocks.counts))
+            for x in places
+            if len(x) == array.ndim and all(map(str.isdecimal, x))
+        }
+
+
+def open_store(address: str, description: Mapping[str, Any]) -> ZarrStore | None:
+    """Return the store of these results, without its damaged pieces; None if there is nothing at
+    the address.
+
+    **Raises:** `DefinitionError` if it holds other results, or something else.
+    """
+    try:
+        group = _group(address, "r")
+    except FileNotFoundError:
+        if (
+            "://" not in address
+            and os.path.exists(address)
+            and (os.path.isfile(address) or os.listdir(address))
+        ):
+            raise DefinitionError(
+                f"'{address}' is there, and is no store of results: choose another name."
+            ) from None
+        return None
+    except Exception as error:
+        raise DefinitionError(f"cannot open '{address}' as a Zarr store: {error}") from error
+    try:
+        theirs = json.loads(group.attrs[_ABOUT])["description"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DefinitionError(
+            f"'{address}' was not written by hybridjax, or not to its end: choose another store, "
+            "or delete it."
+        ) from error
+    change = difference(json.loads(json.dumps(description)), theirs)
+    if change is not None:
+        raise DefinitionError(f"'{address}' holds other results: {change}. Choose another store.")
+    store = ZarrStore(address)
+    store.discard_damaged()
+    return store
+
+
+def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrStore:
+    """Return a new store. It keeps the arrays of `start` for the processes that resume it.
+
+    **Raises:** `DefinitionError` if it cannot be written.
+    """
+    from zarr.codecs import Crc32cCodec
+
+    common = {"compressors": [Crc32cCodec()], "config": {"write_empty_chunks": True}}
+
+    def constant(group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None):
+        values = np.asarray(values)
+        group.create_array(
+            name, data=values, chunks=tuple(max(n, 1) for n in values.shape) or "auto",
+            dimension_names=dims, attributes=dict(attributes or {}), **common,
+        )  # fmt: skip
+
+    with _writing(address), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # (Zarr announces that its format of texts may change.)
+        group = _group(address, "a")
+        for name, x in layout.variables.items():
+            dims, shape = layout.array(name)
+            group.create_array(
+                name, shape=shape, chunks=(*layout.blocks.block, *x.shape), dtype=x.dtype,
+                fill_value=x.fill, dimension_names=dims, attributes=dict(x.attributes), **common,
+            )  # fmt: skip
+        for name, x in layout.constants.items():
+            constant(group, name, *x)
+        kept = group.require_group(_START)
+        for i, x in enumerate(start):
+            constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
+        beside = [x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])]
+        if beside:
+            group.attrs["coordinates"] = " ".join(beside)
+        about = {
+            "description": layout.description,
+            "dims": layout.dims,
+            "variables": list(layout.variables),
+        }
+        group.attrs[_ABOUT] = json.dumps(about)  # last: from now on it is a store
+    return ZarrStore(address)
+
+
+def absolute(address: Any) -> str:
+    """Return an address that is valid in other processes."""
+    address = str(address).removeprefix("file://")
+    return address if "://" in address else os.path.abspath(address)
+
+
+def _group(address: str, mode: Any) -> Any:
+    return package("zarr").open_group(address, mode=mode)
+
+
+def _sync(coroutine: Any) -> Any:
+    from zarr.core.sync import sync
+
+    return sync(coroutine)
+
+
+@contextlib.contextmanager
+def _writing(address: str) -> Iterator[None]:
+    """**Raises:** `DefinitionError` if a store cannot be written."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise DefinitionError(f"cannot write to '{address}': {error}") from error

@@ -1,0 +1,268 @@
+"""What the limit cycle teaches about the way from each section to the next.
+
+A plan serves prediction, step lengths and error estimates, not control flow: lanes that go another
+way than the cycle are integrated just as well, only perhaps in more steps.
+"""
+
+import dataclasses
+from typing import Annotated, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.boundary.values import Number
+from .._core.compilation import at_ease, host_first
+from .._core.executor import Array, from_host, namespace, to_host
+from .._core.memo import Memory
+from .._core.results import Result
+from ..engine.jacobian import tape_jacobian
+from ..engine.move import move
+from ..engine.search.state import Stride
+from ..engine.settings import Settings
+from ..engine.watch import watch
+from ..errors import ComputationError
+from ..sections.place import PATIENCE
+from ..sections.placed import PlacedSections
+
+
+# Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
+# steps whose error estimate is at most this part of the tolerance. Twice as many of either take
+# longer to try, and find ways that are a little cheaper.
+_EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
+_TOLERANCES = (1.0, 1e-2, 1e-4)
+# The relative tolerance of the reference to which the ways are compared. Twice as much shows where
+# accuracies near 1e-13 are asked for.
+_REFERENCE_RTOL = 1e-13
+# Room for the way to a level, which takes longer in some lanes than on the cycle, as a ratio of
+# times. Twice as much makes equal steps longer than they need to be.
+_ROOM = 1.25
+# A step may have up to this many times its error estimate on the cycle, where the accuracy allows
+# it. Twice as much lets lanes far from the cycle go twice as wrong before their steps get shorter.
+_MOST_SLACK = 10.0
+# Periods over which errors are followed; the rest is a geometric series. Twice as many plan for
+# longer, and matter where multipliers are near the unit circle.
+_PERIODS = 8
+# Estimates are this many times the error that accumulates on the cycle. Twice as much doubles
+# `ExperimentData.error`.
+_CAUTION = 3.0
+# Errors of different sections cancel in part; credit for it is given up to this ratio. Twice as
+# much lets estimates be half as large where nearly everything cancels.
+_MOST_CANCELLATION = 30.0
+# Error estimates, and the room that steps have for them, are at least this part of the tolerance.
+# Twice as much counts twice the error estimate of steps that are all but exact.
+_LEAST_SHARE = 1e-6
+# Bounds on the time to the next level as a multiple of Newton's guess, beyond which the guess means
+# nothing. Twice as wide, worse guesses set the length of the last step.
+_LEAST_LEAD, _LARGEST_LEAD = 0.3, 3.0
+# Errors per section that are taken for granted, relative to the states' scales: a few units in the
+# last place. Twice as much changes nothing above accuracies of 1e-13.
+_ROUNDING = 1e-15
+
+Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=1e-13, high=1e-2)]
+"""Relative to the states' scales, that a plan can be made for. Below the least, rounding is larger;
+beyond the largest, the cycle tells little about lanes beside it."""
+
+
+class Plan(eqx.Module):
+    """How to go from section k to the next, for k = 0..N-1.
+
+    **Fields:**
+
+    - `h`: first step. `lead`: time to section k + 1 as a multiple of Newton's guess at section k.
+    - `slack`: a step's error estimate may be this many times the tolerance.
+    - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
+        cycle and relative to the states' scales: the largest that it ever leads to at a later
+        section, summed over all periods as if each made the same error.
+    """
+
+    h: Float[Array, " N"]
+    lead: Float[Array, " N"]
+    slack: Float[Array, " N"]
+    weight: Float[Array, " N"]
+
+    def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
+        """How `lanes` lanes set out from section k."""
+        fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
+        return Stride(fill(self.h), fill(self.lead), fill(self.slack))
+
+
+def make_plan(
+    placed: PlacedSections, settings: Settings, accuracy: float, scale: Float[np.ndarray, "N n"]
+) -> Plan:
+    """Find the cheapest way between sections that keeps the accuracy asked for.
+
+    **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
+
+    **Raises:** `ComputationError` where no way arrives.
+    """
+    N = placed.n_sections
+    placed = to_host(placed)
+    ways = to_host(_try_ways(placed, settings))
+    *_, target = placed.onwards()
+    with at_ease():
+        J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
+    J = J[:, :, : scale.shape[1]]
+    J[~placed.time_is_state, :, 0] = 0.0
+    error = np.transpose(ways.ends[:, :-1] - ways.ends[:, -1:], (1, 2, 0))
+    if not placed.cycle.clocked:
+        error[..., 0] = 0.0
+    impact = np.maximum(_impact(J, error, scale), _ROUNDING)
+    impact = np.where(np.isnan(impact), np.inf, impact)
+    lost = ~np.isfinite(impact).any(axis=0)
+    if lost.any():
+        k = int(np.argmax(lost))
+        raise ComputationError(
+            f"experiments cannot go from section {k} to {placed.family.describe((k + 1) % N)}: "
+            "the limit on steps is reached even on the cycle. Place more sections, or find the "
+            "cycle with `settings=Settings(max_steps=...)`."
+        )
+    estimate = np.maximum(ways.estimate, _LEAST_SHARE)
+
+    # The largest share of the accuracy for each section that keeps their sum.
+    section = np.arange(N)
+    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
+        best = _cheapest(impact, share)
+        total = impact[best, section].sum()
+        if total <= accuracy:
+            break
+    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
+    impact, estimate = impact[best, section], estimate[best, section]
+    # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
+    together = _CAUTION * _accumulated(J, error[best, section], scale) / impact.sum()
+    weight = impact / estimate * np.maximum(together, 1 / _MOST_CANCELLATION)
+    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
+    share = np.minimum(accuracy * estimate / impact, 1.0) / N
+    slack = np.where(
+        best < len(_EQUAL_STEPS), np.maximum(spare * estimate, share), ways.slack[best]
+    )
+    return from_host(Plan(ways.first[best, section], ways.lead, slack, weight))
+
+
+class _Ways(NamedTuple):
+    """What was tried from every section to the next."""
+
+    ends: Float[Array, "n B N"]
+    """(t, q) after each of K ways to go, and after the reference; NaN for those that do not
+    arrive."""
+    estimate: Float[Array, "K N"]
+    """Error estimates of the ways to go, relative to the tolerance."""
+    first: Float[Array, "K N"]
+    """Their first steps."""
+    slack: Float[Array, " K"]
+    lead: Float[Array, " N"]
+
+
+@host_first
+def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
+    s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
+    K = len(_EQUAL_STEPS) + len(_TOLERANCES)
+    patience = max(settings.max_steps, PATIENCE)
+    following, _, target = placed.onwards()
+    lead = _lead(placed, target)
+    by_level = xp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
+    longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
+
+    # Ways, with a lane for every section: K candidates, and the reference.
+    W = K + 1
+    divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), 2])
+    slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, 1.0])
+    by_estimate = np.isfinite(slack) & (np.arange(W) < K)
+    rtol = xp.where(by_estimate, settings.rtol, _REFERENCE_RTOL)
+
+    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W), tree)  # noqa: E731
+    each = lambda x: xp.repeat(xp.asarray(x), N)  # noqa: E731
+    lanes = all_ways(placed.lanes)
+    per_lane = ("time", "index", "event", "limit")
+    target = dataclasses.replace(target, **{x: all_ways(getattr(target, x)) for x in per_lane})
+    start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
+    accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
+    tolerance = Settings(1.0, 1.0, patience, settings.scale)
+    tolerance = eqx.tree_at(lambda x: (x.rtol, x.atol), tolerance, accuracy)
+    moved = move(s, lanes, xp.zeros((s.nu, W * N)), target, tolerance, start)
+    ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
+    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, N)
+    estimate = moved.error.reshape(W, N)[:K] * (rtol[:K, None] / settings.rtol)
+    first = longest / divide[:K, None]
+    return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
+
+
+def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
+    """The first candidate of each section whose impact is at most `share`, or the best one."""
+    enough = impact <= share
+    return np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
+
+
+def _lead(placed: PlacedSections, target):
+    """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
+    s, lanes = placed.structure(), placed.lanes
+    N = placed.n_sections
+    xp = namespace(lanes.t)
+    everywhere = xp.ones(N, bool)
+    seen = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, everywhere)
+    value, rate = seen.value[-1], seen.rate[-1]
+    falls = (value > 0) & (rate < 0)
+    lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    return xp.where((lead > _LEAST_LEAD) & (lead < _LARGEST_LEAD), lead, 1.0)
+
+
+def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
+    """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
+    N = len(scale)
+    section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:2]))
+    for m in range(_PERIODS * N):
+        at = (section + 1 + m) % N
+        now = worst[m // N]
+        np.maximum(now, np.max(np.abs(error) / scale[at], axis=-1), out=now)
+        error = np.einsum("kij,ckj->cki", J[at], error)
+    last, before = worst[-1], worst[-2]
+    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    return worst.sum(axis=0) + last * ratio / (1 - ratio)
+
+
+def _accumulated(J, error, scale) -> float:
+    """The largest error, relative to the scales, when every section makes its `error` (N, n)."""
+    N = len(scale)
+    total, largest = np.zeros(scale.shape[1]), 0.0
+    for m in range(_PERIODS * N):
+        total = J[m % N] @ total + error[m % N]
+        largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
+    return largest
+
+
+class Stepping(eqx.Module):
+    """How lanes step from section to section, and how precise that is.
+
+    **Fields:**
+
+    - `plan`: how lanes set out from each section. `settings`: tolerances.
+    - `scales`: of time (the period) and of states (`LimitCycle.scale`) at each section.
+    - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
+    - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
+    """
+
+    plan: Plan
+    settings: Settings
+    scales: Float[np.ndarray, "N n"]
+    accuracy: float = eqx.field(static=True)
+    rounding: float = eqx.field(static=True, default=0.0)
+
+
+_made = Memory()
+
+
+def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
+    """The plan for placed sections; made once for each accuracy."""
+
+    def make() -> Stepping:
+        cycle = placed.cycle
+        patience = max(PATIENCE, cycle.settings.max_steps)
+        settings = Settings(accuracy, accuracy, patience, cycle.settings.scale)
+        time = np.full((placed.n_sections, 1), float(cycle.period))
+        sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
+        scales = np.concatenate([time, sizes], axis=1)
+        return Stepping(make_plan(placed, settings, accuracy, scales), settings, scales, accuracy)
+
+    return _made.recall(placed, accuracy, make)

@@ -1,0 +1,298 @@
+"""Experiments in a Zarr store: more than memory holds, run by any number of processes."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Path
+from .._core.execution import Execution
+from .._core.pieces.description import array_digest, definition_digest, digest_of, versions
+from .._core.pieces.run import DaskClient, Workers, fill
+from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
+from .._core.results import Result
+from .._core.signal import Signal, unit_of
+from ..engine.describe import describe
+from ..errors import ComputationError, DefinitionError
+from ..orbits.cycle import LimitCycle, rough
+from ..sections.placed import SectionsLike
+from ..systems.output import OutputNames
+from .campaign import Campaign, DesignLike, Options, prepare
+from .data import ExperimentData, Simulated, summary
+from .design.design import Design
+from .events import EventTimes
+
+
+_KIND = "experiments"
+# Events that are kept of an experiment, for each of the limit cycle in the same time. More: files
+# are larger. Fewer: experiments with additional events end the run.
+_MORE_EVENTS = 2
+# The arrays of `EventTimes` in a store, with the value beyond the last event.
+_EVENTS = {"event_time": np.nan, "event": -1, "event_sample": -1}
+
+
+@checked
+class StoredExperiments:
+    """Experiments in a store that `stream_experiments(..., store=...)` fills.
+
+    Iterating over them reads chunk after chunk as `ExperimentData`, so that
+    `estimate_htf(StoredExperiments(store))` needs memory for one chunk only.
+    """
+
+    def __init__(self, store: Path):
+        """**Arguments:** `store`: its folder or address.
+
+        **Raises:** `DefinitionError` if it holds no experiments.
+        """
+        self.address = absolute(store)
+        try:
+            self._store = ZarrStore(self.address)
+            about = self._store.layout.description
+            if about["kind"] != _KIND:
+                raise KeyError
+        except (DefinitionError, KeyError, TypeError, ValueError) as error:
+            raise DefinitionError(f"'{store}' holds no experiments.") from error
+        blocks = self._store.layout.blocks
+        self.experiments, self.chunk = blocks.shape[0], blocks.block[0]
+        self._about = about["data"]
+        self.n_sections: int = self._about["n_sections"]
+
+    def __len__(self) -> int:
+        """Return the number of chunks, missing ones included."""
+        return len(self._store.layout.blocks)
+
+    def missing(self) -> list[int]:
+        """Return the indices of the chunks that are missing."""
+        return self._store.missing()
+
+    def __getitem__(self, k: Index) -> ExperimentData:
+        """Return chunk k. **Raises:** `FileFormatError` if it is damaged."""
+        if k >= len(self):
+            raise IndexError(f"there are {len(self)} chunks, and none of number {k}.")
+        x, about = self._store.read(k), self._about
+        events = None
+        if "event" in x:
+            width = max(int((x["event"] >= 0).sum(axis=1).max(initial=0)), 1)
+            time, event, sample = (x[name][:, :width] for name in _EVENTS)
+            names = tuple(about["transitions"])
+            cycle = self._of_cycle("time"), self._of_cycle("event"), self._of_cycle("period")
+            N = self.n_sections
+            events = EventTimes(time, event, sample, *cycle, n_sections=N, names=names)
+        return ExperimentData(
+            x["u"],
+            x["y"],
+            n_sections=self.n_sections,
+            periods=about["periods"],
+            inputs=tuple(Signal(*named) for named in about["inputs"]),
+            outputs=tuple(Signal(*named) for named in about["outputs"]),
+            result=x["result"],
+            simulated=Simulated(x["failed_at"], x["error"], events, about["label"]),
+            cycle_outputs=self._of_cycle("outputs"),
+        )
+
+    def __iter__(self) -> Iterator[ExperimentData]:
+        """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
+        `FileFormatError` if one is damaged."""
+        missing = self.missing()
+        if missing:
+            raise DefinitionError(
+                f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing, the first "
+                f"is {missing[0]}: make the call that began it again to run them."
+            )
+        for k in range(len(self)):
+            yield self[k]
+
+    @property
+    def dataset(self) -> Any:
+        """All experiments as `xarray.Dataset`, whose values are read when they are used."""
+        return self._store.dataset()
+
+    def summary(self, limit: Index = 5) -> str:
+        """Return the same as `ExperimentData.summary`, for all experiments."""
+        result, failed_at = (self._store.array(name) for name in ("result", "failed_at"))
+        assert result is not None and failed_at is not None
+        return summary(result, failed_at, self.n_sections, limit)
+
+    @functools.cached_property
+    def _of_cycle(self) -> Callable[[str], Any]:
+        return functools.cache(lambda name: self._store.array(f"cycle_{name}"))
+
+    def __repr__(self) -> str:
+        ready = len(self) - len(self.missing())
+        return (
+            f"StoredExperiments('{self.address}': {self.experiments} experiments, {ready} of "
+            f"{len(self)} chunks)"
+        )
+
+
+def store_experiments(
+    arguments: tuple[LimitCycle, SectionsLike, DesignLike, OutputNames],
+    options: Options,
+    chunk: int,
+    store: Any,
+    workers: Workers | None,
+) -> StoredExperiments:
+    """Run the experiments that are missing in a store; see `stream_experiments`."""
+    fill(prepare_pieces(*arguments, options, chunk), store, workers)
+    return StoredExperiments(store)
+
+
+def prepare_pieces(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    options: Options,
+    chunk: int,
+) -> "ExperimentJob":
+    """Return the experiments as pieces whose results do not depend on the number of threads."""
+    # (Batches as for one thread: their size does not depend on the machine.)
+    execution = dataclasses.replace(options.execution or Execution(), workers=1)
+    options = dataclasses.replace(options, execution=execution)
+    campaign = prepare(cycle, sections, design, outputs, options, chunk, one_program=True)
+    S = len(campaign.inputs)
+    return ExperimentJob(campaign, Blocks((S,), (min(chunk, S),)))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExperimentJob:
+    """**Fields:** `campaign`, in `blocks` of experiments."""
+
+    campaign: Campaign
+    blocks: Blocks
+
+    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
+        """Return the records of chunk k."""
+        (rows,) = self.blocks.slices(k)
+        data = self.campaign.run(rows, Execution(workers=workers).threads)
+        values = {
+            "u": data.u, "y": data.y, "result": data.result,
+            "failed_at": data.failed_at, "error": data.error,
+        }  # fmt: skip
+        events = data.events
+        if events is not None:
+            E = self.event_count
+            if events.time.shape[1] > E:
+                worst = rows.start + int(np.argmax(events.count))
+                raise ComputationError(
+                    f"experiment {worst} has more than {E} events, over {_MORE_EVENTS} for each of "
+                    "the limit cycle: run it without `record_events`."
+                )
+            arrays = events.time, events.event, events.sample
+            for (name, fill), x in zip(_EVENTS.items(), arrays, strict=True):
+                values[name] = np.pad(x, ((0, 0), (0, E - x.shape[1])), constant_values=fill)
+        return values
+
+    @property
+    def event_count(self) -> int:
+        """Number of events that are kept of each experiment."""
+        each = len(self.campaign.placed.cycle.event_sequence)
+        return max(_MORE_EVENTS * each * self.campaign.inputs.cycles, 1)
+
+    def begin(self, client: DaskClient | None) -> tuple["ExperimentJob", Layout]:
+        """Return the job, and the form of its records."""
+        campaign, description = self.campaign, self.description
+        placed, here = campaign.placed, campaign.at_sections
+        n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
+        codes = {
+            "flag_values": [int(x) for x in Result],
+            "flag_meanings": " ".join(x.name.lower() for x in Result),
+        }
+        variables = {
+            "u": Variable("<f8", ("sample", "input"), (n, len(u))),
+            "y": Variable("<f8", ("sample", "output"), (n, len(here.outputs.names))),
+            "result": Variable("<i8", attributes=codes),
+            "failed_at": Variable("<i8"),
+            "error": Variable("<f8"),
+        }
+        constants: dict[str, Constant] = {
+            "input": (("input",), np.array(list(map(str, u)))),
+            "output": (("output",), np.array(list(map(str, here.outputs.names)))),
+            "cycle_outputs": (("section", "output"), here.on_cycle),
+        }
+        if campaign.record_events:
+            cycle, axis = campaign.cycle_events(), (("occurrence",), (self.event_count,))
+            unit = {"units": placed.cycle.system.time_unit or "1"}
+            names = {"flag_meanings": " ".join(description["data"]["transitions"])}
+            variables |= {
+                "event_time": Variable("<f8", *axis, unit),
+                "event": Variable("<i8", *axis, names),
+                "event_sample": Variable("<i8", *axis),
+            }
+            constants |= {
+                "cycle_time": (("cycle_event",), np.asarray(cycle.time[0])),
+                "cycle_event": (("cycle_event",), np.asarray(cycle.event[0])),
+                "cycle_period": ((), np.asarray(placed.cycle.period)),
+            }
+        coordinates = "input", "output"
+        layout = Layout(
+            ("experiment",), self.blocks, variables, constants, coordinates, description
+        )
+        return self, layout
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return the arrays that records depend on beside inputs and parameters: those of the
+        cycle, of the sections on it, of the step schedule and of the linearization."""
+        arrays = eqx.filter(self._computed(), eqx.is_array)
+        return [np.asarray(x) for x in jax.tree_util.tree_leaves(arrays)]
+
+    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "ExperimentJob":
+        """Return the job with the arrays of another process."""
+        mine, others = eqx.partition(self._computed(), eqx.is_array)
+        leaves, structure = jax.tree_util.tree_flatten(mine)
+        leaves = [
+            jax.numpy.asarray(new) if isinstance(old, jax.Array) else new
+            for old, new in zip(leaves, arrays, strict=True)
+        ]
+        placed, stepping, model = eqx.combine(structure.unflatten(leaves), others)
+        campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
+        return dataclasses.replace(self, campaign=campaign)
+
+    def _computed(self) -> Any:
+        return self.campaign.placed, self.campaign.stepping, self.campaign.model
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """JSON from which the experiments can be told from others."""
+        campaign = self.campaign
+        placed, inputs, noise = campaign.placed, campaign.inputs, campaign.process_noise
+        z = campaign.at_sections.outputs
+        return {
+            "kind": _KIND,
+            "versions": versions(),
+            "model": describe(placed.cycle.system),
+            "cycle": rough(placed.cycle),
+            "family": definition_digest(placed.family),
+            "design": _design(inputs.source),
+            "start": campaign.start,
+            "process_noise": None if noise is None else dataclasses.asdict(noise),
+            "record_events": campaign.record_events,
+            "accuracy": campaign.stepping.accuracy,
+            "precision": campaign.execution.precision,
+            "batch": campaign.execution.batch,
+            "chunk": self.blocks.block[0],
+            "experiments": self.blocks.shape[0],
+            "cycles": inputs.cycles,
+            "data": {
+                "n_sections": placed.n_sections,
+                "periods": inputs.periods,
+                "inputs": [[str(x), unit_of(x)] for x in z.structure.inputs],
+                "outputs": [[str(x), unit_of(x)] for x in z.names],
+                "label": placed.family.label,
+                "transitions": [t.name for t in z.structure.transitions],
+            },
+            "outputs": [x if isinstance(x, str) else definition_digest(x) for x in z.items],
+        }
+
+
+def _design(source: Design | np.ndarray) -> str:
+    if isinstance(source, Design):
+        arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
+        return digest_of(*map(array_digest, arrays), repr(source.input_names))
+    parts = (source[k : k + 1024] for k in range(0, len(source), 1024))  # (may lie on disk)
+    return digest_of(*map(array_digest, parts))

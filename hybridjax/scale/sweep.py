@@ -1,0 +1,271 @@
+"""Limit cycles over a space of parameters."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from scipy.stats import qmc
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Path
+from .._core.execution import Execution
+from .._core.pieces.description import array_digest, function_digest, versions
+from .._core.pieces.run import DaskClient, Workers, call, fill
+from .._core.pieces.store import Blocks, Layout, Variable, near_cube
+from .._core.precision import require_x64
+from .._core.progress import say, working
+from ..errors import ComputationError, DefinitionError
+from ..orbits.batches import Known, Tiles
+from ..orbits.cycle import LimitCycle, rough
+from ..orbits.find import find_limit_cycle
+from ..orbits.limit_cycles import BATCH, LimitCycles, as_cycles, map_for_sweep, programs_for
+from ..orbits.return_map import ReturnMap
+from ..systems.system import HybridSystem
+from .family import Axes, Family, Points, Space
+from .wanted import Measure, Want, Wanted
+
+
+# Sweeps of more points have to be asked for by `force`: an hour on two cores. Fewer: sweeps of
+# minutes do, too. More: a slip of a digit costs a day.
+LARGE = 50_000_000
+# Points of a piece at most, and pieces of a large sweep at least. Smaller pieces: many small files,
+# and worse first guesses. Larger ones: more is lost with a worker.
+_MOST, _PIECES = 4000, 64
+# Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
+# they save.
+_COARSE = 250
+# Digits of the guess, relative to the sizes of the states. More: results depend on how it was
+# found. Fewer: the coarse pass takes one more step.
+_DIGITS = 7
+
+
+@checked
+@working("sweep")
+def sweep(
+    model: HybridSystem | Callable[..., HybridSystem],
+    over: Axes | Points,
+    want: Want | Measure | Sequence[Want | Measure] = ("period", "spectral_radius"),
+    *,
+    guess: LimitCycle | None = None,
+    chunk: Count | None = None,
+    store: Path | None = None,
+    client: Workers | None = None,
+    force: bool = False,
+) -> Any:
+    """Find limit cycles over a space of parameters, as a labelled array.
+
+    ```python
+    over = {"k": np.linspace(8, 13, 100), "b": np.linspace(3, 7, 100)}
+    map = hj.sweep(hj.models.VerticalHopper(), over)
+    map.spectral_radius.plot()
+    ```
+
+    A coarse pass finds cycles at points all over the space. Pieces of neighboring points then start
+    from these cycles, and points of a piece from each other. A piece does not depend on which
+    process computes it, nor when: results are the same to the last bit for any number of processes
+    and interruptions (on machines of one kind). A point at which the search fails is tried again
+    from the nearest point that succeeded, and after a burn-in.
+
+    **Arguments:**
+
+    - `model`: a system, some of whose scalar parameters take the values given (names may have
+        dots); or a function of these parameters that returns a system.
+    - `over`: values of each parameter by name, of which all combinations are taken; or
+        `hj.scale.Points`.
+    - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
+        chart), "multipliers", "spectral_radius" (their largest modulus), "events" (at most four
+        times as many as cycles of the coarse pass have), "residual"; and functions of a
+        `LimitCycle`, kept under their names, that return a number or an array of always the same
+        shape. NaN where they raise `ComputationError`. The code of the cycle's `Result` is always
+        kept. Default: period and spectral radius.
+    - `guess`: the cycle of a similar system. Default: that of the model in the middle.
+    - `chunk`: largest number of points in a piece. Default: up to 4000, with functions 250.
+    - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
+        are not computed again: after an interruption, repeat the call.
+    - `client`: a `distributed.Client`, whose workers compute the pieces. Or `(rank, size)` if
+        several processes fill one store without Dask: this process computes the pieces rank,
+        rank + size, ...; processes of rank 1 and more wait until the first has begun the store.
+    - `force`: whether to compute more than 50 million points. Default: False.
+
+    **Returns:** an `xarray.Dataset`, whose coordinates are the parameters with their units. With a
+    store, values are read when they are used.
+
+    **Raises:** `DefinitionError` for a parameter that does not exist, for quantities that do not
+    exist or change their shape, if the store holds another sweep (with the difference) or cannot be
+    written, and for a client whose workers cannot do it; `ComputationError` if there is no cycle in
+    the middle, or the cluster is lost.
+    """
+    require_x64()
+    space = Space(over.values, False) if isinstance(over, Points) else Space(_axes(over), True)
+    family = Family(model, list(space.axes))
+    middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
+    system = family.check(middle)
+    wanted = Wanted(want, system)
+    total = math.prod(space.shape)
+    if total > LARGE and not force:
+        size = 8e-9 * total * (1 + len(wanted.names) + len(wanted.measures))
+        raise DefinitionError(
+            f"these are {total:.3g} points, about {total / 5000 / 3600:.3g} hours of one core and "
+            f"{size:.3g} GB: say `force=True` if that is meant."
+        )
+    most = chunk or (BATCH if wanted.measures else min(max(total // _PIECES, BATCH), _MOST))
+    blocks = Blocks(space.shape, near_cube(space.shape, most))
+    description = {
+        "kind": "sweep",
+        "versions": versions(),
+        "model": family.describe(system, middle),
+        "over": {name: array_digest(x) for name, x in space.axes.items()},
+        "form": list(space.dims),
+        "want": list(wanted.names),
+        "measures": {name: function_digest(f) for name, f in wanted.measures.items()},
+        "guess": None if guess is None else rough(guess),
+        "piece": list(blocks.block),
+    }
+    job = SweepJob(family, system, space, blocks, wanted, guess, description)
+    return fill(job, store, client).dataset()
+
+
+def _axes(over: Axes) -> dict[str, np.ndarray]:
+    axes = {name: np.asarray(x, float) for name, x in over.items()}
+    if not axes:
+        raise DefinitionError("`over` must name at least one parameter.")
+    for name, x in axes.items():
+        if not len(x):
+            raise DefinitionError(f"the axis `{name}` is empty: give it at least one value.")
+    return axes
+
+
+class Begun(NamedTuple):
+    """The common beginning of all pieces: the return map of the guess, the indices of the points of
+    the coarse pass, and their cycles (without the systems)."""
+
+    map: ReturnMap
+    index: tuple[np.ndarray, ...]
+    known: Known
+
+    def parts(self) -> Any:
+        """Return all arrays but those that follow from the model."""
+        x = self.map
+        return (x.anchor, x.expected, x.settings.scale, x.conserved), self.index, self.known
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepJob:
+    """**Fields:** `family`: systems as a function of parameters; `system`: that in the middle of
+    the `space` of points, which is cut into `blocks`; `wanted`: quantities to keep of each cycle,
+    as `variables`; `guess`: a cycle, or None; `begun`: the common beginning of all pieces."""
+
+    family: Family
+    system: HybridSystem
+    space: Space
+    blocks: Blocks
+    wanted: Wanted
+    guess: LimitCycle | None
+    description: Mapping[str, Any]
+    begun: Begun | None = None
+    variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
+
+    def begin(self, client: DaskClient | None) -> tuple["SweepJob", Layout]:
+        """Return the job after the coarse pass, and the form of its results."""
+        begun = self._blank()
+        say("a coarse pass")
+        coarse = dataclasses.replace(self, begun=begun, guess=None)
+        known, cycles = call(coarse, "coarse", client)
+        variables = self.wanted.variables(cycles)
+        units = self.family.units(self.system)
+        points, states = self.space.constants(units), self.wanted.constants()
+        layout = Layout(
+            self.space.dims, self.blocks, variables, {**points, **states}, (*points, *states),
+            self.description,
+        )  # fmt: skip
+        begun = begun._replace(known=known)
+        return dataclasses.replace(self, begun=begun, variables=variables), layout
+
+    def arrays(self) -> list[np.ndarray]:
+        """Return the arrays of the common beginning."""
+        assert self.begun is not None
+        return [np.asarray(x) for x in jax.tree_util.tree_leaves(self.begun.parts())]
+
+    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "SweepJob":
+        """Return the job with the beginning that another process computed."""
+        blank = self._blank()
+        structure = jax.tree_util.tree_structure(blank.parts())
+        of_map, index, known = jax.tree_util.tree_unflatten(structure, arrays)
+        begun = Begun(_with(blank.map, *of_map), index, known)
+        return dataclasses.replace(self, begun=begun, variables=layout.variables)
+
+    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
+        """Return the results at the points of piece k."""
+        assert self.begun is not None
+        place = self.blocks.slices(k)
+        index = np.meshgrid(*(np.arange(x.start, x.stop) for x in place), indexing="ij")
+        tiles = self._tiles(tuple(x.ravel() for x in index), workers)
+        coarse = self.family.systems(self.space.at(self.begun.index))
+        tiles = tiles._replace(known=self.begun.known._replace(systems=coarse))
+        cycles = as_cycles(tiles, tiles.solve(index[0].size))
+        values = self.wanted.values(cycles, self.variables)
+        return {name: x.reshape(*index[0].shape, *x.shape[1:]) for name, x in values.items()}
+
+    def coarse(self) -> tuple[Known, LimitCycles]:
+        """Return the cycles of the coarse pass."""
+        assert self.begun is not None
+        index = self.begun.index
+        tiles = self._tiles(index, None)
+        rounds = tiles.solve(len(index[0]))
+        jacobian, result = np.asarray(rounds.turn.jacobian), np.asarray(rounds.result)
+        known = Known(None, rounds.anchor, rounds.period, jacobian, result)
+        return known, as_cycles(tiles, rounds)
+
+    def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
+        assert self.begun is not None
+        systems = self.family.systems(self.space.at(index))
+        points = math.prod(self.blocks.block)
+        # (One size for all, also for the smaller blocks at the edges: there is one program.)
+        size, threads = min(BATCH, points), Execution(workers=workers).threads
+        programs = programs_for(math.prod(self.blocks.shape))
+        return Tiles(systems, self.begun.map, size, threads, programs)
+
+    def _blank(self) -> Begun:
+        """Return the beginning before the cycles of the coarse pass are known."""
+        map = _rounded(map_for_sweep(self._guess(), None, None))
+        unit = qmc.Halton(len(self.blocks.shape), scramble=False).random(_COARSE + 1)[1:]
+        index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
+        n, d = len(index[0]), map.anchor.q.shape[0]
+        anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
+        known = Known(None, anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
+        return Begun(map, index, known)
+
+    def _guess(self) -> LimitCycle:
+        if self.guess is not None:
+            return self.guess
+        say("a cycle in the middle")
+        try:
+            return find_limit_cycle(self.system)
+        except (ComputationError, DefinitionError) as error:
+            raise type(error)(
+                "no limit cycle was found in the middle of the axes, so give one by `guess=`: "
+                f"{error}"
+            ) from error
+
+
+def _rounded(map: ReturnMap) -> ReturnMap:
+    """Return the map with a state, a period and sizes without the last digits of the guess, which
+    depend on how it was found."""
+    single = lambda x: np.asarray(x, np.float32).astype(float)  # noqa: E731
+    scale = single(map.settings.scale)
+    size = scale[np.asarray(map.anchor.chart)].T
+    q = np.round(np.asarray(map.anchor.q) / size, _DIGITS) * size
+    anchor = eqx.tree_at(lambda x: x.q, map.anchor, q)
+    period = map.expected if map.base is None else single(map.expected)
+    return _with(map, anchor, period, scale, map.conserved)
+
+
+def _with(map: ReturnMap, anchor: Any, expected: Any, scale: Any, conserved: Any) -> ReturnMap:
+    settings = dataclasses.replace(map.settings, scale=scale)
+    return dataclasses.replace(
+        map, anchor=anchor, expected=expected, settings=settings, conserved=conserved
+    )
