@@ -378,7 +378,10 @@ def signal_of(crossing: Crossing) -> str:
 
 
 def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
-    values = np.asarray(values)
+    try:
+        values = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
         raise DefinitionError(
             f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "

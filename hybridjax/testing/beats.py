@@ -44,6 +44,8 @@ def simulate_beats(
     """
     force = np.asarray(force, float)
     S, m = force.shape
+    if not force.size:
+        raise DefinitionError("`force` needs at least one sample of one trial.")
     if not len(np.asarray(curve)):
         raise DefinitionError("`curve` needs at least one value.")
     if np.size(rhythm) not in (1, S):

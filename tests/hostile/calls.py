@@ -28,7 +28,7 @@ def scale(t):
     yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
     yield hj.scale.Points, dict(values={"x": [1.0]})
     good = dict(ranges={"x": (0.0, 1.0)}, count=4)
-    yield hj.scale.sobol_points, good
+    yield hj.scale.Points.sobol, good
 
 
 def systems(t):
@@ -149,16 +149,16 @@ def designs(t):
 def experiments(t):
     to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
     yield hj.run_experiments, to_run
+    yield hj.experiments.Options, {}
     yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
     u = np.zeros((1, 8, 1))
     yield t.response, dict(u=u)
-    yield hj.experiments.steady_start, dict(response=t.response, u=u)
+    yield t.response.steady_start, dict(u=u)
     yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
-    yield hj.experiments.odd_part, dict(data=t.data)
     y = np.ones(t.data.y.shape)
     yield hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
     yield t.data.windows, {}
@@ -170,20 +170,12 @@ def experiments(t):
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield hj.identify.estimate_coherence, dict(data=t.repeated, harmonics=0, repeats=2)
     yield hj.identify.missing_frequencies, dict(data=t.repeated)
-    yield (
-        hj.identify.htf_p_values,
-        dict(data=t.four_times, true=t.model.htf(t.design.frequencies[:2], 0)),
-    )
     yield hj.identify.output_levels, dict(data=t.repeated)
-    yield hj.identify.predict_leakage, dict(design=t.design, model=t.model)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])
-    yield hj.identify.fit_aaa, dict(htf=t.estimate)
-    yield t.aaa.compare, dict(true=[0.5])
     yield hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6)
     yield t.structured.htf, dict(f=np.array([0.1, 0.2]))
     true = np.asarray(t.model.multipliers)
