@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from ...errors import DefinitionError
+from ..errors import DefinitionError
+from .recording import Recording, Trial
 
 
-# The longest gap, in cycles, across which turns are counted. Doubled: stretches go on across gaps
-# of half a cycle, where a turn may be lost unseen.
+# Longest gap, in cycles, across which cycles are counted. Longer: half a turn of an angle passes
+# unnoticed, and the count is wrong. Shorter: stretches end at every missing sample of a slow rate.
 LONGEST_GAP = 0.25
 
 
@@ -20,7 +21,7 @@ class Winding(eqx.Module):
 
     **Fields:** `time` (n,), `phase` (n,) in cycles: both strictly increasing. `linear`: whether
     the phase is linear in between, or smooth. `gaps` (g, 2): start and end of the times at which
-    it was not seen, but interpolated.
+    it was interpolated and not observed.
     """
 
     time: Float[np.ndarray, " n"]
@@ -29,24 +30,33 @@ class Winding(eqx.Module):
     gaps: Float[np.ndarray, "g 2"] = eqx.field(default_factory=lambda: np.zeros((0, 2)))
 
     def when(self, phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """The times at which the phase has these values, by inverse interpolation."""
+        """Return the times at which the phase has these values, by inverse interpolation."""
         if self.linear:
             return np.interp(phase, self.phase, self.time)
         return PchipInterpolator(self.phase, self.time)(phase)
 
+    def edges(self) -> Float[np.ndarray, " c1"]:
+        """Return the times at which the phase is a whole number."""
+        return self.when(np.arange(np.ceil(self.phase[0]), np.floor(self.phase[-1]) + 1))
+
+    def at(self, time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return the phase at some times; NaN outside of the stretch."""
+        return np.interp(time, self.time, self.phase, left=np.nan, right=np.nan)
+
 
 class Phase(eqx.Module):
-    """The phase of all trials of a recording, as `estimate_phase` finds it.
+    """The phase of all trials of a recording, as `estimate_phase` returns it.
 
     **Fields:**
 
-    - `stretches`: for each trial, the stretches that are not interrupted.
+    - `stretches`: for each trial, its uninterrupted stretches.
     - `periods`: for each trial, the durations of its cycles. `period`: their median.
-    - `n_sections`: the number N of the family that defined it; None where cycles go from one
-      crossing or event to the next, or a function defined it.
-    - `backwards`: the share of samples at which the angle ran backwards (noise).
-    - `dropped`: events taken for doubled; `missed`: cycles left out since an event was missed.
-    - `lead`: how many cycles the phase looks ahead.
+    - `n_sections`: the number N of the family that defined the phase; None for phases defined by
+      crossings, events or functions.
+    - `backwards`: fraction of samples at which the angle ran backwards (noise).
+    - `dropped`: number of events taken for doubled. `missed`: number of cycles left out because an
+      event was missed.
+    - `lead`: number of cycles by which the phase depends on the future.
     """
 
     stretches: tuple[tuple[Winding, ...], ...]
@@ -60,7 +70,7 @@ class Phase(eqx.Module):
 
     def __init__(
         self,
-        stretches: list[tuple[Winding, ...]],
+        stretches: Sequence[Sequence[Winding]],
         *,
         n_sections: int | None = None,
         backwards: float = 0.0,
@@ -69,44 +79,59 @@ class Phase(eqx.Module):
         lead: int = 0,
     ):
         """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
-        self.stretches = tuple(stretches)
-        self.periods = tuple(_periods(parts) for parts in stretches)
-        everything = np.concatenate(self.periods)
-        if len(everything) < 2:
+        self.stretches = tuple(map(tuple, stretches))
+        self.periods = tuple(
+            np.concatenate([np.zeros(0), *(np.diff(w.edges()) for w in parts)])
+            for parts in self.stretches
+        )
+        every = np.concatenate(self.periods)
+        if len(every) < 2:
             raise DefinitionError(
-                f"the recording holds {len(everything)} whole cycles; at least two are needed to "
-                "speak of a period."
+                f"the recording holds {len(every)} whole cycles; at least two are needed to speak "
+                "of a period."
             )
-        self.period = float(np.median(everything))
+        self.period = float(np.median(every))
         self.n_sections, self.backwards, self.lead = n_sections, backwards, lead
         self.dropped, self.missed = dropped, missed
 
+    def by_trial(self, recording: Recording) -> list[tuple[Trial, tuple[Winding, ...]]]:
+        """Return each trial with its stretches.
+
+        **Raises:** `DefinitionError` for a recording with another number of trials.
+        """
+        if len(self.stretches) != len(recording.trials):
+            raise DefinitionError(
+                f"the phase is of {len(self.stretches)} trials, the recording has "
+                f"{len(recording.trials)}."
+            )
+        return list(zip(recording.trials, self.stretches, strict=True))
+
     @property
     def cycles(self) -> int:
-        """The number of whole cycles."""
+        """Number of whole cycles."""
         return sum(len(p) for p in self.periods)
 
     @property
     def drift(self) -> float:
-        """Change of the period per cycle, relative to it: a straight line through each trial."""
-        slopes, weights = [], []
+        """Relative change of the period per cycle: a straight line through each trial."""
+        slopes, weights = [0.0], [1e-300]
         for p in self.periods:
             k = np.arange(len(p)) - (len(p) - 1) / 2
             if len(p) > 2:
                 slopes.append(float(k @ p / (k @ k)))
                 weights.append(float(k @ k))
-        return float(np.average(slopes, weights=weights)) / self.period if slopes else 0.0
+        return float(np.average(slopes, weights=weights)) / self.period
 
     @property
     def jitter(self) -> float:
-        """Standard deviation of the periods of each trial about their line, relative to them."""
-        rest, freedom = 0.0, 0
+        """Relative standard deviation of the periods of each trial about their line."""
+        squares, freedom = 0.0, 0
         for p in self.periods:
             if len(p) > 2:
                 k = np.arange(len(p))
-                rest += float(((p - np.polyval(np.polyfit(k, p, 1), k)) ** 2).sum())
+                squares += float(((p - np.polyval(np.polyfit(k, p, 1), k)) ** 2).sum())
                 freedom += len(p) - 2
-        return float(np.sqrt(rest / freedom)) / self.period if freedom else 0.0
+        return float(np.sqrt(squares / max(freedom, 1))) / self.period
 
     def __repr__(self) -> str:
         notes = ""
@@ -122,24 +147,3 @@ class Phase(eqx.Module):
             f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
             f"{100 * self.drift:.2g} % per cycle{notes})"
         )
-
-
-def count_on(
-    parts: Sequence[Winding],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Times and phases of a trial's stretches one after the other, each from a new cycle on."""
-    times, phases, next_cycle = [np.zeros(0)], [np.zeros(0)], 0.0
-    for part in parts:
-        times.append(part.time)
-        phases.append(part.phase - np.floor(part.phase[0]) + next_cycle)
-        next_cycle = np.ceil(phases[-1][-1])
-    return np.concatenate(times), np.concatenate(phases)
-
-
-def _periods(parts: tuple[Winding, ...]) -> Float[np.ndarray, " _"]:
-    """Durations of the whole cycles of one trial's stretches."""
-    each = [np.zeros(0)]
-    for part in parts:
-        whole = np.arange(np.ceil(part.phase[0]), np.floor(part.phase[-1]) + 1)
-        each.append(np.diff(part.when(whole)))
-    return np.concatenate(each)
