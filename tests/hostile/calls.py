@@ -275,14 +275,7 @@ def recordings(t):
     yield hj.identify_recording, take | dict(order=1)
     yield t.section_data.experiments, dict(periods=4)
     yield hj.recordings.inspect, dict(recording=t.recording, inputs="f", outputs=("x", "v"))
-    yield (
-        hj.recordings.inspect_cycles,
-        dict(recording=t.recording, phase=t.phase, data=t.section_data),
-    )
-    about = dict(input="f", outputs=("x", "v"), event="strike")
-    yield hj.testing.mishandle, dict(recording=t.recording, mishap="white noise", **about)
     yield hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit)
-    yield hj.recordings.plain_regression, dict(data=t.record, order=2)
     yield hj.recordings.choose_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
@@ -290,13 +283,9 @@ def recordings(t):
         hj.recordings.without_drift,
         dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
     )
-    command = {"c": np.zeros((1, 120))}
-    yield (
-        hj.recordings.add_command,
-        dict(recording=t.recording, phase=t.phase, command=command, n_sections=2),
-    )
+    table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
+    yield hj.recordings.add_command, table
     yield hj.recordings.write_design, dict(path="d.csv", design=t.one_input)
-    yield hj.recordings.read_design, dict(path="nope.csv")
     yield positional(hj.read_recording), dict(values="nope.csv")
     tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
     yield hj.recordings.PhaseTracker, tracker
@@ -305,8 +294,7 @@ def recordings(t):
 
 
 def testing(t):
-    yield hj.testing.Dirt, {}
-    yield hj.testing.spoil, dict(recording=t.recording, signals=("x",), dirt=hj.testing.Dirt())
+    yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
     yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
     force = np.zeros((1, 50, 1))
     yield hj.testing.simulate_recording, dict(cycle=t.cycle, force=force, outputs=STATES, rate=16)
@@ -359,7 +347,6 @@ def rhythms(t):
     yield hj.orbits.coincidences, dict(cycle=t.cycle)
     about = dict(recording=t.recording, phase=BEAT, input="f")
     yield hj.recordings.phase_response, about
-    yield hj.recordings.forecast_intervals, about | dict(curve=[1.0])
     yield hj.plot.phase_response, dict(found=t.beats)
     at = dict(phase=[0.1, 0.2])
     yield t.beats, at
@@ -367,7 +354,6 @@ def rhythms(t):
     yield hj.recordings.natural_multipliers, dict(data=t.variability)
     natural = hj.recordings.natural_multipliers(t.variability)
     yield natural.interval, {}
-    yield natural.plain_interval, {}
     yield t.structured.half_widths, {}
     yield hj.testing.simulate_beats, dict(curve=[1.0], force=jnp.ones((1, 99)))
 
