@@ -155,11 +155,10 @@ def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
     return other
 
 
-class Driven(HybridSystem):
-    """`system` with an input that is a function of time, added to the piecewise constant one."""
+class Derived(HybridSystem):
+    """A system made of another one, of which it has all that it does not define anew."""
 
     system: HybridSystem
-    drive: Callable[[Any], Any]
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -184,3 +183,9 @@ class Driven(HybridSystem):
 
     def outputs(self):
         return self.system.outputs()
+
+
+class Driven(Derived):
+    """`system` with an input that is a function of time, added to the piecewise constant one."""
+
+    drive: Callable[[Any], Any]
