@@ -185,8 +185,8 @@ def simulate(
             break
     t, before, after, charts, event = (np.concatenate(x) for x in zip(*rows, strict=True))
     source = np.concatenate([charts[:1], charts[:-1]])
-    slopes = (_slopes(s, t, *x, u) for x in ((source, before), (charts, after)))
-    trajectory = Trajectory(s.system, t, charts, before, after, *slopes, event, result)
+    left, right = _slopes(s, t, source, before, u), _slopes(s, t, charts, after, u)
+    trajectory = Trajectory(s.system, t, charts, before, after, left, right, event, result)
     if throw and result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "

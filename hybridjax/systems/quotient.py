@@ -154,8 +154,8 @@ class Quotient(Derived):
         def both(q, t):
             return [tuple(as_vector(f(t, q, u)) for f in pair) for _, *pair in claims]
 
-        samples = rng.normal(size=(3, d)), rng.normal(size=3)
-        for (sentence, *_), pair in zip(claims, both(*samples), strict=True):
+        values = both(rng.normal(size=(3, d)), rng.normal(size=3))
+        for (sentence, *_), pair in zip(claims, values, strict=True):
             if not _equal(*pair):
                 raise DefinitionError(
                     f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
@@ -175,9 +175,11 @@ class Quotient(Derived):
             fields = [(f"field of chart '{name}'", name, x.field) for name, x in charts.items()]
             steps = [(f"transition '{x.name}'", x.source, self._event(x)) for x in events]
             for what, name, f in fields + steps:
-                moved = lambda t, q, u, f=f, name=name: f(t, full(name, q, 0.7), u)  # noqa: E731
-                still = lambda t, q, u, f=f, name=name: f(t, full(name, q), u)  # noqa: E731
-                yield f"the {what} changes under the translation", moved, still
+                before, after = (
+                    lambda t, q, u, f=f, name=name, shift=shift: f(t, full(name, q, shift), u)
+                    for shift in (0.0, 0.7)
+                )
+                yield f"the {what} changes under the translation", before, after
         for kept, other in self.swap.items():
 
             def still(f, kept=kept):
@@ -186,11 +188,11 @@ class Quotient(Derived):
             def image(f, kept=kept):
                 return lambda t, q, u: f(t, self._mirrored(kept, full(kept, q)), u)
 
-            def back(t, q, u, kept=kept, f=image(charts[other].field)):
-                return self._mirrored(kept, as_vector(f(t, q, u)), back=True)
+            def back(f, kept=kept):
+                return lambda t, q, u: self._mirrored(kept, as_vector(f(t, q, u)), back=True)
 
             sentence = f"the field of chart '{other}' is not the mirror image of that of '{kept}'"
-            yield sentence, still(charts[kept].field), back
+            yield sentence, still(charts[kept].field), back(image(charts[other].field))
             of_kept, of_other = ([x for x in events if x.source == name] for name in (kept, other))
             if len(of_kept) != len(of_other):
                 sentence = f"'{kept}' and '{other}' have different numbers of transitions"

@@ -145,9 +145,10 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
     return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
 
 
-def _method(name: str, a, b, c, error, order: float, **rest: float) -> Method:
+def _method(name: str, a, b, c, error, order: float, **controls: float) -> Method:
     rows = tuple(tuple(map(float, row)) for row in a)
-    return Method(name, rows, *(tuple(map(float, x)) for x in (b, c, error)), order, **rest)
+    b, c, error = (tuple(map(float, x)) for x in (b, c, error))
+    return Method(name, rows, b, c, error, order, **controls)
 
 
 def _radau(s: int) -> Method:
