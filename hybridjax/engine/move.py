@@ -119,6 +119,7 @@ def _move_jvp(primals, tangents):
     still = constant((s, lanes, u, target, setout))
     recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
     tape = recorded.tape
+    assert tape is not None
     target, levels = target.split()
 
     def repeat(by_lane, common):

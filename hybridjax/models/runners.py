@@ -94,13 +94,13 @@ class TwoLeggedBar(HybridSystem):
     def _step(self, leg: Leg, legs: Legs) -> Transition:
         """Touchdown or liftoff of a leg, while these legs stand."""
         lands, source = leg not in legs, _CHARTS[legs]
-        target = _CHARTS[tuple(x for x in _LEGS if (x in legs) != (x == leg))]
+        after: Legs = tuple(x for x in _LEGS if (x in legs) != (x == leg))
         name = f"{leg} {'lands' if lands else 'lifts'} ({source})"
         length = lambda t, q, u: self.length(leg, t, q)  # noqa: E731
         if not lands:
-            return Transition(name, source, target, length, "rising")
+            return Transition(name, source, _CHARTS[after], length, "rising")
         impact = lambda t, q, u: self._impact(leg, t, q)  # noqa: E731
-        return Transition(name, source, target, length, "falling", impact)
+        return Transition(name, source, _CHARTS[after], length, "falling", impact)
 
     def _impact(self, leg, t, state):
         y, v, q, p = state
