@@ -1,4 +1,4 @@
-"""Odd and 2-adic lines, few experiments, several inputs at once, crest factors, realizations."""
+"""Odd lines, few experiments, several inputs at once, crest factors, realizations."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,6 @@ def products(j, periods):
     [
         (dict(lines="odd"), 64, 20, 320),
         (dict(lines="odd"), 128, 20, 640),
-        (dict(division="2-adic"), 64, 100, 620),
     ],
 )
 def test_even_products_miss_the_lines(choice, periods, count, frequencies):
@@ -207,10 +206,9 @@ def test_distortion_stands_where_a_linear_system_is_silent(hopper):
     {
         "`lines` must be 'all', 'odd' or 'two-phase', not 'even'": dict(lines="even"),
         "`division` must be 'random', 'sum-free', .*, not 'fair'": dict(division="fair"),
-        "exclude each other": dict(division="2-adic", highest_harmonic=2),
-        "leave out `experiments`": dict(division="2-adic", experiments=99),
+        "exclude each other": dict(division="orthogonal", highest_harmonic=2),
         "not with highest_harmonic": dict(highest_harmonic=2, lines="two-phase"),
-        "goes with division='random' or": dict(division="2-adic", lines="two-phase"),
+        "goes with division='random' or": dict(division="disjoint", lines="two-phase"),
         "an even number of periods, not 63": dict(lines="odd", periods=63),
         "`highest_harmonic` must be an integer from 0": dict(highest_harmonic=-1),
         "4 experiments are too few for harmonics up to 2": dict(highest_harmonic=2, experiments=4),
