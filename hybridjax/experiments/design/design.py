@@ -230,7 +230,7 @@ class Design(eqx.Module):
     def inputs(
         self, cycles: PeriodCount | None = None, experiments: slice | None = None
     ) -> Float[np.ndarray, "S n nu"]:
-        """Return the signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
+        """Return the signals of all experiments, n = cycles * N samples long. Default: P cycles.
 
         They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
         have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
@@ -264,9 +264,10 @@ class Design(eqx.Module):
     def realizations(self, count: Count, seed: Seed = 0) -> "Design":
         """Return the design `count` times over, each time with new random phases.
 
-        The sample variance of their responses includes noise and nonlinear distortion, so it
-        gives the variance of an estimate. Cosines of one line and input turn by the same random angle in all experiments of
-        a realization, which keeps differences of 90 degrees and orthogonal experiments as they are.
+        The sample variance of their responses includes noise and nonlinear distortion, so it gives
+        the variance of an estimate. Cosines of one line and input turn by the same random angle in
+        all experiments of a realization, which keeps differences of 90 degrees and orthogonal
+        experiments as they are.
 
         **Returns:** a design with `count` times the experiments, one realization after the other.
         """
@@ -306,7 +307,7 @@ class Design(eqx.Module):
     def expected_variance(
         self, noise: NonNegative = 1.0, repeats: Count = 1
     ) -> Float[np.ndarray, "F nu"]:
-        """Return the variance of every H_m at `frequencies` under white noise of this std on the output.
+        """Return the variance of every H_m at `frequencies` for white output noise of this std.
 
         `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
         """

@@ -19,25 +19,25 @@ from jaxtyping import Bool, Complex, Int
 from ...errors import DefinitionError
 
 
-# Normal equations are singular if, with unknowns scaled to magnitude 1, the least eigenvalue is below
-# this, or if one magnitude is below this part of another. Smaller: inputs that rounding separates
-# are accepted. Larger: good experiments with inputs of unequal magnitude are refused.
+# Normal equations are singular if, with unknowns scaled to magnitude 1, the least eigenvalue is
+# below this, or if one magnitude is below this part of another. Smaller: inputs that only rounding
+# separates are accepted. Larger: good experiments with unequal inputs are refused.
 _SINGULAR = 1e-6
 
 
 def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
-    """Return `min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between two."""
+    """Return `min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between."""
     remainder = line % periods
     return np.minimum(remainder, periods - remainder)
 
 
 def is_half_integer(line: Int[np.ndarray, " K"], periods: int) -> Bool[np.ndarray, " K"]:
-    """Return whether f is a multiple of 1/2: the cosine then aliases with its conjugate (eq. 16)."""
+    """Return whether f is a multiple of 1/2: the cosine aliases with its conjugate (eq. 16)."""
     return (2 * line) % periods == 0
 
 
 def is_real(line: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Bool[np.ndarray, " K"]:
-    """Return whether f is 0 or N/2, where `cos(w n + phi)` is a real factor times a fixed sequence."""
+    """Return whether f is 0 or N/2: `cos(w n + phi)` is a factor times a fixed sequence."""
     return (line == 0) | (2 * line == n_sections * periods)
 
 
@@ -81,7 +81,7 @@ def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
 def assign(
     line: Int[np.ndarray, " K"], periods: int, experiments: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " K"]:
-    """Return a random partition that obeys the rules: the experiment, 0..experiments-1, of each line.
+    """Return a random partition that obeys the rules: the experiment of each line.
 
     Class after class, in random order, is spread over the experiments that are the least full
     at that moment (ties at random), so sizes differ by at most one. Needs
@@ -144,8 +144,8 @@ def avoid_second_order(
     rng: np.random.Generator,
     rounds: int = 200_000,
 ) -> Int[np.ndarray, " K"]:
-    """Return the partition after random swaps, such that no second-order product of an experiment falls
-    on one of its own lines. Sizes stay as they are.
+    """Return the partition after random swaps, such that no second-order product of an experiment
+    falls on one of its own lines. Sizes stay as they are.
 
     Simulated annealing on the number of such products. For N = 32, P = 64, f up to 10 and 80
     experiments about 30 000 swaps suffice.
