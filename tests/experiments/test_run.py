@@ -40,10 +40,6 @@ def family(request, hopper_cycle, design):
     return request.param, placed, ldtp, data
 
 
-@pytest.fixture(scope="session")
-def isochron_data(hopper_cycle, placed_isochrons, design):
-    return hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS, **BATCH)
-
 
 def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
     name, _, ldtp, data = family
