@@ -12,9 +12,9 @@ import numpy as np
 from beartype import beartype
 
 import hybridjax as hj
-from hybridjax._core.boundary.values import Reals
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.kinds import Count, Index, Numbers, Order, Positive, SignalNames
+from hybridjax._core.boundary.values import Reals
 
 
 def count(n: Count): ...
@@ -77,7 +77,7 @@ def calls() -> dict[str, tuple[Callable, tuple, dict]]:
     return {
         "LDTP.simulate, 1200 samples": (hj.LDTP.simulate, (model, u), {}),
         "LDTP.htf, 10 frequencies": (hj.LDTP.htf, (model, np.linspace(0.1, 0.9, 10)), {}),
-        "fit_series, 200 cycles": (hj.fit_series, (record, 2), {"distortion": False}),
+        "fit_series, 200 cycles": (hj.fit_series, (record, 2), {}),
         "validate, 200 cycles": (hj.validate, (model, record), {}),
         "find_limit_cycle, hopper": (hj.find_limit_cycle, (hopper, cycle), {}),
         "place_sections, 8": (hj.place_sections, (cycle, hj.ClockPhase(8)), {}),

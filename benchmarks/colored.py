@@ -99,7 +99,7 @@ def one_case(case: str, draws: int) -> None:
             "htf_plain": hj.fit_multipliers(plain, 2, check=False),
         }
         fits |= {
-            name: hj.fit_series(x, 2, start="cycle", check=False, distortion=False)
+            name: hj.fit_series(x, 2, start="cycle", check=False)
             for name, x in series.items()
         }
         return {

@@ -272,7 +272,7 @@ def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
         show(f"experiments.fit.{S}.cpu_seconds", seconds[-1])
         show(f"experiments.fit.{S}.memory", megabytes())
     show("experiments.fit.linear", seconds[1] / seconds[0] / 2)
-    whole = hj.fit_series(list(records), 2, check=False, distortion=False)
+    whole = hj.fit_series(list(records), 2, check=False)
     show("experiments.fit.difference", np.abs(found.coefficients - whole.coefficients).max())
 
 

@@ -17,7 +17,7 @@ from .._core.progress import working
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
-from ..identify.multipliers.structured import StructuredFit
+from ..identify.multipliers import StructuredFit
 from .candidates import Candidates
 from .goals import Multipliers
 from .limits import Limit, as_limits, without_forbidden

@@ -13,7 +13,7 @@ from hybridjax.identify.joint.prediction.predictor import Predictor
 from hybridjax.identify.joint.prediction.problem import SeriesProblem
 from hybridjax.identify.joint.prediction.series_part import SeriesPart
 from hybridjax.identify.joint.prediction.subspace import subspace_model
-from hybridjax.identify.series.cycle_grid import CycleGrid
+from hybridjax.identify.series.records import CycleGrid
 
 from .test_series import record, scaled
 from .test_uncertainty import covered

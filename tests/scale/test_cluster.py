@@ -210,9 +210,7 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     for mine, theirs in zip(alone, stored, strict=True):
         np.testing.assert_array_equal(mine.y, theirs.y)
     data = list(stored)
-    parts, whole = (hj.fit_series(x, 2, distortion=False, check=False) for x in (stored, data))
+    parts, whole = (hj.fit_series(x, 2, check=False) for x in (stored, data))
     np.testing.assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
     assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))
-    with pytest.raises(hj.DefinitionError, match="`data` are in memory"):
-        hj.fit_series(stored, 2, distortion=True)

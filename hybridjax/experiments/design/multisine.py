@@ -95,8 +95,8 @@ def multisine(
       frequencies, every second-order product falls on a frequency of the same experiment, so
       amplitudes must be small. Default: the fewest possible.
     - `highest_harmonic`: M, beyond which harmonics are taken as zero. Then 2 M + 1 experiments may
-      suffice instead of 20. `hj.identify.predict_leakage` computes the error of this assumption for
-      a model. Pass M to the estimate, too: `estimate_htf(data, highest=M)`. Default: no assumption.
+      suffice instead of 20. Pass M to the estimate, too: `estimate_htf(data, highest=M)`. Default:
+      no assumption.
     - `inputs`: their number or names. Default: 1.
 
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too few

@@ -5,9 +5,10 @@ import numpy as np
 from ..._core.boundary.checked import checked
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.bound import MultiplierBound, exact_htf
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.error_weights import check_values, error_weights
+from ..denominator import multipliers_of
+from ..htf_errors import check_values, error_weights
+from ..multiplier_estimate import MultiplierEstimate
+from ..multipliers import exact_htf
 from ..series.realization import realize
 from .characteristic import characteristic_slopes
 from .coordinates import local_coordinates
@@ -21,7 +22,7 @@ _PERIODS, _LAGS = 4, 17
 
 
 @checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
+def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     r"""The Cramer-Rao bound of the multipliers for whoever knows the dimensions of the states.
 
     As `multiplier_bound`, for independent, circular, normal errors of the HTFs, but with the
@@ -47,4 +48,4 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
     coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()
-    return MultiplierBound(multipliers_of(c), c, spread.covariance(slopes))
+    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -13,8 +13,8 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.multiplier_estimate import MultiplierEstimate
+from ..denominator import multipliers_of
+from ..multiplier_estimate import MultiplierEstimate
 from .characteristic import characteristic_slopes
 from .coordinates import LocalCoordinates
 from .frequency import transfer, transfer_slopes

@@ -6,7 +6,7 @@ from ..._core.arguments import require_same
 from ...errors import DefinitionError
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.error_weights import ROUNDING, check_values, error_weights
+from ..htf_errors import ROUNDING, check_values, error_weights
 from ..series.realization import given_dims, realize
 from .coordinates import local_coordinates
 from .frequency import FrequencyProblem

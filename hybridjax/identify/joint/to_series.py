@@ -10,8 +10,8 @@ from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import all_harmonics
 from ...linear.ldtp import LDTP
-from ..series.parts import Parts
 from ..series.realization import given_dims
+from ..series.records import PreparedRecords
 from .coordinates import local_coordinates
 from .ldtp_fit import LDTPFit, finished
 from .minimize import minimize
@@ -26,7 +26,7 @@ def fit_to_series(
     data: RecordedData, guess, innovations: bool, free_start: bool, direct: bool, max_steps: int
 ) -> LDTPFit:
     """As `fit_ldtp`."""
-    parts = Parts(data)
+    parts = PreparedRecords(data)
     if parts.lead:
         raise DefinitionError(
             f"the outputs of the records depend on inputs up to {parts.lead} samples later "
@@ -90,18 +90,11 @@ class ScaledSeries:
     `sampled` (N, ny): of each output at each section. `first`: where each record starts.
     """
 
-    def __init__(self, parts: Parts):
+    def __init__(self, parts: PreparedRecords):
         """**Raises:** `DefinitionError` for an output that is zero or missing."""
         self._parts = parts
         N, ny = parts.n_sections, len(parts.outputs)
-        square, count = np.zeros(ny), np.zeros(ny)
-        for grid in parts:
-            square += np.nansum(grid.y**2, axis=(0, 1, 2))
-            count += np.isfinite(grid.y).sum(axis=(0, 1, 2))
-        self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / np.maximum(count, 1))
-        for name, size in zip(parts.outputs, self.scale, strict=True):
-            if not size:
-                raise DefinitionError(f"the output {name} is zero or missing at every sample.")
+        self.scale: Float[np.ndarray, " ny"] = parts.scale
         self._kept = [SeriesPart.of(g, self.scale) for g in parts] if parts.in_memory else None
         self.sampled: Int[np.ndarray, "N ny"] = np.zeros((N, ny), int)
         drift, self.first = 0, []

@@ -1,50 +1,124 @@
-"""Multipliers and transfer functions from recorded series with any input: output error."""
+"""Multipliers and transfer functions from recorded time series with any input: output error."""
 
 from typing import Literal
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Index, Order, StepCount
+from ..._core.boundary.kinds import Index, Order, PeriodCount, Scalar, StepCount, Vector
 from ..._core.execution import one_blas_thread
 from ..._core.precision import require_x64
 from ..._core.results import Result
+from ..._core.signal import unit_of
+from ..._core.text import number
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
+from ...linear.frequency_response import Harmonics, check_harmonics
+from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..descent import Coefficients, least_squares
-from ..multipliers.covariance import Covariance, correlated_cycles, sandwich
-from ..multipliers.denominator import Denominator, multipliers_of
+from ..denominator import Denominator, chi, multipliers_of
+from ..multiplier_estimate import MultiplierEstimate
 from .arx import delayed_outputs, refuse_order, total_least_squares
-from .gradient_covariance import gradient_covariance
-from .linearization import Linearization, linearize
-from .nonlinear.second_order import allow_for_second_order
-from .nonlinear.shared_state_fit import HORIZON
-from .output_error import OutputErrorProblem, Part
-from .parts import Parts
-from .robust import (
-    Loss,
-    efficiency,
-    misfit,
-    reweight,
-    rms_of,
-    weigh_outputs,
-    without_outliers,
-)
-from .series_fit import SeriesFit
+from .covariance import coefficient_covariance
+from .linearization import Linearization, minimize
+from .output_error import OutputErrorProblem
+from .records import PreparedRecords
+from .robust import ROUNDING, Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
 
 
-# Outputs of pure noise, from which the noise in the Jacobian is estimated. Doubled: its share of a
-# covariance scatters 0.7 times as much.
-_PROBES = 4
-# How often weights are found anew, at most, and the change of c, relative to 1 + |c|, that is the
-# last. Doubled: slow iterations come to their end; minima of robust losses are missed by twice as
-# much.
-_MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
-# Smallest noise of an output in the units of the moment: rounding. Doubled: outputs without noise
-# count half as much beside noisy ones.
-_ROUNDING = 1e-15
+class SeriesFit(MultiplierEstimate):
+    r"""A periodic system with one denominator in $q^{-N}$, fitted to recorded time series.
+
+    $$\chi(q^{-N})\, y[n] = \sum_{r=0}^{R-1} b_{n \bmod N}[r]\, u[n-r], \qquad
+    \chi(q^{-N}) = 1 + c_1 q^{-N} + \ldots + c_d q^{-dN} = \prod_i (1 - \lambda_i q^{-N})$$
+
+    This is exact for a periodic system with d non-zero multipliers, if R is large enough.
+
+    **Fields:**
+
+    - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d.
+    - `covariance` (d, d): covariance of the coefficients, estimated with `covariance_freedom`
+      degrees of freedom. `standard_errors`, `contains` and `ellipse` follow from it.
+    - `numerators` (N, R, ny, nu): b at each section. Combinations of inputs that were not
+      excited are zero.
+    - `slopes` (d, N, R, ny, nu): their derivatives with respect to c.
+    - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
+    - `noise` (ny,): standard deviation of the residuals.
+    - `result`: code of `Result`, OK or NOT_CONVERGED.
+    - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
+      by the records.
+    """
+
+    multipliers: Complex[np.ndarray, " d"]
+    coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    numerators: Float[np.ndarray, "N R ny nu"]
+    slopes: Float[np.ndarray, "d N R ny nu"]
+    roots: Float[np.ndarray, "N ny R nu r"]
+    noise: Float[np.ndarray, " ny"]
+    covariance_freedom: float = eqx.field(static=True)
+    result: int = eqx.field(static=True)
+    n_sections: int = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    lead: int = eqx.field(static=True, default=0)
+
+    @checked
+    def impulse_response(self, n_lags: PeriodCount) -> Float[np.ndarray, "N lags ny nu"]:
+        """Return the Markov parameters: the response at section n to a unit input r sections
+        earlier."""
+        N, R = self.numerators.shape[:2]
+        h = np.zeros((N, max(self.lead + n_lags, R), *self.numerators.shape[2:]))
+        h[:, :R] = self.numerators
+        for r in range(N, h.shape[1]):
+            for j, c in enumerate(self.coefficients[: r // N], 1):
+                h[:, r] -= c * h[:, r - j * N]
+        return h[:, self.lead : self.lead + n_lags]
+
+    @checked
+    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
+        """Return the harmonic transfer functions at frequencies f (F,), in cycles per period.
+
+        The variance is that of white noise for the numerators, and follows from `covariance` for c.
+        It is large or infinite at frequencies without power of the inputs.
+
+        **Arguments:** `harmonics`: Default: all N.
+        """
+        f = np.atleast_1d(np.asarray(f, float))
+        harmonics = check_harmonics(harmonics, self.n_sections)
+        N, R, ny, nu = self.numerators.shape
+        powers = np.exp(-2j * np.pi / N * f[:, None] * (np.arange(R) - self.lead))
+        period_delay = np.exp(-2j * np.pi * f)
+        below = chi(period_delay, self.coefficients)
+        n = np.arange(N)
+        to_harmonics = np.exp(-2j * np.pi * np.outer(harmonics, n) / N) / N
+
+        def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
+            G = np.einsum("fr,...nrij->...nfij", powers, b) / below[:, None, None]
+            return np.einsum("mn,...nfij->...mfij", to_harmonics, G)
+
+        H = sum_up(self.numerators)
+        delays = period_delay ** np.arange(1, len(self.coefficients) + 1)[:, None]
+        slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
+        by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()).real
+        spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
+        by_b = (np.abs(spread) ** 2).sum(axis=(1, 4)) / N**2 / np.abs(below)[:, None, None] ** 2
+        variance = by_c + by_b * self.noise[:, None] ** 2
+        variance = np.where(np.isnan(variance), np.inf, variance)
+        return HTF(f, H, harmonics, N, self.inputs, self.outputs, "series fit", variance=variance)
+
+    def __repr__(self) -> str:
+        return f"SeriesFit(multipliers {self.show_multipliers()}; {self._about()})"
+
+    def _about(self) -> str:
+        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
+        noise = ", ".join(
+            f"{name} {number(x, 3, unit_of(name))}"
+            for name, x in zip(self.outputs, self.noise, strict=True)
+        )
+        return f"noise {noise}; {self.n_sections} sections, {self.numerators.shape[1]} lags{state}"
 
 
 @checked
@@ -57,210 +131,116 @@ def fit_series(
     start: Literal["free", "cycle"] = "free",
     loss: Loss = "squares",
     errors: Literal["residuals", "white"] = "residuals",
-    distortion: bool | None = None,
     check: bool = True,
     max_steps: StepCount = 50,
 ) -> SeriesFit:
-    r"""Multipliers, HTFs and their uncertainty from series with any input.
+    r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
-    Output error, with white noise of unknown variance in each output: the sum of squares of the
-    difference between measured and simulated outputs is minimized over all numerators, unknown
-    starts and c; all but c is solved for inside (variable projection, Golub and Pereyra 1973). It
-    starts from the periodic ARX problem, solved by total least squares (Ljung, *System
-    Identification: Theory for the User*, treats both). Where `distortion` is allowed for, c comes
-    from the form in which all sections share one state.
+    The fit minimizes the output error, for white noise of unknown variance in each output: the sum
+    of squares of the difference between measured and simulated outputs. The unknowns are the
+    numerators, the initial conditions and c. All but c are eliminated (variable projection, Golub
+    and Pereyra 1973). The iteration starts from the periodic ARX problem, solved by total least
+    squares (Ljung, *System Identification: Theory for the User*, treats both).
 
     **Arguments:**
 
-    - `data`: a `Record`, which may have gaps and any length, `ExperimentData` (all cycles are used,
-      not only its window; failed experiments are left out), `SectionData`, or several of them.
-      `StoredExperiments` are read part by part, some thirty times over.
-    - `order`: d, the number of non-zero multipliers, or an `LDTP` model to take its rank from.
-    - `overhang`: lags of the numerators beyond d N; None means N.
-    - `start`: "free": whatever happened before a record, the state at its start is unknown.
-      "cycle": it starts on the limit cycle, with no input before.
-    - `loss`: what is minimized of the errors. "squares", the most accurate for normal ones; "huber"
-      or "student" where some samples are far off: squares up to 1.345 standard deviations and
+    - `data`: a `Record` of any length, with gaps or without; `ExperimentData`, of which all cycles
+      of the experiments that did not fail are used; `SectionData`; or several of these.
+      `StoredExperiments` are read in parts, about thirty times.
+    - `order`: d, the number of non-zero multipliers, or an `LDTP` model with this number.
+    - `overhang`: number of lags of the numerators beyond d N. Default: N.
+    - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
+      no input before. Default: "free".
+    - `loss`: function of the errors that is minimized. "squares" is the most accurate for Gaussian
+      errors. "huber" and "student" are for outliers: squares up to 1.345 standard deviations and
       linear beyond, or the likelihood of Student's distribution with 4 degrees of freedom
-      (iteratively reweighted, standard deviations from the median). `noise` is then that of the
-      normal errors with which squares would be as accurate.
-    - `errors`: what the covariance is computed from. "residuals": from the misfit of blocks of
-      successive cycles, so that it holds also where their errors depend on each other (process
-      noise) and on the inputs (distortion). "white": from its size alone.
-    - `distortion`: whether to allow for a part of the response of second order, with squares only;
-      None: if that explains more than half of the misfit, and lowers the standard errors by 10 % or
-      more. Data that are read part by part have no such part.
-    - `check`: refuse an order that the data do not carry, as `fit_multipliers` does.
-    - `max_steps`: of Gauss and Newton's iteration.
+      (iteratively reweighted, standard deviations from the median). `noise` is then the standard
+      deviation of Gaussian errors for which squares are as accurate. Default: "squares".
+    - `errors`: source of the covariance. "residuals": the residuals of blocks of successive cycles,
+      which allows for errors that depend on each other (process noise) and on the inputs (nonlinear
+      distortion). "white": the variance of the residuals alone. Default: "residuals".
+    - `check`: whether to raise an error for an order that the data do not support. Default: True.
+    - `max_steps`: largest number of Gauss-Newton steps. Default: 50.
 
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
-    few cycles (the message says how many are needed), or an order that the data do not carry.
+    few cycles (the message says how many are needed), or an order that the data do not support.
     """
     require_x64()
-    free_start = start == "free"
     order = order.rank() if isinstance(order, LDTP) else order
-    parts = Parts(data)
-    N = parts.n_sections
-    overhang = N if overhang is None else overhang
-    if distortion and loss != "squares":
-        raise DefinitionError(f"distortion is allowed for with the loss 'squares', not {loss!r}.")
-    if distortion and not parts.in_memory:
-        raise DefinitionError("distortion is allowed for only where `data` are in memory.")
-    problem = OutputErrorProblem.from_data(parts, order, overhang, free_start)
+    records = PreparedRecords(data)
+    overhang = records.n_sections if overhang is None else overhang
+    problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     usual = problem if loss == "squares" else without_outliers(problem)
     delayed = delayed_outputs(usual, order)
-    if loss != "squares":
-        problem = weigh_outputs(problem)
-    c, found, _ = _minimize(problem, total_least_squares(delayed), max_steps)
-    _require_freedom(found, order, problem)
+    c = total_least_squares(delayed)
     if loss == "squares":
-        noise = _noise(found, order)
-        problem = problem.rescale(noise)  # the weights that the misfit suggests
-        c, found, converged = _minimize(problem, c, max_steps, found.rescale(noise))
-        noise = _noise(found, order)
+        c, solution, _ = minimize(problem, c, max_steps)
+        _require_freedom(problem, solution)
+        problem = problem.rescale(_noise(solution))  # the weights that the residuals suggest
+        c, solution, converged = minimize(problem, c, max_steps)
+        noise = _noise(solution) * problem.scale
     else:
-        problem, c, found, converged = _reweighted(problem, c, found, loss, max_steps)
-        noise = rms_of(usual, misfit(problem, found))
+        problem, c, solution, converged = minimize_robust(problem, c, loss, max_steps)
+        _require_freedom(problem, solution)
+        noise = rms_of(usual, misfit(problem, solution)) * problem.scale
     if check:
-        refuse_order(delayed.rescale(noise * problem.scale / usual.scale))
-    best = Denominator(c, _covariance(problem, found, errors, loss), converged)
-    second = None
-    if distortion is not False and loss == "squares" and parts.in_memory:
-        first = assemble(problem, found, best)
-        second = allow_for_second_order(
-            parts.whole(),
-            first.impulse_response((1 + HORIZON + order + -(-overhang // N)) * N),
-            order,
-            overhang,
-            _section_noise(found) * problem.scale,
-            free_start=free_start,
-            errors=errors,
-            always=distortion is True,
-            max_steps=max_steps,
-        )
-    if second is not None:
-        best, found = second, linearize(problem, second.coefficients)
-    return assemble(problem, found, best, distortion=second is not None, loss=loss)
+        refuse_order(delayed, noise / usual.scale)
+    covariance = coefficient_covariance(problem, solution, errors, loss)
+    return assemble(problem, solution, Denominator(c, covariance, converged), loss)
 
 
 def assemble(
     problem: OutputErrorProblem,
-    found: Linearization,
+    solution: Linearization,
     denominator: Denominator,
-    distortion: bool = False,
     loss: Loss = "squares",
 ) -> SeriesFit:
-    """The fit with this denominator, in the units of the data; `found`: the problem there."""
+    """Return the fit with this denominator, in the units of the data."""
     N, nu, ny = problem.shape
-    c = denominator.coefficients
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
-    noise = _noise(found, len(c))
+    noise = _noise(solution)
     if loss != "squares":
-        noise = efficiency(problem, found, loss).noise
-    widest = max(root.shape[1] for row in found.roots for root in row)
+        noise = efficiency(problem, solution, loss).noise
+    widest = max(root.shape[1] for row in solution.roots for root in row)
     roots = np.zeros((N, ny, problem.lags * nu, widest))
-    for n, row in enumerate(found.roots):
+    for n, row in enumerate(solution.roots):
         for i, root in enumerate(row):
             roots[n, i, :, : root.shape[1]] = root
     return SeriesFit(
-        multipliers=multipliers_of(c),
-        coefficients=c,
+        multipliers=multipliers_of(denominator.coefficients),
+        coefficients=denominator.coefficients,
         covariance=denominator.covariance.matrix,
-        numerators=by_input(found.numerators),
-        slopes=by_input(found.slope),
+        numerators=by_input(solution.numerators),
+        slopes=by_input(solution.slope),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=noise * problem.scale,
         covariance_freedom=denominator.covariance.freedom,
         result=Result.OK if denominator.converged else Result.NOT_CONVERGED,
         n_sections=N,
-        inputs=problem.data.inputs,
-        outputs=problem.data.outputs,
-        lead=problem.lead,
-        distortion=distortion,
+        inputs=problem.records.inputs,
+        outputs=problem.records.outputs,
+        lead=problem.records.lead,
     )
 
 
-def _minimize(
-    problem: OutputErrorProblem,
-    start: Coefficients,
-    max_steps: int,
-    found: Linearization | None = None,
-) -> tuple[Coefficients, Linearization, bool]:
-    """`found`: the linearization at the start, where that is known."""
-    last = [start, found]
-
-    def at(c):
-        if c is not last[0] or last[1] is None:
-            last[:] = c, linearize(problem, c)
-        return last[1]
-
-    def normal(c):
-        return at(c).as_residuals()
-
-    c, converged = least_squares(normal, start, max_steps)
-    return c, at(c), converged
+def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
+    """Return the standard deviation of each output's noise, in units of the problem's scale."""
+    left = solution.freedom.sum(axis=0) - len(solution.c) / solution.freedom.shape[1]
+    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), ROUNDING)
 
 
-def _reweighted(
-    problem: OutputErrorProblem, c: Coefficients, found: Linearization, loss: Loss, max_steps: int
-) -> tuple[OutputErrorProblem, Coefficients, Linearization, bool]:
-    """The minimum of a robust loss, that of Huber first, which has no other ones."""
-    converged = False
-    for kind in dict.fromkeys(("huber", loss)):
-        for _ in range(_MAX_REWEIGHTINGS):
-            before = c
-            problem = reweight(problem, found, kind)
-            c, found, converged = _minimize(problem, c, max_steps)
-            settled = np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max())
-            if settled:
-                break
-        converged = converged and bool(settled)
-    return problem, c, found, converged
-
-
-def _noise(found: Linearization, order: int) -> Float[np.ndarray, " ny"]:
-    """Standard deviation of each output's noise, in its units of the moment."""
-    left = found.freedom.sum(axis=0) - order / found.freedom.shape[1]
-    return np.maximum(np.sqrt(found.square.sum(axis=0) / left), _ROUNDING)
-
-
-def _section_noise(found: Linearization) -> Float[np.ndarray, "N ny"]:
-    return np.sqrt(found.square / np.maximum(found.freedom, 1))
-
-
-def _covariance(
-    problem: OutputErrorProblem, found: Linearization, errors: str, loss: Loss
-) -> Covariance:
-    """Of c, by blocks of cycles, which may depend on their neighbors."""
-    price = efficiency(problem, found, loss)
-
-    def probes(k: int, part: Part, n: int):
-        sampled = part.weight[:, :, n, :, None] > 0
-        draws = np.random.default_rng((k, n)).standard_normal((*sampled.shape[:3], _PROBES))
-        return draws * sampled * price.noise[:, None]
-
-    noise = linearize(problem, found.c, probes).curvature / _PROBES
-    curvature = np.einsum("aij,a->ij", found.curvature - noise, price.curvature)
-    by_output = found.curvature
-    if errors == "white" or not np.linalg.eigvalsh(by_output.sum(axis=0))[0] > 0:
-        return sandwich(curvature, np.einsum("aij,a->ij", by_output, price.variance))
-    lags = correlated_cycles(multipliers_of(found.c), problem.cycles)
-    gradient = gradient_covariance(problem, found, lags + 1)
-    return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
-
-
-def _require_freedom(found: Linearization, order: int, problem: OutputErrorProblem) -> None:
-    if (found.freedom > order).all():
+def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
+    order = len(solution.c)
+    if (solution.freedom > order).all():
         return
-    n, i = np.argwhere(found.freedom <= order)[0]
-    sampled = sum(int((part.weight[:, :, n, i] > 0).sum()) for part in problem.parts())
-    missing = order + 1 - int(found.freedom[n, i])
+    n, i = np.argwhere(solution.freedom <= order)[0]
+    missing = order + 1 - int(solution.freedom[n, i])
     raise DefinitionError(
-        f"section {n} was sampled {sampled} times, too few for numerators of {problem.lags} lags "
-        f"and {problem.free} unknown cycles at the start of each record: {missing} or more cycles "
-        "are missing. Record more, or lower `order` or `overhang`."
+        f"section {n} was sampled {problem.records.sampled[n, i]} times, too few for numerators of "
+        f"{problem.lags} lags and {problem.free} unknown cycles at the start of each record: "
+        f"{missing} or more cycles are missing. Record more, or lower `order` or `overhang`."
     )

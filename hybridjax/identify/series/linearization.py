@@ -1,59 +1,128 @@
-"""What numerators and free starts leave of outputs at some c, and its derivative in c: sums over
-all records."""
+"""The linearized output-error problem at some c: sums over all records, and its minimum in c."""
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..descent import Coefficients
-from .cycle_filters import divide_by_chi
-from .output_error import OutputErrorProblem, Part, in_passes
-from .section_regression import SectionRegression, root_of
+from ..descent import Coefficients, least_squares
+from .output_error import OutputErrorProblem, SectionRegression, in_passes, root_of
+from .records import CycleGrid, divide_by_chi
+
+
+Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
+"""C columns for each output, as a function of the number of a grid, the grid and a section."""
+Regress = Callable[[CycleGrid, Any, int], list[SectionRegression]]
 
 
 class SectionFit(NamedTuple):
-    """What fits some outputs of a section, those with the same weights, best."""
+    """The best fit of some outputs of a section, with equal weights."""
 
     outputs: list[int]
     root: Float[np.ndarray, "r k"]
-    """Of the inverse of the inputs' Gram matrix."""
+    """Root of the inverse of the inputs' Gram matrix."""
     coefficients: Float[np.ndarray, "r m C"]
-    """Of the inputs, for C columns of each of m outputs."""
+    """Coefficients of the inputs, for C columns of each of m outputs."""
     slopes: Float[np.ndarray, "r d m C"]
-    """Their derivatives in c."""
-
-    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "SectionFit":
-        """That of the problem with each output in units of its noise."""
-        unit = noise[self.outputs, None]
-        coefficients, slopes = self.coefficients / unit, self.slopes / unit
-        return self._replace(coefficients=coefficients, slopes=slopes)
+    """Their derivatives with respect to c."""
 
     @property
     def first(self) -> "SectionFit":
-        """That of the first column."""
+        """The fit of the first column."""
         return self._replace(coefficients=self.coefficients[..., :1], slopes=self.slopes[..., :1])
-
-    def errors(
-        self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]
-    ) -> Float[np.ndarray, "rows m C"]:
-        """Residuals, weighted."""
-        return _left(self.coefficients, regression, x)
 
     def samples(
         self, c: Coefficients, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]
     ) -> tuple[Float[np.ndarray, "rows m C"], Float[np.ndarray, "rows d m C"]]:
-        """Errors and their derivatives in c, which omit what vanishes with the
-        residuals (Kaufman 1975): q^-jN / chi of what was fitted, less what fits that."""
-        left = self.errors(regression, x)
-        slopes = _reduced(regression, _fitted(self.coefficients, c, regression, x))
-        slopes = slopes - np.tensordot(regression.remainder, self.slopes, 1)
-        return left, slopes
+        """Return the weighted residuals and their derivatives with respect to c.
+
+        The derivatives omit the term that vanishes with the residuals (Kaufman 1975).
+        """
+        fitted = filtered_response(self.coefficients, c, regression, x)
+        left = regression.residual(self.coefficients, x)
+        return left, regression.residual(self.slopes, fitted)
+
+
+class SectionSums:
+    """Sums over all records for some outputs of a section, in three passes.
+
+    Each pass solves with the sums of the previous ones, and the last removes rounding errors: the
+    result is as accurate as that of one QR decomposition.
+    """
+
+    def __init__(self, outputs: list[int], c: Coefficients):
+        self.outputs, self._c = outputs, c
+        self._gram: Any = 0.0
+        self._along: Any = 0.0
+        self._along_left: Any = 0.0
+        self._along_slopes: Any = 0.0
+        self._along_last: Any = 0.0
+        self._curvature: Any = 0.0
+        self.freedom = 0.0
+        self.products: Any = 0.0
+        """(m, C, C): products of the residuals of different columns."""
+        self.gradient: Any = 0.0
+
+    def begin(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
+        self._gram = self._gram + regression.along(regression.remainder)
+        self._along = self._along + regression.along(regression.reduced(x))
+        self.freedom += regression.freedom
+
+    def refine(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
+        left = regression.residual(self._first, x)
+        fitted = filtered_response(self._first, self._c, regression, x)
+        self._along_left = self._along_left + regression.along(left)
+        self._along_slopes = self._along_slopes + regression.along(regression.reduced(fitted))
+
+    def finish(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
+        left, slopes = self.fit.samples(self._c, regression, x)
+        self._along_last = self._along_last + regression.along(slopes)
+        self.products = self.products + np.einsum("rmk,rml->mkl", left, left)
+        self.gradient = self.gradient + np.einsum("rjmk,rmk->mj", slopes, left)
+        self._curvature = self._curvature + np.einsum("rimk,rjmk->mij", slopes, slopes)
+
+    @cached_property
+    def _root(self) -> Float[np.ndarray, "r k"]:
+        return root_of(self._gram)
+
+    @cached_property
+    def _first(self) -> Float[np.ndarray, "r m C"]:
+        return self._solved(self._along)
+
+    @cached_property
+    def fit(self) -> SectionFit:
+        """The fit, after the second pass."""
+        a = self._first + self._solved(self._along_left)
+        return SectionFit(self.outputs, self._root, a, self._solved(self._along_slopes))
+
+    @property
+    def curvature(self) -> Float[np.ndarray, "m d d"]:
+        """The products of derivatives, after the last pass."""
+        missed = self._solved(self._along_last)
+        return self._curvature - np.einsum("rimk,rjmk->mij", self._along_last, missed)
+
+    def _solved(self, along: np.ndarray) -> np.ndarray:
+        return np.tensordot(self._root, np.tensordot(self._root.T, along, 1), 1)
+
+
+def filtered_response(
+    a: Float[np.ndarray, "r m C"],
+    c: Coefficients,
+    regression: SectionRegression,
+    x: Float[np.ndarray, "S T m C"],
+) -> Float[np.ndarray, "S T d m C"]:
+    """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
+    fitted = regression.response(a, x)
+    out = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
+    for j in range(len(c)):
+        out[:, :, j] = divide_by_chi(c, fitted, j + 1)
+    return out
 
 
 class Linearization(NamedTuple):
-    """Sums of weighted residuals and of their derivatives in c."""
+    """Sums of weighted residuals and of their derivatives with respect to c."""
 
     c: Coefficients
     square: Float[np.ndarray, "N ny"]
@@ -65,61 +134,64 @@ class Linearization(NamedTuple):
     freedom: Int[np.ndarray, "N ny"]
     """Samples less unknowns."""
     numerators: Float[np.ndarray, "N columns ny"]
-    """Of the first column of outputs; rows are lags, then inputs."""
+    """Numerators of the first column of outputs; rows are lags, then inputs."""
     slope: Float[np.ndarray, "d N columns ny"]
     """Their derivative with respect to c."""
     roots: list[list[Float[np.ndarray, "columns r"]]]
     """root @ root.T is the covariance of the numerators of a section and output, given c."""
     fits: list[list[SectionFit]]
-    """Of each section."""
-
-    def rescale(self, noise: Float[np.ndarray, " ny"]) -> "Linearization":
-        """That of the problem with each output in units of its noise."""
-        return self._replace(
-            square=self.square / noise**2,
-            gradient=self.gradient / noise[:, None] ** 2,
-            curvature=self.curvature / noise[:, None, None] ** 2,
-            numerators=self.numerators / noise,
-            slope=self.slope / noise,
-            fits=[[fit.rescale(noise) for fit in fits] for fits in self.fits],
-        )
+    """The fits of each section."""
 
     def as_residuals(self) -> tuple[Float[np.ndarray, " d1"], Float[np.ndarray, "d1 d"]]:
-        """d + 1 residuals with their Jacobian that have the same sums."""
+        """Return d + 1 residuals with their Jacobian that have the same sums."""
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
         along = np.where(size > 0, along / np.where(size > 0, size, 1), 0.0)
-        rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
+        last = np.sqrt(max(self.square.sum() - along @ along, 0.0))
         jacobian = np.concatenate([size[:, None] * vectors.T, np.zeros((1, len(size)))])
-        return np.append(along, rest), jacobian
+        return np.append(along, last), jacobian
 
 
-def linearize(
+def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny 1"]:
+    """Return the outputs of a section as one column."""
+    return part.y[:, :, n, :, None]
+
+
+def sum_up(
     problem: OutputErrorProblem,
     c: Coefficients,
-    outputs: Callable[[int, Part, int], Float[np.ndarray, "S T ny C"]] | None = None,
-) -> Linearization:
-    """All residuals and their derivatives in c, in three passes.
+    outputs: Outputs,
+    regress: Regress,
+    prepare: Callable[[CycleGrid], Any],
+) -> list[list[SectionSums]]:
+    """Return the sums of each section, with one regression for each list of outputs."""
+    sums = [[SectionSums(outputs, c) for outputs in alike] for alike in problem.alike]
 
-    **Arguments:** `outputs`: other ones than those measured, C of each, of the number and the data
-    of a part and a section.
-    """
-    N, nu, ny = problem.shape
-    d, columns = len(c), problem.lags * nu
-    sums = [[_Sums(some, c) for some in alike] for alike in problem.alike]
-
-    def of(work):
+    def of(work: Callable) -> Callable:
         def section(k, part, n, regressions):
-            y = part.y[:, :, n, :, None] if outputs is None else outputs(k, part, n)
-            for one, regression in zip(sums[n], regressions, strict=True):
-                work(one, regression, y[:, :, one.outputs])
+            y = outputs(k, part, n)
+            for each, regression in zip(sums[n], regressions, strict=True):
+                work(each, regression, y[:, :, each.outputs])
 
         return section
 
-    passes = [of(work) for work in (_Sums.begin, _Sums.refine, _Sums.finish)]
-    in_passes(problem, passes, *regressions_at(problem, c))
-    found = Linearization(
+    passes = [of(work) for work in (SectionSums.begin, SectionSums.refine, SectionSums.finish)]
+    in_passes(problem, passes, regress, prepare)
+    return sums
+
+
+def linearize(
+    problem: OutputErrorProblem, c: Coefficients, outputs: Outputs = measured_outputs
+) -> Linearization:
+    """Return the sums of all residuals and their derivatives with respect to c.
+
+    **Arguments:** `outputs`: columns to take in place of the measured outputs.
+    """
+    N, nu, ny = problem.shape
+    d, columns = len(c), problem.lags * nu
+    sums = sum_up(problem, c, outputs, *_regressions_at(problem, c))
+    out = Linearization(
         c=c,
         square=np.zeros((N, ny)),
         gradient=np.zeros((ny, d)),
@@ -128,126 +200,60 @@ def linearize(
         numerators=np.zeros((N, columns, ny)),
         slope=np.zeros((d, N, columns, ny)),
         roots=[[np.zeros((0, 0))] * ny for _ in range(N)],
-        fits=[[one.fit for one in some] for some in sums],
+        fits=[[each.fit for each in section] for section in sums],
     )
-    for n, (some, to_lags) in enumerate(zip(sums, problem.to_lags, strict=True)):
-        for one in some:
-            which, fit = one.outputs, one.fit
-            found.square[n, which] = one.square
-            found.gradient[which] += one.gradient
-            found.curvature[which] += one.curvature
-            found.freedom[n, which] = round(one.freedom) - fit.root.shape[1]
-            found.numerators[n][:, which] = to_lags @ fit.coefficients[..., 0]
-            slope = np.moveaxis(fit.slopes[..., 0], 1, 0)
-            found.slope[:, n][..., which] = to_lags @ slope
+    for n, (section, to_lags) in enumerate(zip(sums, problem.to_lags, strict=True)):
+        for each in section:
+            which, fit = each.outputs, each.fit
+            out.square[n, which] = np.trace(each.products, axis1=1, axis2=2)
+            out.gradient[which] += each.gradient
+            out.curvature[which] += each.curvature
+            out.freedom[n, which] = round(each.freedom) - fit.root.shape[1]
+            out.numerators[n][:, which] = to_lags @ fit.coefficients[..., 0]
+            out.slope[:, n][..., which] = to_lags @ np.moveaxis(fit.slopes[..., 0], 1, 0)
             for i in which:
-                found.roots[n][i] = to_lags @ fit.root
-    return found
+                out.roots[n][i] = to_lags @ fit.root
+    return out
 
 
-def regressions_at(problem: OutputErrorProblem, c: Coefficients):
-    """What `in_passes` takes to make the regressions of each section at c."""
-
-    def regress(part, v, n):
-        return [problem.regression(part, v, c, n, some[0]) for some in problem.alike[n]]
+def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> tuple[Regress, Callable]:
+    def regress(part: CycleGrid, v: np.ndarray, n: int) -> list[SectionRegression]:
+        return [problem.regression(part, v, c, n, alike[0]) for alike in problem.alike[n]]
 
     return regress, lambda part: divide_by_chi(c, part.u)
 
 
 def each_part(
     problem: OutputErrorProblem,
-    found: Linearization,
-    work: Callable[[int, Part, int, SectionFit, SectionRegression], Any],
-    collect: Callable[[int, list[list[Any]]], None],
+    solution: Linearization,
+    work: Callable[[int, CycleGrid, int, SectionFit, SectionRegression], Any],
+    collect: Callable[[int, list[Any]], None],
 ) -> None:
-    """One more pass, with what was found: `work` for each part (its number first), section and list
-    of outputs, and `collect` for each part with its number and what came out."""
+    """Go through all grids, sections and lists of outputs once more, with the fits of a solution.
 
-    def section(k, part, n, regressions):
-        pairs = zip(found.fits[n], regressions, strict=True)
-        return [work(k, part, n, fit, regression) for fit, regression in pairs]
-
-    in_passes(problem, [section], *regressions_at(problem, found.c), collect)
-
-
-class _Sums:
-    """What the passes add up for some outputs of a section.
-
-    Each pass solves with the sums of the one before, and the last corrects what rounding has left:
-    so the result is as accurate as that of one array.
+    **Arguments:** `collect`: takes the number of each grid and the results of `work`.
     """
 
-    def __init__(self, outputs: list[int], c: Coefficients):
-        self.outputs, self.c = outputs, c
-        self.gram: Any = 0.0
-        self.freedom = 0.0
-        self._along: Any = 0.0
-        self._along_left: Any = 0.0
-        self._along_slopes: Any = 0.0
-        self._along_last: Any = 0.0
-        self._root: Any = None
-        self._fit: SectionFit | None = None
-        self.square: Any = 0.0
-        self.gradient: Any = 0.0
-        self._curvature: Any = 0.0
+    def section(k, part, n, regressions):
+        pairs = zip(solution.fits[n], regressions, strict=True)
+        return [work(k, part, n, fit, regression) for fit, regression in pairs]
 
-    def begin(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        self.gram = self.gram + regression.gram
-        self.freedom += regression.freedom
-        self._along = self._along + _along(regression, _reduced(regression, x))
+    def flat(k, results):
+        collect(k, [x for section in results for x in section])
 
-    def refine(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        if self._root is None:
-            self._root = root_of(self.gram)
-            self._along = self._solved(self._along)
-        self._along_left += _along(regression, _left(self._along, regression, x))
-        fitted = _fitted(self._along, self.c, regression, x)
-        self._along_slopes += _along(regression, _reduced(regression, fitted))
-
-    def finish(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        left, slopes = self.fit.samples(self.c, regression, x)
-        self._along_last += _along(regression, slopes)
-        self.square += (left**2).sum(axis=(0, 2))
-        self.gradient += np.einsum("rjmk,rmk->mj", slopes, left)
-        self._curvature += np.einsum("rimk,rjmk->mij", slopes, slopes)
-
-    @property
-    def fit(self) -> SectionFit:
-        """After the second pass."""
-        if self._fit is None:
-            a = self._along + self._solved(self._along_left)
-            slopes = self._solved(self._along_slopes)
-            self._fit = SectionFit(self.outputs, self._root, a, slopes)
-        return self._fit
-
-    @property
-    def curvature(self) -> Float[np.ndarray, "m d d"]:
-        """After the last one."""
-        missed = self._solved(self._along_last)
-        return self._curvature - np.einsum("rimk,rjmk->mij", self._along_last, missed)
-
-    def _solved(self, along: np.ndarray) -> np.ndarray:
-        return np.tensordot(self._root, np.tensordot(self._root.T, along, 1), 1)
+    in_passes(problem, [section], *_regressions_at(problem, solution.c), flat)
 
 
-def _left(a: np.ndarray, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]):
-    return _reduced(regression, x) - np.tensordot(regression.remainder, a, 1)
+def minimize(
+    problem: OutputErrorProblem, start: Coefficients, max_steps: int
+) -> tuple[Coefficients, Linearization, bool]:
+    """Return the c that minimizes the sum of squares, the problem there, and whether it settled."""
+    last: list[Linearization] = []
 
+    def at(c: Coefficients) -> Linearization:
+        if not last or c is not last[0].c:
+            last[:] = [linearize(problem, c)]
+        return last[0]
 
-def _reduced(regression: SectionRegression, x: np.ndarray) -> np.ndarray:
-    """Columns (S, T, ...), by row."""
-    flat = x.reshape(*x.shape[:2], -1)
-    return regression.reduced(flat).reshape(-1, *x.shape[2:])
-
-
-def _along(regression: SectionRegression, left: np.ndarray) -> np.ndarray:
-    return np.tensordot(regression.remainder.T, left, 1)
-
-
-def _fitted(
-    a: Float[np.ndarray, "r m C"], c: Coefficients, regression: SectionRegression, x: np.ndarray
-) -> Float[np.ndarray, "S T d m C"]:
-    """What was fitted, later and filtered."""
-    flat = x.reshape(*x.shape[:2], -1)
-    fitted = regression.response(a.reshape(len(a), -1), flat).reshape(x.shape)
-    return np.stack([divide_by_chi(c, fitted, j) for j in range(1, len(c) + 1)], axis=2)
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start, max_steps)
+    return c, at(c), converged

@@ -1,154 +1,202 @@
-r"""The output-error problem in time: numerators and unknown starts projected out.
+r"""The output-error problem of time series: linear unknowns are eliminated section by section.
 
 With $\chi(q^{-N}) y = B_{n \bmod N}(q^{-1}) u$ and $v = \chi^{-1} u$, filtered from cycle to cycle,
 
 $$y[n] = \sum_r b_{n \bmod N}[r]\, v[n-r] + (\chi^{-1} g)[n] + \varepsilon[n],$$
 
-where g is free in the first cycles of each record: it stands for inputs and outputs before the
+where g is free in the first cycles of each record: it represents inputs and outputs before the
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Shaped
 
-from ..._core.execution import core_count, on_all_cores
+from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
 from ..descent import Coefficients
-from .cycle_filters import lagged_inputs, start_responses
-from .cycle_grid import CycleGrid
-from .parts import Parts
-from .section_regression import RANK, SectionRegression
+from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
 
 
-class Part(NamedTuple):
-    """Some of the records."""
+# Singular values of regressors, relative to the largest, below which they are rounding errors.
+# Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
+RANK = 1e-10
+# The same for the eigenvalues of a Gram matrix, which are squares.
+_GRAM_RANK = 1e-12
 
-    u: Float[np.ndarray, "S T N nu"]
-    y: Float[np.ndarray, "S T N ny"]
-    """In units of `scale`; zero where there is no sample."""
-    weight: Float[np.ndarray, "S T N ny"]
-    """What each sample's equation is multiplied by: 1, less for outliers, zero where there is no
-    sample."""
-    first: Int[np.ndarray, "S N"]
-    """The cycle in which a record first meets a section."""
-    drift: Float[np.ndarray, "S T K"]
-    """What an unknown drift of the outputs is composed of."""
+
+class SectionRegression(NamedTuple):
+    """Regressors of the outputs of a section that have the same weights, in one grid.
+
+    Initial conditions and drift are unknowns of each record and are projected out here. The
+    coefficients of the inputs are common to all grids.
+    """
+
+    inputs: Float[np.ndarray, "S T r"]
+    starts: Float[np.ndarray, "S T K"]
+    """Responses to unknown initial conditions."""
+    weight: Float[np.ndarray, "S T 1"]
+    """Factors of the rows."""
+    basis: Float[np.ndarray, "S T k"]
+    """Orthonormal basis of the weighted rows of initial conditions and drift, by record."""
+    to_starts: Float[np.ndarray, "S k K"]
+    """Map from coefficients of the basis to those of the initial conditions."""
+    remainder: Float[np.ndarray, "rows r"]
+    """The weighted rows of the inputs without the part in the basis."""
+
+    @classmethod
+    def make(
+        cls,
+        inputs: Float[np.ndarray, "S T r"],
+        starts: Float[np.ndarray, "S T K"],
+        drift: Float[np.ndarray, "S T k"],
+        weight: Shaped[np.ndarray, "S T"],
+    ) -> "SectionRegression":
+        rows = weight[:, :, None].astype(float)
+        unknown = rows * np.concatenate([starts, drift], axis=2)
+        basis, s, right = np.linalg.svd(unknown, full_matrices=False)
+        kept = s > RANK * s.max(axis=1, initial=0, keepdims=True)
+        basis = basis * kept[:, None]
+        inverse = np.where(kept, 1 / np.where(kept, s, 1), 0)[:, None]
+        to_starts = (np.swapaxes(right, 1, 2) * inverse)[:, : starts.shape[2]]
+        remainder = rows * inputs
+        remainder = remainder - basis @ (basis.swapaxes(1, 2) @ remainder)
+        return cls(inputs, starts, rows, basis, to_starts, remainder.reshape(-1, inputs.shape[2]))
+
+    @property
+    def freedom(self) -> float:
+        """Samples less unknown initial conditions and drift."""
+        return float((self.weight > 0).sum() - (self.basis**2).sum())
+
+    def input_basis(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T k"]:
+        """Return the rows of this grid in an orthonormal basis of the inputs' rows of all grids."""
+        return (self.remainder @ root).reshape(*self.basis.shape[:2], -1)
+
+    def leverage(self, root: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "S T"]:
+        """Return the share of its own error that the fit takes from each sample."""
+        return (self.basis**2).sum(axis=2) + (self.input_basis(root) ** 2).sum(axis=2)
+
+    def reduced(self, x: Float[np.ndarray, "S T *columns"]) -> Float[np.ndarray, "rows *columns"]:
+        """Return outputs, weighted, without the part in the basis."""
+        left = self.weight * x.reshape(*x.shape[:2], -1)
+        for _ in range(2):  # the second time removes rounding errors
+            left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
+        return left.reshape(len(self.remainder), *x.shape[2:])
+
+    def residual(
+        self, a: Float[np.ndarray, "r *columns"], x: Float[np.ndarray, "S T *columns"]
+    ) -> Float[np.ndarray, "rows *columns"]:
+        """Return the weighted residuals of outputs x, given coefficients of the inputs."""
+        return self.reduced(x) - np.tensordot(self.remainder, a, 1)
+
+    def along(self, rows: Float[np.ndarray, "rows *columns"]) -> Float[np.ndarray, "r *columns"]:
+        """Return the products of the inputs with weighted rows."""
+        return np.tensordot(self.remainder.T, rows, 1)
+
+    def response(
+        self, a: Float[np.ndarray, "r *columns"], x: Float[np.ndarray, "S T *columns"]
+    ) -> Float[np.ndarray, "S T *columns"]:
+        """Return the response to the inputs and to the initial conditions that fit x best."""
+        forced = self.inputs @ a.reshape(len(a), -1)
+        left = self.weight * (x.reshape(forced.shape) - forced)
+        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ left)
+        return (forced + self.starts @ free).reshape(x.shape)
 
 
 class OutputErrorProblem(NamedTuple):
-    """What does not depend on c."""
+    """The parts of the problem that do not depend on c."""
 
-    data: Parts
+    records: PreparedRecords
     weights: list[Float[np.ndarray, "S T N ny"]] | None
-    """Those of each part; None: 1 where there is a sample."""
+    """Weights of the samples of each grid; None: those of the records."""
     lags: int
-    """R: numerators have the lags -lead..R-1-lead."""
-    lead: int
+    """R: numerators have the lags -lead, ..., R - 1 - lead."""
     free: int
-    """K: the cycles at the start of each record in which g is free."""
+    """The number of cycles at the start of each record in which g is free."""
     to_lags: list[Float[np.ndarray, "columns r"]]
     """For each section: the combinations of lagged inputs that are linearly independent."""
     alike: list[list[list[int]]]
-    """For each section: the outputs, in lists of those that have the same weights."""
-    cycles: int
-    """Of the longest record."""
+    """For each section: the outputs, in lists of equal weights."""
     scale: Float[np.ndarray, " ny"]
+    """The units of the outputs."""
 
     @classmethod
     def from_data(
-        cls, data: Parts, order: int, overhang: int, free_start: bool
+        cls, records: PreparedRecords, order: int, overhang: int, free_start: bool
     ) -> "OutputErrorProblem":
         """**Arguments:** `order`: d. `overhang`: lags of the numerators beyond d N. `free_start`:
         whether the state at the start of records is unknown, or zero.
 
-        **Raises:** `DefinitionError` for signals that are zero, or records too short for the lags.
+        **Raises:** `DefinitionError` for records too short for the lags.
         """
-        N, nu, ny = data.n_sections, len(data.inputs), len(data.outputs)
-        lags = data.lead + order * N + overhang + 1
+        N, nu, ny = records.n_sections, len(records.inputs), len(records.outputs)
+        lags = records.lead + order * N + overhang + 1
         free = order + -(-overhang // N) if free_start else 0
+        if lags > records.cycles * N:
+            raise DefinitionError(
+                f"numerators of {lags} lags reach beyond the longest record, of "
+                f"{records.cycles * N} samples: lower `order` or `overhang`."
+            )
         triangles = [np.zeros((0, lags * nu))] * N
         equal = np.ones((N, ny, ny), bool)
-        square, count, excited = np.zeros(ny), np.zeros(ny), np.zeros(nu, bool)
-        cycles = 0
-        for grid in data:
-            sampled = np.isfinite(grid.y)
-            cycles = max(cycles, grid.y.shape[1])
-            square += np.nansum(grid.y**2, axis=(0, 1, 2))
-            count += sampled.sum(axis=(0, 1, 2))
-            excited |= grid.u.any(axis=(0, 1, 2))
+        for grid in records:
             for i in range(ny):
-                equal[:, i] &= (sampled == sampled[..., [i]]).all(axis=(0, 1))
-            if lags <= cycles * N:
-                triangles = _with_rows(triangles, grid, lags, free)
-        _require_signals(data, excited, square)
-        if lags > cycles * N:
-            raise DefinitionError(
-                f"numerators of {lags} lags reach beyond the longest record, of {cycles * N} "
-                "samples: lower `order` or `overhang`."
-            )
+                equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
+            triangles = _with_rows(triangles, grid, lags, records.lead, free)
+        alike = [[np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]] for e in equal]
         return cls(
-            data=data,
-            weights=None,
-            lags=lags,
-            lead=data.lead,
-            free=free,
-            to_lags=on_all_cores(_independent, triangles),
-            alike=[_classes(x) for x in equal],
-            cycles=cycles,
-            scale=np.sqrt(square / count),
+            records, None, lags, free, on_all_cores(_independent, triangles), alike, records.scale
         )
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """N, and the numbers of inputs and outputs."""
-        return self.data.n_sections, len(self.data.inputs), len(self.data.outputs)
+        return self.records.n_sections, len(self.records.inputs), len(self.records.outputs)
 
-    def parts(self) -> Iterator[Part]:
-        """All records, a part at a time."""
-        for k, grid in enumerate(self.data):
-            sampled = np.isfinite(grid.y)
-            yield Part(
-                grid.u,
-                np.where(sampled, grid.y, 0.0) / self.scale,
-                sampled.astype(float) if self.weights is None else self.weights[k],
-                np.argmax(grid.inside, axis=1),
-                grid.drift,
-            )
+    def parts(self) -> Iterator[CycleGrid]:
+        """Iterate over all grids, with the outputs in units of `scale` and these weights."""
+        for k, grid in enumerate(self.records):
+            weight = grid.weight if self.weights is None else self.weights[k]
+            yield grid._replace(y=grid.y / self.scale, weight=weight)
 
     def rescale(self, noise: Float[np.ndarray, " ny"]) -> "OutputErrorProblem":
-        """The same with each output in units of its noise, which was `noise` units before."""
+        """Return the problem with outputs in units of their noise, given in the present units."""
         return self._replace(scale=self.scale * noise)
 
     def weighed(self, weights: Sequence[Float[np.ndarray, "S T N ny"]]) -> "OutputErrorProblem":
-        """The same with other weights of samples."""
+        """Return the problem with other weights of samples."""
         N, _, ny = self.shape
         return self._replace(weights=list(weights), alike=[[[i] for i in range(ny)]] * N)
 
     def regression(
-        self, part: Part, v: Float[np.ndarray, "S T N nu"], c: Coefficients, n: int, output: int
+        self,
+        part: CycleGrid,
+        v: Float[np.ndarray, "S T N nu"],
+        c: Coefficients,
+        n: int,
+        output: int,
     ) -> SectionRegression:
-        """That of section n, and of all outputs with the weights of this one; `v`: the inputs over
-        chi."""
-        inputs = lagged_inputs(v, n, self.lags, self.lead) @ self.to_lags[n]
+        """Return the regression of section n for all outputs with the weights of `output`.
+
+        **Arguments:** `v`: the inputs, divided by chi.
+        """
+        inputs = lagged_inputs(v, n, self.lags, self.records.lead) @ self.to_lags[n]
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(self.free, T))
         return SectionRegression.make(inputs, starts, part.drift, part.weight[:, :, n, output])
 
 
 def _with_rows(
-    triangles: list[np.ndarray], grid: CycleGrid, lags: int, free: int
+    triangles: list[np.ndarray], grid: CycleGrid, lags: int, lead: int, free: int
 ) -> list[np.ndarray]:
-    """Triangles of the lagged inputs of each section, with those of more records."""
-    sampled, first = np.isfinite(grid.y), np.argmax(grid.inside, axis=1)
-    cycle = np.arange(grid.y.shape[1])
+    """Return the triangular factors of the lagged inputs of each section with those of a grid."""
+    later = np.arange(grid.y.shape[1])[:, None] >= grid.first[:, None] + free
+    used = grid.sampled.any(axis=3) & later
 
     def section(n: int):
-        tells = sampled[:, :, n].any(axis=2) & (cycle >= first[:, n, None] + free)
-        rows = lagged_inputs(grid.u, n, lags, grid.lead)[tells]
+        rows = lagged_inputs(grid.u, n, lags, lead)[used[:, :, n]]
         return np.linalg.qr(np.concatenate([triangles[n], rows]), mode="r")
 
     return on_all_cores(section, range(len(triangles)))
@@ -160,57 +208,52 @@ def _independent(triangle: np.ndarray) -> np.ndarray:
     return vh[kept].T / s[kept]
 
 
-def _classes(equal: np.ndarray) -> list[list[int]]:
-    """Outputs in lists of those that are equal."""
-    return [list(x) for x in dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in equal)]
-
-
-def _require_signals(data: Parts, excited: np.ndarray, square: np.ndarray) -> None:
-    for name, there in zip(data.inputs, excited, strict=True):
-        if not there:
-            raise DefinitionError(f"the input {name} is zero at every sample.")
-    for name, size in zip(data.outputs, square, strict=True):
-        if not size:
-            raise DefinitionError(f"the output {name} is zero or missing at every sample.")
+def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:
+    """Return a matrix R such that R R^T is the pseudoinverse of a Gram matrix."""
+    w, q = np.linalg.eigh(gram)
+    kept = w > _GRAM_RANK * w.max(initial=0)
+    return q[:, kept] / np.sqrt(w[kept])
 
 
 def in_passes(
     problem: OutputErrorProblem,
-    passes: Sequence[Callable[[int, Part, int, Any], Any]],
-    regress: Callable[[Part, Any, int], Any],
-    prepare: Callable[[Part], Any],
-    collect: Callable[[int, list[Any]], None] | None = None,
+    passes: Sequence[Callable[[int, CycleGrid, int, Any], Any]],
+    regress: Callable[[CycleGrid, Any, int], Any],
+    prepare: Callable[[CycleGrid], Any],
+    collect: Callable[[int, Sequence[Any]], None] = lambda k, results: None,
 ) -> None:
-    """Go through all parts several times, and each time through all sections.
+    """Go through all grids and sections several times. Stored data are read once in each pass.
 
     **Arguments:**
 
-    - `passes`: what is done with the number and the data of a part, a section, and what `regress`
-      makes of these and of what `prepare` makes of the part.
-    - `collect`: takes what they return for all sections of a part.
-
-    Of data that are in memory some sections are looked at together, whose regressions are kept from
-    pass to pass. Others are read once in each pass.
+    - `passes`: functions of the number of a grid, the grid, a section, and the return value of
+      `regress`, a function of the grid, the return value of `prepare(grid)` and the section. Data
+      in memory keep this value for all passes.
+    - `collect`: takes the number of each grid and the results of the last pass at all sections.
     """
-    kept = problem.data.in_memory
-    prepared = [(part, prepare(part)) for part in problem.parts()] if kept else None
-    together = core_count() if kept else problem.data.n_sections
-    for begin in range(0, problem.data.n_sections, together):
-        some = range(begin, min(begin + together, problem.data.n_sections))
-        regressions: dict[tuple[int, int], Any] = {}
-        for work in passes:
-            parts = prepared if kept else ((part, prepare(part)) for part in problem.parts())
-            for k, (part, ready) in enumerate(parts):
-                missing = [n for n in some if (k, n) not in regressions]
-                made = on_all_cores(functools.partial(regress, part, ready), missing)
-                regressions |= {(k, n): one for n, one in zip(missing, made, strict=True)}
-                each = [(n, regressions[k, n]) for n in some]
-                results = on_all_cores(functools.partial(_on_pair, work, k, part), each)
-                if collect is not None:
-                    collect(k, results)
-                if not kept:
-                    regressions.clear()
+    sections = range(problem.records.n_sections)
+    if problem.records.in_memory:
+        parts = [(part, prepare(part)) for part in problem.parts()]
 
+        def all_passes(n: int) -> list[Any]:
+            regressions = [regress(part, ready, n) for part, ready in parts]
+            grids = [(k, part) for k, (part, _) in enumerate(parts)]
+            results: list[Any] = []
+            for work in passes:
+                pairs = zip(grids, regressions, strict=True)
+                results = [work(*grid, n, regression) for grid, regression in pairs]
+            return results
 
-def _on_pair(work: Callable, k: int, part: Part, pair: tuple[int, Any]) -> Any:
-    return work(k, part, *pair)
+        for k, results in enumerate(zip(*on_all_cores(all_passes, sections), strict=True)):
+            collect(k, results)
+        return
+
+    def visit(k: int, part: CycleGrid, work: Callable) -> list[Any]:
+        ready = prepare(part)
+        return on_all_cores(lambda n: work(k, part, n, regress(part, ready, n)), sections)
+
+    for work in passes:
+        for k, part in enumerate(problem.parts()):
+            results = visit(k, part, work)
+            if work is passes[-1]:
+                collect(k, results)

@@ -1,124 +1,129 @@
-"""Losses that outliers do not decide: weights for samples, and what these cost in accuracy."""
+"""Losses in which outliers count less: weights of samples, and their price in accuracy."""
 
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from .linearization import Linearization, SectionFit, each_part
-from .output_error import OutputErrorProblem, Part
-from .section_regression import SectionRegression
+from ..descent import Coefficients
+from .linearization import Linearization, SectionFit, each_part, minimize
+from .output_error import OutputErrorProblem, SectionRegression
+from .records import CycleGrid
 
 
 Loss = Literal["squares", "huber", "student"]
+Samples = list[Float[np.ndarray, "S T N ny"]]
+"""A number for each sample of each grid."""
 
-# Where Huber's loss becomes linear, in standard deviations: 95 % as efficient as squares for normal
-# errors. Doubled: outliers count twice as much.
+# Where Huber's loss becomes linear, in standard deviations: 95 % as efficient as squares for
+# Gaussian errors. Larger: outliers count more; smaller: Gaussian errors are met less efficiently.
 _HUBER = 1.345
-# Degrees of freedom of Student's distribution (Lange, Little and Taylor 1989). Doubled: outliers
-# count twice as much.
+# Degrees of freedom of Student's distribution (Lange, Little and Taylor 1989). Larger: outliers
+# count more; smaller: Gaussian errors are met less efficiently.
 _STUDENT = 4.0
 # The median of the modulus of a standard normal variable.
 _MEDIAN = 0.6745
-# Outputs beyond so many standard deviations are left out of what a fit starts from. Doubled: larger
-# outliers move the start.
+# Outputs beyond so many standard deviations are left out of the start. Larger: outliers move the
+# start; smaller: large responses are left out.
 _FAR = 6.0
-# The share of its own error that a fit leaves to a sample, at least, as far as its weight is
-# concerned. Doubled: outliers that the fit nearly passes through count more.
+# Smallest share of its own error that a fit leaves to a sample, as far as weights are concerned.
+# Larger: outliers that the fit nearly interpolates count more; smaller: weights are unstable.
 _SMALLEST_REMAINDER = 0.5
-# Smallest noise of an output in the units of the moment: rounding. Doubled: outputs without noise
-# count half as much beside noisy ones.
-_ROUNDING = 1e-15
+# Smallest noise of an output, relative to its rms: rounding.
+ROUNDING = 1e-15
+# Iterations of the weights at most, and the change of c, relative to 1 + |c|, of the last one.
+_MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
 
 
-def root_weights(loss: Loss, error: np.ndarray) -> np.ndarray:
-    """Roots of the weights of errors, in standard deviations, by which least squares minimize the
-    loss (iteratively reweighted: Holland and Welsch 1977)."""
+def _root_weights(loss: Loss, error: np.ndarray) -> np.ndarray:
+    """Return the roots of the weights with which least squares minimize the loss.
+
+    **Arguments:** `error`: in standard deviations (Holland and Welsch 1977).
+    """
     if loss == "huber":
         return np.sqrt(_HUBER / np.maximum(np.abs(error), _HUBER))
-    if loss == "student":
-        return np.sqrt((_STUDENT + 1) / (_STUDENT + error**2))
-    return np.ones_like(error)
+    return np.sqrt((_STUDENT + 1) / (_STUDENT + error**2))
 
 
-def _slope(loss: Loss, error: np.ndarray) -> np.ndarray:
-    """The second derivative of the loss."""
+def _second_derivative(loss: Loss, error: np.ndarray) -> np.ndarray:
     if loss == "huber":
         return (np.abs(error) < _HUBER).astype(float)
     return (_STUDENT + 1) * (_STUDENT - error**2) / (_STUDENT + error**2) ** 2
 
 
-Samples = list[Float[np.ndarray, "S T N ny"]]
-"""One number for each sample of each part."""
-
-
-def weigh_outputs(problem: OutputErrorProblem) -> OutputErrorProblem:
-    """With weights that take the outputs themselves for errors, to start from."""
-    parts = list(problem.parts())
-    spread = np.maximum(_spread(problem, [part.y for part in parts]), _ROUNDING)
-    weights = [part.weight * root_weights("huber", part.y / spread) for part in parts]
-    return problem.weighed(weights)
-
-
 def without_outliers(problem: OutputErrorProblem) -> OutputErrorProblem:
-    """Without the outputs that are far from all others."""
+    """Return the problem without the outputs that are far from all others."""
     parts = list(problem.parts())
     spread = _spread(problem, [part.y for part in parts])
     weights = [np.where(np.abs(part.y) > _FAR * spread, 0.0, part.weight) for part in parts]
     return problem.weighed(weights)
 
 
-def reweight(problem: OutputErrorProblem, found: Linearization, loss: Loss) -> OutputErrorProblem:
-    """In units of the noise, with the weights that a fit suggests."""
-    error = misfit(problem, found)
-    scale = np.maximum(_spread(problem, error), _ROUNDING)
-    weights = [
-        np.where(part.weight > 0, root_weights(loss, e / scale), 0.0)
-        for part, e in zip(problem.parts(), error, strict=True)
-    ]
-    return problem.rescale(scale).weighed(weights)
+def minimize_robust(
+    problem: OutputErrorProblem, start: Coefficients, loss: Loss, max_steps: int
+) -> tuple[OutputErrorProblem, Coefficients, Linearization, bool]:
+    """Return the minimum of a robust loss by iteratively reweighted least squares.
+
+    The minimum of Huber's loss, which has no other minima, comes first.
+    """
+    outputs = [part.y for part in problem.parts()]
+    spread = np.maximum(_spread(problem, outputs), ROUNDING)
+    problem = _with_weights(problem, "huber", [y / spread for y in outputs])
+    c, solution, converged = minimize(problem, start, max_steps)
+    for kind in dict.fromkeys(("huber", loss)):
+        for _ in range(_MAX_REWEIGHTINGS):
+            before, error = c, misfit(problem, solution)
+            scale = np.maximum(_spread(problem, error), ROUNDING)
+            problem = _with_weights(problem.rescale(scale), kind, [e / scale for e in error])
+            c, solution, _ = minimize(problem, c, 1)
+            converged = bool(np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max()))
+            if converged:
+                break
+    return problem, c, solution, converged
 
 
-def misfit(problem: OutputErrorProblem, found: Linearization) -> Samples:
-    """Unweighted, and without the share that the fit takes of it."""
+def _with_weights(problem: OutputErrorProblem, loss: Loss, error: Samples) -> OutputErrorProblem:
+    pairs = zip(problem.parts(), error, strict=True)
+    return problem.weighed([_root_weights(loss, e) * part.sampled for part, e in pairs])
+
+
+def misfit(problem: OutputErrorProblem, solution: Linearization) -> Samples:
+    """Return the residuals, unweighted and corrected for the share that the fit takes of them."""
     errors = [np.zeros(part.y.shape) for part in problem.parts()]
 
-    def section(_, part: Part, n: int, fit: SectionFit, regression: SectionRegression):
-        x = part.y[:, :, n, fit.outputs, None]
-        error, _ = fit.samples(found.c, regression, x)
-        error = error.reshape(x.shape[:3])
+    def section(_, part: CycleGrid, n: int, fit: SectionFit, regression: SectionRegression):
+        x = part.y[:, :, n, fit.outputs]
+        error = regression.residual(fit.coefficients[..., 0], x).reshape(x.shape)
         weight = part.weight[:, :, n, fit.outputs]
         remainder = np.maximum(1 - regression.leverage(fit.root), _SMALLEST_REMAINDER)
         left = weight * np.sqrt(remainder)[..., None]
         return n, fit.outputs, np.where(weight > 0, error / np.where(left > 0, left, 1.0), 0.0)
 
-    def collect(k, sections):
-        for n, outputs, error in (one for each in sections for one in each):
+    def collect(k, results):
+        for n, outputs, error in results:
             errors[k][:, :, n, outputs] = error
 
-    each_part(problem, found, section, collect)
+    each_part(problem, solution, section, collect)
     return errors
 
 
 def rms_of(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
-    """Root mean square of each output's x where the problem has samples."""
-    square, count = 0.0, 0
-    for part, values in zip(problem.parts(), x, strict=True):
-        sampled = part.weight > 0
-        square = square + (np.where(sampled, values, 0.0) ** 2).sum(axis=(0, 1, 2))
-        count = count + sampled.sum(axis=(0, 1, 2))
-    return np.maximum(np.sqrt(square / count), _ROUNDING)
+    """Return the root mean square of each output's x where the problem has samples."""
+    pairs = [(part.sampled, a) for part, a in zip(problem.parts(), x, strict=True)]
+    square = sum(((a**2) * sampled).sum(axis=(0, 1, 2)) for sampled, a in pairs)
+    count = sum(sampled.sum(axis=(0, 1, 2)) for sampled, _ in pairs)
+    return np.maximum(np.sqrt(square / count), ROUNDING)
 
 
 def _spread(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
-    """Standard deviation of each output's x, by the median of its modulus."""
-    pairs = [(np.abs(a), part.weight > 0) for a, part in zip(x, problem.parts(), strict=True)]
+    """Return the standard deviation of each output's x, from the median of its modulus."""
+    pairs = [(np.abs(a), part.sampled) for a, part in zip(x, problem.parts(), strict=True)]
     each = [np.concatenate([a[..., i][s[..., i]] for a, s in pairs]) for i in range(x[0].shape[3])]
     return np.array([np.median(a) for a in each]) / _MEDIAN
 
 
 class Efficiency(NamedTuple):
-    """What a loss changes of the accuracy of a fit, for each output (Huber, *Robust Statistics*,
+    """The effect of a loss on the accuracy of a fit, for each output (Huber, *Robust Statistics*,
     1981, sec. 7.6): 1 for squares, in units of the noise."""
 
     curvature: Float[np.ndarray, " ny"]
@@ -128,20 +133,20 @@ class Efficiency(NamedTuple):
 
     @property
     def noise(self) -> Float[np.ndarray, " ny"]:
-        """Standard deviation of normal errors that would leave least squares as uncertain."""
+        """Standard deviation of Gaussian errors for which least squares are as accurate."""
         return np.sqrt(self.variance) / self.curvature
 
 
-def efficiency(problem: OutputErrorProblem, found: Linearization, loss: Loss) -> Efficiency:
+def efficiency(problem: OutputErrorProblem, solution: Linearization, loss: Loss) -> Efficiency:
+    """Return the efficiency of the loss at its minimum."""
     ny = problem.shape[2]
     if loss == "squares":
         return Efficiency(np.ones(ny), np.ones(ny))
     total = slope = count = np.zeros(ny)
-    for part, error in zip(problem.parts(), misfit(problem, found), strict=True):
-        sampled = part.weight > 0
+    for part, error in zip(problem.parts(), misfit(problem, solution), strict=True):
         total = total + (part.weight**2).sum(axis=(0, 1, 2))
-        slope = slope + (_slope(loss, error) * sampled).sum(axis=(0, 1, 2))
-        count = count + sampled.sum(axis=(0, 1, 2))
-    # Of the residuals' squares a share is missing, as of those of least squares.
-    kept = found.freedom.sum(axis=0) / count
-    return Efficiency(slope / total, found.square.sum(axis=0) / kept / total)
+        slope = slope + (_second_derivative(loss, error) * part.sampled).sum(axis=(0, 1, 2))
+        count = count + part.sampled.sum(axis=(0, 1, 2))
+    # The unknowns take a share of the residuals' squares, as in least squares.
+    kept = solution.freedom.sum(axis=0) / count
+    return Efficiency(slope / total, solution.square.sum(axis=0) / kept / total)

@@ -10,8 +10,8 @@ from ...errors import DefinitionError
 from ...experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ...linear.ldtp import LDTP
 from ..joint.prediction.predictor import Predictor
-from ..series.parts import in_groups
-from ..series.series_fit import SeriesFit
+from ..series.fit import SeriesFit
+from ..series.records import in_groups
 from .residual_tests import sections_of
 from .simulation import can_be_compared
 

@@ -8,9 +8,14 @@ from jaxtyping import Float
 from ...experiments.record import Record
 from ...linear.ldtp import LDTP
 from ..joint.prediction.predictor import Predictor
-from ..series.cycle_filters import divide_by_chi, lagged_inputs, start_responses
-from ..series.cycle_grid import count_cycles, drift_waves
-from ..series.series_fit import SeriesFit
+from ..series.fit import SeriesFit
+from ..series.records import (
+    count_cycles,
+    divide_by_chi,
+    drift_waves,
+    lagged_inputs,
+    start_responses,
+)
 
 
 # Samples for each unknown of its start and drift, which a record must have more of to say anything

@@ -16,7 +16,7 @@ from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
 from ..joint.ldtp_fit import LDTPFit
 from ..joint.prediction.predictor import Predictor
-from ..series.series_fit import SeriesFit
+from ..series.fit import SeriesFit
 from .comparable import Comparable
 from .power import smallest_visible
 from .residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of

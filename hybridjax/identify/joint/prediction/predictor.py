@@ -9,7 +9,7 @@ from ...._core.arguments import require_same
 from ....errors import DefinitionError
 from ....experiments.record import Record
 from ....linear.ldtp import LDTP
-from ...series.cycle_grid import CycleGrid
+from ...series.records import CycleGrid
 from ..periodic_model import PeriodicModel
 from .problem import SeriesProblem
 from .series_part import SeriesPart

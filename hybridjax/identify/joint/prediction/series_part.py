@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ...series.cycle_grid import CycleGrid
+from ...series.records import CycleGrid
 
 
 # Singular values below this part of the largest one are rounding errors. Doubled: combinations of
@@ -30,7 +30,7 @@ class SeriesPart(NamedTuple):
 
     @classmethod
     def of(cls, grid: CycleGrid, scale: Float[np.ndarray, " ny"]) -> "SeriesPart":
-        seen = np.isfinite(grid.y)
+        seen = grid.sampled
         lost = grid.inside[..., None] & ~seen
         waves = grid.drift[:, None, :, None, :] * np.moveaxis(seen, 2, 1)[..., None]
         basis, s, _ = np.linalg.svd(np.moveaxis(waves, 2, 3), full_matrices=False)  # (R N ny T K)
@@ -38,7 +38,7 @@ class SeriesPart(NamedTuple):
         basis = basis * kept[..., None, :]
         return cls(
             u=np.moveaxis(grid.u, 2, 0),
-            y=np.moveaxis(np.where(seen, grid.y, 0.0) / scale, 2, 0),
+            y=np.moveaxis(grid.y / scale, 2, 0),
             seen=np.moveaxis(seen, 2, 0),
             lost=np.moveaxis(lost, 2, 0),
             first=np.argmax(grid.inside[:, 0], axis=1),

@@ -1,0 +1,193 @@
+"""Records as fits use them: grids of records, cycles and sections, with delays and filters."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.signal import lfilter
+
+from ...errors import DefinitionError
+from ...experiments.record import (
+    HasRecords,
+    Record,
+    RecordedData,
+    each_uninterrupted_record,
+    uninterrupted_records,
+)
+
+
+# Samples in a grid, unless a single record has more: 16 MB with 20 columns. Larger: stored data
+# may exceed the memory; smaller: loops over many small grids.
+_SAMPLES = 100_000
+# Length of the shortest record of a grid, relative to the longest. Larger: as many grids as there
+# are lengths; smaller: most of a grid is padding.
+_SHORTEST = 0.5
+
+
+class CycleGrid(NamedTuple):
+    """S records of T cycles. Samples outside of a record and in its gaps have the weight zero."""
+
+    u: Float[np.ndarray, "S T N nu"]
+    """Inputs; zero outside of a record."""
+    y: Float[np.ndarray, "S T N ny"]
+    """Outputs; zero where there is no sample."""
+    weight: Float[np.ndarray, "S T N ny"]
+    """Factor of each sample's equation: 1, less for outliers, zero where there is no sample."""
+    inside: Bool[np.ndarray, "S T N"]
+    """Whether a sample lies between the first and the last of its record."""
+    drift: Float[np.ndarray, "S T K"]
+    """Basis of the drift of each section's outputs; zero outside of a record."""
+
+    @classmethod
+    def from_records(cls, records: Sequence[Record]) -> "CycleGrid":
+        """Put records of one kind, without unknown inputs, on one grid."""
+        S, T, about = len(records), max(map(count_cycles, records)), records[0]
+        N, nu, ny = about.n_sections, len(about.inputs), len(about.outputs)
+        u, y = np.zeros((S, T * N, nu)), np.full((S, T * N, ny), np.nan)
+        inside = np.zeros((S, T * N), bool)
+        waves = [drift_waves(r) for r in records]
+        drift = np.zeros((S, T, max(w.shape[1] for w in waves)))
+        for s, (r, w) in enumerate(zip(records, waves, strict=True)):
+            rows = slice(r.first_section, r.first_section + len(r.u))
+            u[s, rows], y[s, rows], inside[s, rows] = r.u, r.y, True
+            drift[s, : len(w), : w.shape[1]] = w
+        y = y.reshape(S, T, N, ny)
+        sampled = np.isfinite(y)
+        u, y = u.reshape(S, T, N, nu), np.where(sampled, y, 0.0)
+        return cls(u, y, sampled.astype(float), inside.reshape(S, T, N), drift)
+
+    @property
+    def sampled(self) -> Bool[np.ndarray, "S T N ny"]:
+        return self.weight > 0
+
+    @property
+    def first(self) -> Int[np.ndarray, "S N"]:
+        """The cycle in which each record first crosses a section."""
+        return np.argmax(self.inside, axis=1)
+
+
+def count_cycles(record: Record) -> int:
+    """Return the number of cycles that a record touches, counted from section 0 of its first."""
+    return -(-(record.first_section + len(record.u)) // record.n_sections)
+
+
+def drift_waves(record: Record) -> Float[np.ndarray, "T K"]:
+    """Return the basis of a drift: cosines in the cycles, down to a wavelength of `record.drift`.
+
+    The first is a constant. Records that announce no drift have none.
+    """
+    T = count_cycles(record)
+    if record.drift is None:
+        return np.zeros((T, 0))
+    waves = np.arange(int(2 * T / record.drift) + 1)
+    return np.cos(np.pi / T * (np.arange(T)[:, None] + 0.5) * waves)
+
+
+class PreparedRecords:
+    """Records as grids of bounded size, which can be iterated over again and again.
+
+    Data that can be iterated over more than once, and are no sequence (`StoredExperiments`), are
+    read anew each time; the grids of other data are kept.
+
+    **Fields:** `n_sections`, `lead`, `inputs`, `outputs`: as in `Record`. `cycles`: of the longest
+    record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
+    """
+
+    def __init__(self, data: RecordedData):
+        """**Raises:** `DefinitionError` as `uninterrupted_records`, and for signals that are zero
+        or missing at every sample."""
+        self.in_memory = isinstance(data, HasRecords | Sequence) or iter(data) is data
+        kept = self.in_memory and not isinstance(data, HasRecords)
+        self._data = list(data) if kept else data
+        about = next(each_uninterrupted_record(self._data))
+        self.n_sections, self.lead = about.n_sections, about.lead
+        self.inputs, self.outputs = about.inputs, about.outputs
+        self._grids = list(_grids(self._data)) if self.in_memory else None
+        self.cycles = 0
+        self.sampled = np.zeros((self.n_sections, len(self.outputs)), int)
+        excited, square = np.zeros(len(self.inputs), bool), np.zeros(len(self.outputs))
+        for grid in self:
+            self.cycles = max(self.cycles, grid.y.shape[1])
+            self.sampled += grid.sampled.sum(axis=(0, 1))
+            excited |= grid.u.any(axis=(0, 1, 2))
+            square += (grid.y**2).sum(axis=(0, 1, 2))
+        for name, nonzero in zip(self.inputs, excited, strict=True):
+            if not nonzero:
+                raise DefinitionError(f"the input {name} is zero at every sample.")
+        for name, size in zip(self.outputs, square, strict=True):
+            if not size:
+                raise DefinitionError(f"the output {name} is zero or missing at every sample.")
+        self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
+
+    def __iter__(self) -> Iterator[CycleGrid]:
+        return _grids(self._data) if self._grids is None else iter(self._grids)
+
+    def whole(self) -> CycleGrid:
+        """Return all records on one grid."""
+        return CycleGrid.from_records(uninterrupted_records(self._data))
+
+
+def _grids(data: RecordedData) -> Iterator[CycleGrid]:
+    for group in in_groups(each_uninterrupted_record(data)):
+        left = sorted(group, key=count_cycles, reverse=True)
+        while left:
+            enough = _SHORTEST * count_cycles(left[0])
+            alike = [r for r in left if count_cycles(r) >= enough]
+            yield CycleGrid.from_records(alike)
+            left = left[len(alike) :]
+
+
+def in_groups(records: Iterable[Record]) -> Iterator[list[Record]]:
+    """Collect records in lists of bounded size."""
+    group: list[Record] = []
+    size = 0
+    for record in records:
+        if group and size + len(record.u) > _SAMPLES:
+            yield group
+            group, size = [], 0
+        group.append(record)
+        size += len(record.u)
+    if group:
+        yield group
+
+
+def lagged_inputs(
+    u: Float[np.ndarray, "S T N nu"], section: int, lags: int, lead: int
+) -> Float[np.ndarray, "S T columns"]:
+    """Return the inputs r samples before a section in all cycles, r = -lead, ..., lags - 1 - lead.
+
+    Inputs outside of the grid are zero. Columns are ordered by r, then by input.
+    """
+    S, T, N, nu = u.shape
+    before, after = np.zeros((S, lags - 1 - lead, nu)), np.zeros((S, lead, nu))
+    row = np.concatenate([before, u.reshape(S, T * N, nu), after], axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)[:, section::N]
+    return windows[..., ::-1].swapaxes(2, 3).reshape(S, T, lags * nu)
+
+
+def delay_cycles(
+    x: Shaped[np.ndarray, "S T *columns"], cycles: int, fill: float | bool = 0
+) -> Shaped[np.ndarray, "S T *columns"]:
+    """Delay x by a number of cycles; the first cycles become `fill`."""
+    T = x.shape[1]
+    cycles = min(cycles, T)
+    return np.concatenate([np.full_like(x[:, :cycles], fill), x[:, : T - cycles]], axis=1)
+
+
+def divide_by_chi(
+    c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"], delay: int = 0
+) -> Float[np.ndarray, "S T *columns"]:
+    """Filter x by 1 / chi from cycle to cycle, and delay it by a number of cycles."""
+    return delay_cycles(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1), delay)
+
+
+def start_responses(
+    c: Float[np.ndarray, " d"], first: Int[np.ndarray, " S"], T: int, K: int
+) -> Float[np.ndarray, "S T K"]:
+    """Return the responses of T cycles to an impulse in the first, ..., K-th cycle of a record.
+
+    **Arguments:** `first`: the cycle in which each record first crosses the section.
+    """
+    cycle = first[:, None] + np.arange(K)
+    return divide_by_chi(c, (np.arange(T)[:, None] == cycle[:, None]).astype(float))
