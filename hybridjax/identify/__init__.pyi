@@ -4,9 +4,9 @@ from .htf.leakage import predict_leakage as predict_leakage
 from .htf.nonparametric import missing_frequencies as missing_frequencies
 from .htf.p_values import htf_p_values as htf_p_values
 from .htf.transient import TransientFit as TransientFit, remove_transient as remove_transient
-from .joint.bound import ldtp_bound as ldtp_bound
-from .joint.ldtp_fit import LDTPFit as LDTPFit
+from .joint.fit import LDTPFit as LDTPFit, ldtp_bound as ldtp_bound
 from .joint.noise import noise_spectrum as noise_spectrum
+from .joint.realization import realize as realize
 from .multipliers.bound import (
     MultiplierBound as MultiplierBound,
     multiplier_bound as multiplier_bound,
@@ -18,7 +18,6 @@ from .multipliers.structured import StructuredFit as StructuredFit
 from .rational.aaa import AAAFit as AAAFit, fit_aaa as fit_aaa
 from .rational.fit import RationalFit as RationalFit
 from .series.fit import SeriesFit as SeriesFit
-from .series.realization import realize as realize
 from .validation.amplitude import (
     AmplitudeSweep as AmplitudeSweep,
     amplitude_sweep as amplitude_sweep,
