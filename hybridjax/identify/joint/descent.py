@@ -1,7 +1,7 @@
 """The damped descent of periodic models, in local coordinates that are chosen anew at each step."""
 
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Inexact
@@ -83,6 +83,7 @@ class Spread(NamedTuple):
         return half @ half.T
 
 
+@runtime_checkable
 class Problem(Protocol):
     """A sum of squares of `residuals` numbers, as a function of a model."""
 
