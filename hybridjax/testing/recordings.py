@@ -161,7 +161,7 @@ def spoil(
     rng = np.random.default_rng(seed)
     columns, trials = [recording.column(x) for x in signals], []
     for trial in recording.trials:
-        values, time = trial.values.copy(), trial.time
+        values, time = np.array(trial.values), trial.time
         y = values[:, columns]
         y = y + noise * rng.normal(size=y.shape)
         y = np.round(y / quantum) * quantum if quantum else y
