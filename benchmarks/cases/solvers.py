@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until

@@ -9,7 +9,6 @@ sections. `ratio` is how many times as long the biped takes.
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.engine.solver.tableau import method_of
 from hybridjax.experiments import campaign
 from hybridjax.experiments.campaign import Options, prepare
 
@@ -52,7 +51,7 @@ def _costs(show, case, options) -> dict[str, float]:
     prepared = prepare(cycle, placed, u, output, Options(discard=0, accuracy=ACCURACY))
     s, chart = placed.structure(), np.asarray(placed.lanes.chart)
     steps = np.ceil(np.asarray(placed.duration) / np.asarray(prepared.stepping.plan.h))
-    stages = [len(method_of(s, a).c) for a in chart]
+    stages = [len(s.method(a).c) for a in chart]
     work = u.size / SECTIONS * np.sum(steps * stages * np.array(s.dims)[chart])
     costs |= {"experiments.cpu": seconds.cpu, "experiments.nanoseconds": 1e9 * seconds.cpu / work}
     for key, value in costs.items():

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..errors import DefinitionError
+from ..identify.htf_errors import check_values, error_weights
 from ..identify.joint.frequency import transfer, transfer_slopes
 from ..identify.joint.model import (
     LocalCoordinates,
@@ -19,7 +20,6 @@ from ..identify.joint.model import (
     local_coordinates,
 )
 from ..identify.joint.realization import realize
-from ..identify.multipliers.error_weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs

@@ -1,7 +1,7 @@
 """Jacobians of recorded flow on the host: those of the moves on the tape, multiplied.
 
 The same derivatives as those of `replay`: of the Runge-Kutta step, of the crossing at its end (the
-saltation formula), and of the reset. Every move is linearized where the search left it, so that all
+saltation formula), and of the reset. Every move is linearized at its recorded start, so that all
 moves in a chart are done in one pass.
 """
 
@@ -11,18 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..systems.alike import Member
+from ..systems.kinds import Member
 from ..systems.structure import Structure
 from . import kernels
 from .lanes import Lanes
-from .solver.tableau import method_of
 from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
 from .target import Target
 from .watch import ChartFlow, slopes
 
 
 class _Moves(NamedTuple):
-    """Moves of any lanes, on the last axis: where they start, how far they go, how they end."""
+    """Moves of any lanes, on the last axis."""
 
     t: Float[np.ndarray, " M"]
     chart: Int[np.ndarray, " M"]
@@ -30,8 +29,8 @@ class _Moves(NamedTuple):
     h: Float[np.ndarray, " M"]
     code: Int[np.ndarray, " M"]
     lane: Int[np.ndarray, " M"]
-    turn: Int[np.ndarray, " M"]
-    """How many moves of the same lane come before."""
+    order: Int[np.ndarray, " M"]
+    """Number of moves of the same lane before this one."""
 
 
 class _Linear(NamedTuple):
@@ -52,24 +51,24 @@ def chain(
     """Derivatives of (t, q) at the end of a record by (t, q, u) at its start, at u = 0, or by q
     only; and (t, q) at the end.
 
-    With `across`, sizes of states by chart, for autonomous systems and targets at which the
-    direction of the flow means nothing: it is taken out of every move, so that nothing is drowned
-    in it, however strongly the flow contracts.
+    `across` holds sizes of states by chart, for autonomous systems and targets at which the
+    direction of the flow has no meaning: it is projected out of every move, so that it does not
+    drown the other directions, however strongly the flow contracts.
     """
     n, L = 1 + s.d, len(lanes.t)
     moves = _moves(lanes, tape)
-    found = _linear_moves(s, moves, target)
+    end, by = _linear_moves(s, moves, target)
     if across is not None:
-        found.by[:, :, 1:n] = found.by[:, :, 1:n] @ _across(s, moves, across)
+        by[:, :, 1:n] = by[:, :, 1:n] @ _across(s, moves, across)
     columns = np.tile(np.eye(n, n + s.nu), (L, 1, 1))
-    end = np.concatenate([lanes.t[None], lanes.q]).T
-    for turn in range(1 + max(moves.turn, default=-1)):
-        now = moves.turn == turn
-        lane, by = moves.lane[now], found.by[now]
-        columns[lane] = by[:, :, :n] @ columns[lane]
-        columns[lane, :, n:] += by[:, :, n:]
-        end[lane] = found.end[now]
-    return columns[:, :, 1:n] if of_states else columns, end.T
+    ends = np.concatenate([lanes.t[None], lanes.q]).T
+    for order in range(1 + max(moves.order, default=-1)):
+        now = moves.order == order
+        lane = moves.lane[now]
+        columns[lane] = by[now, :, :n] @ columns[lane]
+        columns[lane, :, n:] += by[now, :, n:]
+        ends[lane] = end[now]
+    return columns[:, :, 1:n] if of_states else columns, ends.T
 
 
 class Link(NamedTuple):
@@ -86,28 +85,28 @@ class Link(NamedTuple):
 def links(s: Structure, lanes: Lanes, target: Target, tape: Tape) -> list[Link]:
     """The moves of one lane."""
     moves = _moves(lanes, tape)
-    found, f, n = _linear_moves(s, moves, target), _fields(s, moves), 1 + s.d
-    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, found.by[:, :, :n], strict=True)]
+    by, f = _linear_moves(s, moves, target).by[:, :, : 1 + s.d], _fields(s, moves)
+    return [Link(*x) for x in zip(moves.chart.tolist(), f.T, by, strict=True)]
 
 
 def divergence(s: Structure, lanes: Lanes, tape: Tape) -> float:
     """The divergence of the field, integrated over the moves of one lane, up to their ends."""
     moves, total = _moves(lanes, tape), 0.0
     for a in np.unique(moves.chart):
-        here = moves.chart == a
-        t, q, h = moves.t[here], moves.q[: s.dims[a], here], moves.h[here]
+        in_chart = moves.chart == a
+        t, q, h = moves.t[in_chart], moves.q[: s.dims[a], in_chart], moves.h[in_chart]
         total += kernels.divergence(s, int(a), t, q, np.zeros((s.nu, 1)), h).sum()
     return total
 
 
 def _linear_moves(s: Structure, moves: _Moves, target: Target) -> _Linear:
     n, M = 1 + s.d, len(moves.t)
-    found = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
+    linear = _Linear(np.zeros((M, n)), np.zeros((M, n, n + s.nu)))
     for a in np.unique(moves.chart):
-        here = np.flatnonzero(moves.chart == a)
-        own = _linear(s, int(a), _Moves(*(x[..., here] for x in moves)), target)
-        found.end[here], found.by[here] = own
-    return found
+        in_chart = np.flatnonzero(moves.chart == a)
+        of_chart = _linear(s, int(a), _Moves(*(x[..., in_chart] for x in moves)), target)
+        linear.end[in_chart], linear.by[in_chart] = of_chart
+    return linear
 
 
 def _fields(s: Structure, moves: _Moves) -> Float[np.ndarray, "d M"]:
@@ -129,12 +128,12 @@ def _moves(lanes: Lanes, tape: Tape) -> _Moves:
     first = np.diff(lane, prepend=-1) > 0
     last = np.roll(row, 1)  # the move before, but for the first of a lane
     begins = np.flatnonzero(first)
-    turn = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
+    order = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
     return _Moves(
         np.where(first, lanes.t[lane], tape.t[last, lane]),
         np.where(first, lanes.chart[lane], tape.chart[last, lane]),
         np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
-        tape.h[row, lane], tape.code[row, lane], lane, turn,
+        tape.h[row, lane], tape.code[row, lane], lane, order,
     )  # fmt: skip
 
 
@@ -161,9 +160,9 @@ def _linear(s: Structure, a: int, moves: _Moves, target: Target) -> _Linear:
     if len(lands):
         point = t[lands], q[:, lands], f[:, lands]
         flow = ChartFlow(s, a, u[:, lands], dataclasses.replace(target, index=index[lands]))
-        settled = flow.settle(*point, which[lands])
-        t[lands] += settled.past
-        q[:, lands] = settled.q
+        zero = flow.locate(*point, which[lands])
+        t[lands] += zero.past
+        q[:, lands] = zero.q
         f = kernels.field(s, a, t[lands], q[:, lands], u[:, lands])[:, 0].T[:, :, None]
         rows = kernels.watched(
             s, a, target.levels, t[lands], q[:, lands], u[:, lands], index[lands]
@@ -203,10 +202,10 @@ def _step(s: Structure, a: int, t, q, u, h):
     the start, and the field (n, M) at the end."""
     n, M = q.shape
     m = 2 + n + s.nu
-    method = method_of(s, a)
+    method = s.method(a)
     if method.implicit:
-        found = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
-        return found[:, :, 0].T, found[:, :, 2:], found[:, :, 1].T
+        expanded = np.array(np.moveaxis(kernels.linear_step(s, a, t, q, u, h), -1, 0))
+        return expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
     stages = len(method.b) + 1
     K, dK = np.zeros((stages, n, M)), np.zeros((stages, M, n, m))
     straight = np.zeros((M, n, m))

@@ -1,4 +1,4 @@
-"""A system in words and digests, by which stored results are known again."""
+"""The description of a system, by words and digests, that stored results carry."""
 
 import inspect
 from collections.abc import Callable
@@ -21,36 +21,23 @@ def describe(system: HybridSystem) -> dict[str, Any]:
 
     If a function calls back into Python, the source of the class stands for all functions.
     """
-    return {
-        "class": type(system).__qualname__,
-        "numbers": _numbers(system),
-        "functions": _functions(system),
-    }
-
-
-def _numbers(system: HybridSystem) -> dict[str, Any]:
-    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(system, eqx.is_array))[0]
-    return {
-        ".".join(str(getattr(x, "name", x)) for x in path): float(leaf)
-        if np.ndim(leaf) == 0
-        else array_digest(leaf)
-        for path, leaf in leaves
-    }
+    numbers = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array)):
+        name = ".".join(str(getattr(x, "name", x)) for x in path)
+        numbers[name] = float(leaf) if np.ndim(leaf) == 0 else array_digest(leaf)
+    functions = _functions(system)
+    return {"class": type(system).__qualname__, "numbers": numbers, "functions": functions}
 
 
 def _functions(system: HybridSystem) -> dict[str, str]:
-    arrays, static = eqx.partition(system, eqx.is_array)
-    numbers, structure = jax.tree_util.tree_flatten(arrays)
-    s, real = Structure(system), jnp.result_type(float)
+    arrays, static = eqx.partition(Structure(system), eqx.is_array)
+    s, real = eqx.combine(arrays, static), jnp.result_type(float)
 
     def digest(a: int, function: Callable) -> str:
-        """Of `function(structure, t, q, u)` at a point of chart a."""
-
-        def run(numbers, *point):
-            return function(Structure(eqx.combine(structure.unflatten(numbers), static)), *point)
-
+        """A digest of `function(structure, t, q, u)` at a point of chart a."""
         shapes = [jax.ShapeDtypeStruct(x, real) for x in ((), (s.dims[a],), (s.nu,))]
-        return program_digest(run, numbers, *shapes)
+        run = lambda arrays, *point: function(eqx.combine(arrays, static), *point)  # noqa: E731
+        return program_digest(run, arrays, *shapes)
 
     digests = {}
     try:

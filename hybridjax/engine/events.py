@@ -1,4 +1,4 @@
-"""What happens at events: resets, arming, schedules, and the signs of Zeno."""
+"""Events: arming of guards, resets, schedules, and the accumulation of events (Zeno)."""
 
 import jax
 import jax.numpy as jnp
@@ -8,58 +8,50 @@ from jaxtyping import Bool, Float, Int
 from .._core.executor import Array, cond, namespace, on_host, put, stop_gradient
 from .._core.lanes import put_rows
 from .._core.precision import at_precision
-from ..systems.alike import Kind, Member
+from ..systems.kinds import Kind, Member
 from ..systems.structure import Structure, stacked
 from ..systems.transition import Scheduled
 from . import kernels
+from .arrays import Index, Inputs, Mask, Padded, States, Times
 from .lanes import Lanes, for_each_chart, needed, only
 from .settings import ROUNDING
 from .watch import Watch
 
 
-# A watched function counts as zero if its rate would have made its value in this part of the time
-# allowed (in double and in single precision). Twice as much: events that follow each other within
-# it are taken for one.
+# Parts of the time allowed (in double and in single precision).
+# An instant: shorter steps are not taken, and landings may lie beyond a step by as much. Higher:
+# lanes are given up earlier. Lower: they are given up after many useless halvings.
+INSTANT = 1e-13, 1e-6
+# A watched function counts as zero if its rate would have made its value in this time. Higher:
+# separate events are taken for simultaneous ones. Lower: simultaneous ones for separate ones.
 ZERO = 1e-12, 1e-6
-# Times of a schedule are equal if they differ by less than this part of its period (in double and
-# in single precision). Twice as much: a piece of flow that ends so shortly before an event has it.
-_SAME_TIME = 1e-11, 1e-5
-# Zeno: this many intervals between events in a row shrink, and what is to come of them (as a
-# geometric series) is at most this part of what was. Twice as many intervals, or half the part, and
-# it is seen later.
+# A target's level counts once it is above the change that its rate makes in this time. Higher: a
+# level that falls right after the start is missed. Lower: one that was zero up to rounding is met.
+LEVEL_CLEAR = 1e-10, 1e-6
+# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
+# steps if they differ by less than it. Higher: a piece of flow that ends shortly before an event
+# has it. Lower: an event happens twice, or a step of rounding errors is taken.
+SAME_TIME = 1e-11, 1e-5
+# Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
+# intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
+# lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
-# An interval between events shrinks if it is at most this part of the last one. Nearer to 1, a
-# long transient of a stable bouncing could be taken for Zeno.
+# An interval between events shrinks if it is at most this part of the last one. Nearer to 1: a
+# long transient of a stable bouncing is taken for Zeno. Farther: slow accumulation is missed.
 _ZENO_SHRINKS = 0.999
-# A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno too.
-# Twice as many: some of these are called grazing instead.
+# A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno, too.
+# Higher: it is called grazing instead. Lower: a grazing is called Zeno.
 _ZENO_SLOW = 3
 
 
-def start_lanes(
-    s: Structure,
-    t: Float[Array, " L"],
-    chart: Int[Array, " L"],
-    q: Float[Array, "d L"],
-) -> Lanes:
-    """Lanes with fresh bookkeeping. No guard is armed yet: that is done where they set out."""
-    L = t.shape[0]
-    xp = namespace(t)
-    pace = xp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), dtype=float)
-    armed = xp.asarray(np.zeros((len(s.transitions), L), bool))
-    return Lanes(t, chart, q, armed, xp.asarray(np.zeros(L, np.int32)), pace)
-
-
-def width(
-    t: Float[Array, " #L"], span: Float[Array, " L"], rate: Float[Array, "W L"]
-) -> Float[Array, "W L"]:
-    """Values of watched functions that count as zero: what their rates make of rounding errors."""
+def width(t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]) -> Float[Array, "W L"]:
+    """Values of watched functions that count as zero: their change in a time of rounding errors."""
     zero, rounding = at_precision(*ZERO), at_precision(*ROUNDING)
     xp = namespace(rate)
     return (zero * span + rounding * xp.abs(t)) * xp.abs(rate)
 
 
-def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> Lanes:
+def arm(s: Structure, lanes: Lanes, seen: Watch, span: Times) -> Lanes:
     """Arm the guards that are positive at the beginning of a piece of flow.
 
     A guard that its input, which may have jumped, makes negative is crossed by no motion: it is
@@ -67,11 +59,11 @@ def arm(s: Structure, lanes: Lanes, seen: Watch, span: Float[Array, " L"]) -> La
     """
     zero = width(lanes.t, span, seen.rate)
     armed = (lanes.armed & (seen.value >= -zero)[:-1]) | (seen.value > zero)[:-1]
-    return lanes._replace(armed=armed & mine(s, lanes.chart)[:-1])
+    return lanes._replace(armed=armed & _belongs(s, lanes.chart)[:-1])
 
 
-def mine(s: Structure, chart: Int[Array, " L"]) -> Bool[Array, "W L"]:
-    """Which rows of a `Watch` belong to the chart of each lane (the target's row to all)."""
+def _belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
+    """Whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
     source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)
 
@@ -80,31 +72,29 @@ def rearm(
     s: Structure,
     lanes: Lanes,
     seen: Watch,
-    fired: Int[Array, " L"],
-    together: Bool[Array, " L"],
-    span: Float[Array, " L"],
-    u: Float[Array, "nu L"],
-    residue: Float[Array, " L"],
+    fired: Index,
+    together: Mask,
+    span: Times,
+    u: Inputs,
+    residue: Times,
 ) -> Lanes:
     """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
-    A guard that is zero there, up to rounding and to the `residue` that the guard that fired was
-    left with, waits until it has left zero. The one exception are events at the
-    same instant: where another guard of the old chart was at its zero too (`together`), a guard
-    other than the one that fired, at zero and falling, is still due.
+    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
+    until it has left zero. The one exception are events at the same instant: where another guard of
+    the old chart was at its zero, too (`together`), a guard other than the one that fired, at zero
+    and falling, is still due.
     """
     xp, value, rate = namespace(fired), seen.value[:-1], seen.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     due = together & other & (xp.abs(value) <= zero) & (rate < 0)
-    armed = ((value > zero) | due) & mine(s, lanes.chart)[:-1]
+    armed = ((value > zero) | due) & _belongs(s, lanes.chart)[:-1]
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
-def _noise(
-    s: Structure, lanes: Lanes, u: Float[Array, "nu L"], mask: Bool[Array, " L"]
-) -> Float[Array, "G L"]:
+def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G L"]:
     """A bound on the rounding errors of the guards of the charts that lanes are in."""
 
     def work(a, here, out):
@@ -122,29 +112,24 @@ def _noise(
     return for_each_chart(s, lanes.chart, mask, work, nothing)
 
 
-def _guard_rounding(
-    s: Structure, a: int, t: Float[Array, " L"], q: Float[Array, "n L"], u: Float[Array, "nu L"]
-) -> Float[Array, "g L"]:
-    """The change of the guards of chart a by changes of times and states relative to them, whatever
-    the signs of these."""
-
+def _guard_rounding(s: Structure, a: int, t: Times, q: States, u: Inputs) -> Float[Array, "g L"]:
+    """A bound on the change of the guards of chart a by relative changes of time and states."""
     if on_host(t):
         slopes = kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))[:, 1 : 2 + len(q)]
         return np.sum(np.abs(slopes * np.concatenate([t[None], q])), axis=1)
-
     kinds = s.guard_kinds(a)
 
-    def one(s, t, q, u):
+    def bound(s, t, q, u):
         guards = lambda t, q: stacked(s.guard_values(kinds, t, q, u))  # noqa: E731
         by_t, by_q = jax.jacfwd(guards, (0, 1))(t, q)
         return jnp.abs(by_t * t) + jnp.abs(by_q) @ jnp.abs(q)
 
-    return s.by_lane(one)(t, q, u)
+    return s.by_lane(bound)(t, q, u)
 
 
 def apply_resets(
-    s: Structure, t, chart, q, u: Float[Array, "nu L"], fired: Int[Array, " L"]
-) -> tuple[Float[Array, "d L"], Int[Array, " L"]]:
+    s: Structure, t: Times, chart: Index, q: Padded, u: Inputs, fired: Index
+) -> tuple[Padded, Index]:
     """States and charts after the transitions `fired` (-1: none)."""
     for kind in s.kinds:
         transition = s.transitions[kind[0]]
@@ -158,9 +143,8 @@ def apply_resets(
             if on_host(q):
                 new = kernels.reset(s, Member(kind, place), *point, here)[:, 0]
             else:
-                own = Structure(needed(here, s.source))
-                reset = own.by_lane(lambda s, t, q, u, k: s.reset(Member(kind, k), t, q, u))
-                new = reset(*needed(here, point), place)
+                reset = lambda s, t, q, u, k: s.reset(Member(kind, k), t, q, u)  # noqa: E731
+                new = needed(here, s).by_lane(reset)(*needed(here, point), place)
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
             return xp.where(here, new, q), xp.where(here, b, chart)
 
@@ -168,7 +152,7 @@ def apply_resets(
     return q, chart
 
 
-def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]:
+def enabled(s: Structure, t: Times, q: Padded, u: Inputs, which: Index) -> Mask:
     """Whether the predicates of the transitions `which` hold; True where there is none."""
     xp = namespace(t)
     out = xp.ones(t.shape, bool)
@@ -181,14 +165,14 @@ def enabled(s: Structure, t, q, u, which: Int[Array, " L"]) -> Bool[Array, " L"]
             if on_host(t):
                 holds = kernels.enabled(s, Member(kind, place), *point)
             else:
-                one = lambda s, t, q, u, k, kind=kind: s.enabled(Member(kind, k), t, q, u)  # noqa: E731
-                holds = s.by_lane(one)(*point, place)
+                of = lambda s, t, q, u, k, kind=kind: s.enabled(Member(kind, k), t, q, u)  # noqa: E731
+                holds = s.by_lane(of)(*point, place)
             out = xp.where(here, holds, out)
     return out
 
 
-def _within(kind: Kind, g: Int[Array, " L"]) -> tuple[Bool[Array, " L"], Int[Array, " #L"]]:
-    """Which of the transitions g (-1: none) are of a kind, and their places there (else 0)."""
+def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
+    """Whether the transitions g (-1: none) are of a kind, and their indices there (else 0)."""
     xp = namespace(g)
     if len(kind) == 1:
         return g == kind[0], xp.asarray(np.zeros(1, np.int32))
@@ -198,15 +182,13 @@ def _within(kind: Kind, g: Int[Array, " L"]) -> tuple[Bool[Array, " L"], Int[Arr
     return place >= 0, xp.maximum(place, 0)
 
 
-def next_schedule(
-    s: Structure, t: Float[Array, " L"], chart: Int[Array, " L"], end: Float[Array, " L"]
-) -> tuple[Float[Array, " L"], Int[Array, " L"]]:
+def next_schedule(s: Structure, t: Times, chart: Index, end: Times) -> tuple[Times, Index]:
     """Time of the next scheduled event after t (infinity if there is none), and its transition.
 
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
     at `end` happens at `end`.
     """
-    xp, tie = namespace(t), at_precision(*_SAME_TIME)
+    xp, tie = namespace(t), at_precision(*SAME_TIME)
     best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
@@ -219,9 +201,7 @@ def next_schedule(
     return best, which
 
 
-def scheduled_time(
-    s: Structure, fired: Int[Array, " L"], t: Float[Array, " L"]
-) -> Float[Array, " L"]:
+def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
     """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
     its period and offset; t itself for other events."""
     xp, time = namespace(t), t
@@ -234,12 +214,10 @@ def scheduled_time(
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"],
-    moved: Float[Array, " L"],
-    event: Bool[Array, " L"],
-    slow: Bool[Array, " L"],
-) -> tuple[Float[Array, "4 L"], Bool[Array, " L"]]:
-    """Bookkeeping for Zeno: do the intervals between events shrink with a sum that converges?
+    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask
+) -> tuple[Float[Array, "4 L"], Mask]:
+    """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
+    shrink with a sum that converges.
 
     `slow` marks events whose guard is crossed at a vanishing speed.
     """
@@ -249,8 +227,8 @@ def keep_pace(
     shrinks = ratio < _ZENO_SHRINKS
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
-    rest = since * ratio / (1 - xp.minimum(ratio, _ZENO_SHRINKS))
-    zeno = (streak >= _ZENO_STREAK) & (rest <= _ZENO_REST * total)
+    to_come = since * ratio / (1 - xp.minimum(ratio, _ZENO_SHRINKS))
+    zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap, since = xp.where(event, since, gap), xp.where(event, 0.0, since)
     return xp.stack([since, gap, streak, total]), zeno

@@ -1,22 +1,26 @@
 """Jacobians of the flow between targets, for many lanes in one call."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from .._core.executor import Array, namespace, on_host
 from .._core.lanes import vmap_to_lanes
 from ..systems.structure import Structure
+from .arrays import Index, Times
 from .chain import chain
 from .lanes import Lanes, constant
-from .move import record, retrace
+from .move import record
+from .replay import replay
 from .search.search import Moved
 from .settings import Settings
 from .tape import Tape
 from .target import Target
+
+
+Jacobians = Float[Array, "L n m"]
+Wanted = Bool[Array, ""] | bool
 
 
 def flow_jacobian(
@@ -24,12 +28,12 @@ def flow_jacobian(
     lanes: Lanes,
     target: Target,
     settings: Settings,
-    h: Float[Array, " L"] | None = None,
-    result: Int[Array, " L"] | None = None,
+    h: Times | None = None,
+    result: Index | None = None,
     of_states: bool = False,
     new_input: bool = True,
-    wanted: Bool[Array, ""] | bool = True,
-) -> tuple[Float[Array, "L n m"], Moved, Tape]:
+    wanted: Wanted = True,
+) -> tuple[Jacobians, Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
     respect to q only (`of_states`). If it is not `wanted`, zeros: only the flow is computed then.
 
@@ -40,17 +44,14 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     u = namespace(lanes.t).zeros((s.nu, lanes.t.shape[0]))
-    still, begin, end = s, lanes, target
-    if not on_host(lanes.t):
-        source, begin, end = constant((s.source, lanes, target))
-        still = Structure(source)
-    moved, tape = record(still, begin, u, end, settings, h, result, new_input, tangents=wanted)
+    fixed = (s, lanes, target) if on_host(lanes.t) else constant((s, lanes, target))
+    still, start, goal = fixed
+    moved, tape = record(still, start, u, goal, settings, h, result, new_input, tangents=wanted)
+    assert tape is not None
     jacobian, end = tape_jacobian(s, lanes, target, tape, of_states, wanted)
     if wanted is not True:
         end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
-    ends = moved.lanes._replace(t=end[0], q=end[1:])
-    moved = moved._replace(lanes=ends)
-    return jacobian, moved, tape
+    return jacobian, moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])), tape
 
 
 def tape_jacobian(
@@ -59,27 +60,25 @@ def tape_jacobian(
     target: Target,
     tape: Tape,
     of_states: bool = False,
-    wanted: Bool[Array, ""] | bool = True,
+    wanted: Wanted = True,
     across: Float[Array, "A d"] | None = None,
-) -> tuple[Float[Array, "L n m"], Float[Array, "n L"]]:
-    """What `flow_jacobian` returns, for a flow whose record is there already: the Jacobians, and
-    (t, q) at the targets; both are zeros if they are not `wanted`. `across`: see `chain`; traced,
-    it makes no difference."""
+) -> tuple[Jacobians, Float[Array, "n L"]]:
+    """The Jacobians of `flow_jacobian` for a recorded flow, and (t, q) at the targets; both are
+    zeros if they are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
-    columns, end = _push(s.source, lanes, target, tape, of_states, wanted)
+    columns, end = _push(s, lanes, target, tape, of_states, wanted)
     return columns.transpose(2, 1, 0), end
 
 
-def _columns(system, lanes, target, tape, of_states):
+def _columns(s, lanes, target, tape, of_states):
     """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
-    s = Structure(system)
     L, d = lanes.t.shape[0], s.d
     n = 1 + d + s.nu
 
     def flow(x):
         start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
-        t, q = retrace(s, start, x[1 + d :], target, tape)
+        t, q = replay(s, start, x[1 + d :], target, tape)
         return jnp.concatenate([t[None], q])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
@@ -91,25 +90,24 @@ def _columns(system, lanes, target, tape, of_states):
 
 
 @eqx.filter_custom_jvp
-def _push(system, lanes, target, tape, of_states, wanted):
+def _push(s, lanes, target, tape, of_states, wanted):
     """`_columns` where they are wanted, with the axes that `jax.vmap` maps as more lanes."""
-    bare = dataclasses.replace(target, levels=None)
 
-    def run(common, lane):
-        system, levels, wanted = common
-        lanes, target, tape = lane
-        target = dataclasses.replace(target, levels=levels)
+    def run(common, by_lane):
+        source, levels, wanted = common
+        lanes, target, tape = by_lane
 
         def columns():
-            return _columns(system, lanes, target, tape, of_states)
+            return _columns(Structure(source), lanes, target.with_levels(levels), tape, of_states)
 
-        def nothing():
+        def zeros():
             shapes = jax.eval_shape(columns)
             return jax.tree_util.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-        return columns() if wanted is True else jax.lax.cond(wanted, columns, nothing)
+        return columns() if wanted is True else jax.lax.cond(wanted, columns, zeros)
 
-    return vmap_to_lanes(run)((system, target.levels, wanted), (lanes, bare, tape))
+    target, levels = target.split()
+    return vmap_to_lanes(run)((s.source, levels, wanted), (lanes, target, tape))
 
 
 @_push.def_jvp

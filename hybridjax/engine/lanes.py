@@ -6,31 +6,40 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float
 
 from .._core.executor import Array, cond, lane, namespace, on_host
 from ..systems.structure import Structure
+from .arrays import Index, Mask, Padded, Times
 
 
 class Lanes(NamedTuple):
     """L hybrid states. States are padded with zeros to the largest chart's dimension d."""
 
-    t: Float[Array, " L"]
-    chart: Int[Array, " L"]
-    q: Float[Array, "d L"]
+    t: Times
+    chart: Index
+    q: Padded
     armed: Bool[Array, "G L"]
     """Which transitions (rows, by index) would fire at their guard's next falling zero."""
-    events: Int[Array, " L"]
+    events: Index
     """Number of events so far."""
     pace: Float[Array, "4 L"]
     """For Zeno: time since the last event, the last interval between events, number of intervals
     in a row that shrank, and their sum."""
 
 
-def for_each_chart(
-    s: Structure, chart: Int[Array, " L"], mask: Bool[Array, " L"], work: Callable, out
-):
-    """Let every chart that some lane of `mask` is in update `out` by `work(a, lanes_in_a, out)`.
+def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
+    """Lanes before their first step. No guard is armed yet: the search does that."""
+    L = t.shape[0]
+    xp = namespace(t)
+    pace = xp.asarray(np.repeat([[0.0], [np.inf], [0.0], [0.0]], L, axis=1), dtype=float)
+    armed = xp.asarray(np.zeros((len(s.transitions), L), bool))
+    return Lanes(t, chart, q, armed, xp.asarray(np.zeros(L, np.int32)), pace)
+
+
+def for_each_chart(s: Structure, chart: Index, mask: Mask, work: Callable, out):
+    """Update `out` by `work(a, lanes_in_a, out)` for every chart a that has lanes of `mask`.
 
     Charts without lanes cost nothing: the branch is on a scalar of the whole batch. The branch
     also keeps XLA from computing its contents once for every use of its results.
@@ -45,7 +54,7 @@ def for_each_chart(
     return out
 
 
-def only(mask: Bool[Array, " L"], x: Array) -> Array:
+def only(mask: Mask, x: Array) -> Array:
     """`x`, with the lanes outside `mask` replaced by one lane of it; itself if it is one for all.
 
     A chart's functions are thus never evaluated at another chart's states, where they might be
@@ -64,7 +73,7 @@ def constant(tree):
     )
 
 
-def needed(mask: Bool[Array, " L"], tree):
+def needed(mask: Mask, tree):
     """`tree` itself, without derivatives if `mask` has no lanes.
 
     Where `jax.vmap` maps a branch, both of its sides are computed, the one that is not taken with

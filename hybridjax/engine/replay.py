@@ -1,7 +1,7 @@
-"""Differentiable flow: the moves on a tape, repeated.
+"""Differentiable flow: the moves on a tape, integrated again.
 
-What a search decided (step sizes, the order of events) is fixed here; only smooth arithmetic is
-left, so that this function has exact derivatives in forward and reverse mode. The times of
+The decisions of a search (step sizes, the order of events) are fixed here; only smooth arithmetic
+is left, so that this function has exact derivatives in forward and reverse mode. The times of
 crossings follow from two Newton steps on the true guard, which is the saltation formula.
 """
 
@@ -10,34 +10,28 @@ import functools as ft
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
 
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
+from .arrays import Index, Inputs, Mask, Padded, Times
 from .events import apply_resets, scheduled_time
 from .lanes import Lanes, constant, for_each_chart, needed, only
-from .solver import take_step
-from .solver.step import Step
-from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE
+from .runge_kutta import Step, take_step
+from .tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, Tape
 from .target import Target
 from .watch import ChartFlow
 
 
-# Rows of a tape that are skipped, or computed again by reverse mode, together. Twice as many: half
-# the states that reverse mode keeps, and up to 15 empty rows that are looked at.
+# Rows of a tape that are skipped, or computed again by reverse mode, together. Higher: empty rows
+# are computed. Lower: reverse mode stores more states.
 _BLOCK = 16
 
 
 def replay(
-    s: Structure,
-    lanes: Lanes,
-    u: Float[Array, "nu L"],
-    target: Target,
-    h: Float[Array, "R L"],
-    code: Int[Array, "R L"],
-    unroll: bool = False,
-) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
-    """Times and states at the end of the moves `h` with outcomes `code` (see `Tape`)."""
+    s: Structure, lanes: Lanes, u: Inputs, target: Target, tape: Tape, unroll: bool = False
+) -> tuple[Times, Padded]:
+    """Times and states at the end of a recorded piece of flow, differentiable."""
+    h, code = tape.h, tape.code
     scheduled = jnp.array([isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False])
 
     def row(carry, row):
@@ -50,7 +44,9 @@ def replay(
             h1 = jnp.where(code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h))
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock, -1, which)
-            t, q = _advance(s, t, q, chart, code != IDLE, u, target, h1, which, unroll)
+            begin = lanes._replace(t=t, q=q, chart=chart)
+            moving = code != IDLE
+            t, q = _advance(s, begin, moving, u, target, h1, which, unroll)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
@@ -73,26 +69,25 @@ def replay(
 
 def _advance(
     s: Structure,
-    t: Float[Array, " L"],
-    q: Float[Array, "d L"],
-    chart: Int[Array, " L"],
-    moves: Bool[Array, " L"],
-    u: Float[Array, "nu L"],
+    lanes: Lanes,
+    moving: Mask,
+    u: Inputs,
     target: Target,
-    h: Float[Array, " L"],
-    which: Int[Array, " L"],
+    h: Times,
+    which: Index,
     unroll: bool,
-) -> tuple[Float[Array, " L"], Float[Array, "d L"]]:
+) -> tuple[Times, Padded]:
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
+    t, q, chart = lanes.t, lanes.q, lanes.chart
 
     def work(a, here, out):
         t_out, q_out = out
         n = s.dims[a]
-        own, levels = needed(here, (s.source, target.levels))
+        system, levels = needed(here, (s, target.levels))
         goal = dataclasses.replace(target, levels=levels, index=only(here, target.index))
         t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
-        flow = ChartFlow(Structure(own), a, u0, goal)
-        still = ChartFlow(Structure(constant(own)), a, constant(u0), goal)
+        flow = ChartFlow(system, a, u0, goal)
+        still = ChartFlow(constant(system), a, constant(u0), goal)
         crossing = jnp.where(here, which, -1)
         # (A branch of its own, lest XLA masks the states again in every stage.)
         step = jax.lax.cond(
@@ -103,11 +98,11 @@ def _advance(
         q1, t1 = step.q, t0 + h0
 
         def land():
-            settled = flow.settle(t1, q1, step.f1, crossing)
-            return t1 + settled.past, settled.q
+            zero = flow.locate(t1, q1, step.f1, crossing)
+            return t1 + zero.past, zero.q
 
         if flow.rows:
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
         return jnp.where(here, t1, t_out), q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
 
-    return for_each_chart(s, chart, moves, work, (t, q))
+    return for_each_chart(s, chart, moving, work, (t, q))

@@ -17,7 +17,7 @@ from .._core.text import fields
 from ..errors import DefinitionError
 from ..systems.solver import Solver, solvers
 from ..systems.system import HybridSystem, integrated
-from .solver.step import Step
+from .runge_kutta import Step
 
 
 # Default accuracies: the error that one step may have, relative to the size of each state. A tenth
@@ -87,7 +87,8 @@ class Settings(eqx.Module):
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = map(_kept, (rtol, atol, scale))
-        self.max_steps, self.solver = max_steps, solver if solver == "auto" else solvers(solver)
+        self.max_steps = max_steps
+        self.solver = solver if isinstance(solver, str) else solvers(solver)
 
     def filled(self, accuracy: float) -> "Settings":
         """With this accuracy where none is given."""

@@ -1,25 +1,24 @@
-"""The record of a search: what was done with every lane."""
+"""The records of a search: the tape of all steps, and the log of events."""
 
 from typing import NamedTuple
 
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, namespace, on_host, put
+from .._core.executor import Array, cond, namespace, on_host, put
 from .lanes import Lanes
 
 
-# Codes on a tape. Codes >= 0 name the transition that fires at the end of a move.
-IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = -4, -3, -2, -1
+# Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
+IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = range(-4, 0)
 
 
 class Tape(NamedTuple):
-    """What was done, one row per iteration and one column per lane. Without its first axis: one
-    row."""
+    """The moves, one row per iteration and one column per lane. Without its first axis: one row."""
 
     h: Float[Array, "R L"]
     """Length of the move."""
     code: Int[Array, "R L"]
-    """How it ended: IDLE (no move), MOVE, ARRIVE_TIME, ARRIVE_LEVEL, or a transition's index."""
+    """Its end: IDLE (no move), MOVE, ARRIVE_TIME, ARRIVE_LEVEL, or a transition's index."""
     t: Float[Array, "R L"]
     """Time at the end of the move."""
     before: Float[Array, "R d L"]
@@ -31,16 +30,11 @@ class Tape(NamedTuple):
 
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
-    """A tape on which nothing is written yet."""
+    """A tape without moves."""
     xp, (d, L) = namespace(lanes.q), lanes.q.shape
-    return Tape(
-        xp.zeros((rows, L)),
-        xp.full((rows, L), IDLE, xp.int32),
-        xp.zeros((rows, L)),
-        xp.zeros((rows, d, L)),
-        xp.zeros((rows, d, L)),
-        xp.zeros((rows, L), xp.int32),
-    )
+    times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
+    code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
+    return Tape(times(), code, times(), states(), states(), chart)
 
 
 def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
@@ -50,3 +44,37 @@ def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
             x[i] = y
         return tape
     return Tape(*(put(x, i, y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))
+
+
+class EventLog(NamedTuple):
+    """The first K events of each lane in a piece of flow, in order. (Times have no derivatives.)
+
+    Where more than K happened, `count` is larger than K, and the log lacks the later ones. An event
+    that made its lane fail is in the log, too.
+    """
+
+    time: Float[Array, "K L"]
+    """NaN where there is none."""
+    event: Int[Array, "K L"]
+    """The transition's index; -1 where there is none."""
+    count: Int[Array, " L"]
+    """Number of events."""
+
+
+def blank_log(size: int, lanes: Lanes) -> EventLog:
+    """A log for `size` events of each lane, still without any."""
+    xp, L = namespace(lanes.t), lanes.t.shape[0]
+    events = xp.full((size, L), -1, xp.int32)
+    return EventLog(xp.full((size, L), xp.nan), events, xp.zeros(L, xp.int32))
+
+
+def log_events(log: EventLog, row: Tape) -> EventLog:
+    """The log, with the events of one row of a tape."""
+    xp, fired = namespace(row.code), row.code >= 0
+
+    def write():
+        here = fired & (xp.arange(len(log.time))[:, None] == log.count)
+        time = xp.where(here, row.t, log.time)
+        return EventLog(time, xp.where(here, row.code, log.event), log.count + fired)
+
+    return cond(fired.any(), write, lambda: log)

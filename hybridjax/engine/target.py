@@ -1,6 +1,7 @@
 """Where a piece of flow ends: at a time, at the zero of a level function, or at an event."""
 
 import abc
+import dataclasses
 
 import equinox as eqx
 from jaxtyping import Float, Int
@@ -41,11 +42,18 @@ class Target(eqx.Module):
     limit: Float[Array, " L"]
     """Give up at this time."""
     event_sequence: tuple[int, ...] | None = eqx.field(static=True)
-    """Transitions expected on one turn of the limit cycle, counted from the first event after
-    the start; `None` if any order will do."""
+    """Transitions on one period of the limit cycle, from the first event after the start on; `None`
+    if any order will do."""
     levels: AbstractLevels | PerLane | None
     missed: Result = eqx.field(static=True)
     """The code of a lane that does not arrive."""
+
+    def split(self) -> tuple["Target", AbstractLevels | PerLane | None]:
+        """The part that belongs to lanes, and the level functions, which all of them share."""
+        return dataclasses.replace(self, levels=None), self.levels
+
+    def with_levels(self, levels: AbstractLevels | PerLane | None) -> "Target":
+        return dataclasses.replace(self, levels=levels)
 
 
 def toward(

@@ -176,7 +176,7 @@ def add_noise(
     if np.shape(std) not in ((), (ny,), (N, ny)):
         raise DefinitionError(
             f"`std` must be one number or {ny}, one for each output, or of shape ({N}, {ny}), not "
-            f"{std}."
+            f"of shape {np.shape(std)}."
         )
     white = np.random.default_rng(seed).normal(size=data.y.shape)
     each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])

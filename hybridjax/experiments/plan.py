@@ -20,7 +20,7 @@ from .._core.memo import Memory
 from .._core.results import Result
 from ..engine.jacobian import tape_jacobian
 from ..engine.move import move
-from ..engine.search.stride import Stride
+from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..engine.watch import watch
 from ..errors import ComputationError

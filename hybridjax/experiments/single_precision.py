@@ -14,7 +14,7 @@ from .._core.memo import Memory
 from .._core.precision import single, single_precision
 from .._core.results import Result
 from ..engine.move import move
-from ..engine.search.stride import Stride
+from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..sections.placed import PlacedSections

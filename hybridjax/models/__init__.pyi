@@ -1,26 +1,36 @@
-from .ball import BouncingBall as BouncingBall
-from .bar import TwoLeggedBar as TwoLeggedBar
-from .chain import BouncingChain as BouncingChain
-from .compliant import CompliantHopper as CompliantHopper
-from .converters.buck import BuckConverter as BuckConverter
-from .converters.cuk import CukConverter as CukConverter
-from .hopper import VerticalHopper as VerticalHopper
-from .juggler import PaddleJuggler as PaddleJuggler
-from .neurons.adex import AdExNeuron as AdExNeuron
-from .neurons.izhikevich import IzhikevichNeuron as IzhikevichNeuron
-from .oscillators.belt import BeltOscillator as BeltOscillator
-from .oscillators.chua import ChuaCircuit as ChuaCircuit
-from .oscillators.duffing import Duffing as Duffing
-from .oscillators.fitzhugh import FitzHughNagumo as FitzHughNagumo
-from .oscillators.flap import RotorFlap as RotorFlap
-from .oscillators.hopf import HopfOscillator as HopfOscillator
-from .oscillators.mathieu import Mathieu as Mathieu
-from .oscillators.vanderpol import VanDerPol as VanDerPol
-from .pair import HopperPair as HopperPair
-from .slip import SLIPRunner as SLIPRunner
-from .trot import TrottingQuadruped as TrottingQuadruped
-from .walkers.biped import FiveLinkBiped as FiveLinkBiped
-from .walkers.compass import CompassGait as CompassGait
-from .walkers.torso_walker import TorsoWalker as TorsoWalker
-from .walkers.walker import SimplestWalker as SimplestWalker
-from .walkers.wheel import RimlessWheel as RimlessWheel
+from .balls import (
+    BouncingBall as BouncingBall,
+    BouncingChain as BouncingChain,
+    PaddleJuggler as PaddleJuggler,
+)
+from .bipeds import FiveLinkBiped as FiveLinkBiped, TorsoWalker as TorsoWalker
+from .converters import BuckConverter as BuckConverter, CukConverter as CukConverter
+from .hoppers import (
+    CompliantHopper as CompliantHopper,
+    HopperPair as HopperPair,
+    VerticalHopper as VerticalHopper,
+)
+from .neurons import (
+    AdExNeuron as AdExNeuron,
+    FitzHughNagumo as FitzHughNagumo,
+    IzhikevichNeuron as IzhikevichNeuron,
+)
+from .oscillators import (
+    BeltOscillator as BeltOscillator,
+    ChuaCircuit as ChuaCircuit,
+    Duffing as Duffing,
+    HopfOscillator as HopfOscillator,
+    Mathieu as Mathieu,
+    RotorFlap as RotorFlap,
+    VanDerPol as VanDerPol,
+)
+from .runners import (
+    SLIPRunner as SLIPRunner,
+    TrottingQuadruped as TrottingQuadruped,
+    TwoLeggedBar as TwoLeggedBar,
+)
+from .walkers import (
+    CompassGait as CompassGait,
+    RimlessWheel as RimlessWheel,
+    SimplestWalker as SimplestWalker,
+)

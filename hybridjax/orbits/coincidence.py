@@ -22,7 +22,7 @@ from .._core.executor import to_host
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.chain import chain
-from ..engine.events import start_lanes
+from ..engine.lanes import start_lanes
 from ..engine.move import record
 from ..engine.target import toward, until
 from ..errors import ComputationError

@@ -14,8 +14,7 @@ from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
-from ..engine.events import start_lanes
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, start_lanes
 from ..engine.move import move
 from ..engine.search.search import Moved
 from ..engine.settings import Settings

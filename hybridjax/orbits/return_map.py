@@ -19,10 +19,11 @@ from .._core.executor import Array, namespace, on_host, scan, singular_values, s
 from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.events import arm, start_lanes
+from ..engine.events import arm
 from ..engine.jacobian import flow_jacobian
-from ..engine.lanes import Lanes
-from ..engine.move import move, retrace
+from ..engine.lanes import Lanes, start_lanes
+from ..engine.move import move
+from ..engine.replay import replay
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
 from ..engine.watch import Watch, slopes, watch
@@ -205,7 +206,7 @@ class ReturnMap(eqx.Module):
                     time = jnp.where(jnp.isfinite(target.time), target.time * grown, jnp.inf)
                     to = dataclasses.replace(target, time=time)
                     other = dataclasses.replace(self, system=moved_system(step)).structure
-                    return retrace(other, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
+                    return replay(other, begin, jnp.zeros((s.nu, 1)), to, tape)[1][:, 0]
 
                 # The parameter is one more state, which is constant.
                 last = jnp.zeros((1, n + 1)).at[0, n].set(1.0)

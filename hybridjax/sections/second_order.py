@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from .._core.compilation import quick_jit
 from .._core.executor import from_host, to_host
-from ..engine.move import retrace
+from ..engine.replay import replay
 from ..linear.time_response import monodromy, periodic_states
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output
@@ -207,7 +207,7 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
 
     def work(x):
         here = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
-        t, q = retrace(s, here, x[n:], target, placed.tape)
+        t, q = replay(s, here, x[n:], target, placed.tape)
         return jnp.concatenate([t[None], q, observe(s, z, here, x[n:])])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])

@@ -1,10 +1,11 @@
-"""The static structure of a hybrid system, and its functions brought to one form.
+"""The structure of a hybrid system: charts and transitions by index, functions in one form.
 
-Everything below `systems` sees a system through `Structure`: charts and transitions by index,
-functions that return arrays, guards that fall through zero at their event.
+The engine evaluates a system through `Structure`: functions return arrays, and guards fall through
+zero at their event.
 """
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any
 
@@ -20,12 +21,13 @@ from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError
-from .alike import Kind, Member, chosen, counts_alike, kinds
 from .chart import Chart
+from .kinds import Kind, Member, counts_alike, kinds, member_of
 from .output import Output
 from .solver import ByChart, Method, as_method
 from .system import Driven, HybridSystem
 from .transition import Scheduled, Transition
+from .verner import VERNER76
 
 
 def as_vector(value: Any) -> jax.Array:
@@ -50,62 +52,95 @@ def stacked(parts: Sequence[jax.Array]) -> jax.Array:
 _kinds = Memory()
 
 
+@jax.tree_util.register_pytree_node_class
 class Structure:
-    """Charts and transitions of `system` by index.
+    """Charts and transitions of a system by index.
 
-    Built once in every trace and handed on: a function of the system is then traced once, however
-    often it is used. (It holds tracers, so it cannot be kept from one trace to the next.)
+    Built where a public call begins, and handed on. It is a pytree whose only child is the system,
+    so that transformations of JAX take it as an argument, and each trace gets its own. Within one
+    trace, a function of the system is traced once, however often it is used.
     """
 
-    def __init__(self, system: HybridSystem | PerLane):
-        self.source = system
-        self.system = system = shared(system)
-        self.drive = system.drive if isinstance(system, Driven) else None
-        self.charts: list[Chart] = list(system.charts().values())
-        self.names: tuple[str, ...] = tuple(system.charts())
-        self.transitions: list[Transition] = list(system.transitions())
-        self.dims: tuple[int, ...] = tuple(len(c.states) for c in self.charts)
-        self.d = max(self.dims)
-        self.inputs: tuple[Signal, ...] = signals(system.inputs, system.input_units)
-        self.nu = len(self.inputs)
+    def __init__(self, source: "HybridSystem | PerLane"):
+        self.source = source
         self._made: dict[Hashable, tuple[Callable, tuple]] = {}
+
+    def tree_flatten(self):
+        return (self.source,), None
+
+    @classmethod
+    def tree_unflatten(cls, _, children):
+        return cls(*children)
+
+    @ft.cached_property
+    def system(self) -> HybridSystem:
+        return shared(self.source)
+
+    @ft.cached_property
+    def _charts(self) -> dict[str, Chart]:
+        return self.system.charts()
+
+    @ft.cached_property
+    def charts(self) -> list[Chart]:
+        return list(self._charts.values())
+
+    @ft.cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._charts)
+
+    @ft.cached_property
+    def transitions(self) -> list[Transition]:
+        return list(self.system.transitions())
+
+    @ft.cached_property
+    def dims(self) -> tuple[int, ...]:
+        return tuple(len(c.states) for c in self.charts)
+
+    @ft.cached_property
+    def d(self) -> int:
+        """Dimension of the largest chart."""
+        return max(self.dims)
+
+    @ft.cached_property
+    def inputs(self) -> tuple[Signal, ...]:
+        return signals(self.system.inputs, self.system.input_units)
+
+    @ft.cached_property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
 
     def by_lane(self, function: Callable, *trees: Any, name: Hashable = None) -> Callable:
         """Vectorize `function(structure, *trees, *arguments)` over the lanes on the last axis of
         `arguments`. Lanes may have parameters of their own (see `PerLane`).
 
-        A function with a `name` is made once, for the same trees, and with that traced once.
+        A function with a `name` is made once for the same trees, and traced once.
         """
-        known = self._made.get(name)
-        if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
-            known = self._by_lane(function, *trees), trees
-            if name is not None:
-                self._made[name] = known
-        return known[0]
 
-    def _by_lane(self, function, *trees):
-        if not isinstance(self.source, PerLane):
-            return by_lane(lambda *rest: function(self, *rest), *trees)
-        return by_lane(
-            lambda system, *rest: function(Structure(system), *rest), self.source, *trees
-        )
+        def make():
+            if isinstance(self.source, PerLane):
+                of_source = lambda source, *x: function(Structure(source), *x)  # noqa: E731
+                return by_lane(of_source, self.source, *trees)
+            return by_lane(lambda *x: function(self, *x), *trees)
+
+        return make() if name is None else self._once(name, trees, make)
 
     def kernel(
-        self,
-        function: Callable,
-        form: Callable,
-        *static: Hashable,
-        trees: tuple = (),
-        lanes: int = 1,
+        self, function: Callable, form: Callable, *static: Hashable, trees: tuple = (), lanes=1
     ) -> Callable:
-        """`function(*static, system, *trees, *point)` in this form for arrays of the host, compiled
-        (see `_core/compilation/kernel.py`)."""
+        """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
+        compiled (see `_core/compilation/kernel.py`)."""
         name = function, form, static, lanes
-        known = self._made.get(name)
-        if known is None or any(x is not y for x, y in zip(known[1], trees, strict=True)):
-            known = kernel(function, form, static, (self.source, *trees), lanes), trees
-            self._made[name] = known
-        return known[0]
+        every = self, *trees
+        return self._once(name, trees, lambda: kernel(function, form, static, every, lanes))
+
+    def _once(self, name: Hashable, trees: tuple, make: Callable[[], Callable]) -> Callable:
+        """The function made under this name for these trees, made anew only for other trees."""
+        function, earlier = self._made.get(name, (None, ()))
+        if function is None or any(x is not y for x, y in zip(earlier, trees, strict=True)):
+            function = make()
+            self._made[name] = function, trees
+        return function
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:
@@ -118,9 +153,9 @@ class Structure:
             raise DefinitionError(f"there is no event '{name}'; events are {quoted(names)}.")
         return names.index(name)
 
-    def method(self, a: int) -> Method | None:
-        """The method by which chart a is integrated, as the system says or the chart; `None` for
-        the default.
+    def method(self, a: int) -> Method:
+        """The method by which chart a is integrated: that of the system, of the chart, or the
+        default.
 
         **Raises:** `DefinitionError` for a solver that is none with an error estimate.
         """
@@ -128,12 +163,12 @@ class Structure:
         solver = type(system).solver if system.solver is None else system.solver
         solver = solver.get(self.names[a]) if isinstance(solver, ByChart) else solver
         solver = self.charts[a].solver if solver is None else solver
-        return None if solver is None else as_method(solver)
+        return VERNER76 if solver is None else as_method(solver)
 
     def chart_input(self, a: int, t: ArrayLike, u: Array) -> Array:
         """g_a(û): the inputs that chart a uses."""
-        if self.drive is not None:
-            u = u + jnp.broadcast_to(jnp.asarray(self.drive(t), float), u.shape)
+        if isinstance(self.system, Driven):
+            u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
         names = self.charts[a].inputs
         if names is None:
             return u
@@ -147,34 +182,34 @@ class Structure:
         """The transitions, those of one kind together."""
 
         def make():
-            found = []
+            groups = []
             for kind in kinds(self.transitions):
-                found += [kind] if len(kind) == 1 or self._is_one(kind) else [(g,) for g in kind]
-            return found
+                groups += [kind] if len(kind) == 1 or self._is_one(kind) else [(g,) for g in kind]
+            return groups
 
         return _kinds.recall(self.source, None, make)
 
     def _is_one(self, kind: Kind) -> bool:
-        """Whether functions can be traced with the numbers in which they differ as arguments, and
-        then mean the same. (Not if a number decides what Python does.)"""
+        """Whether functions can be traced with the numbers in which they differ as arguments and
+        then mean the same. (They cannot if Python branches on a number.)"""
         n = self.dims[self.chart_index(self.transitions[kind[0]].source)]
 
-        def at_a_point(system, place, *point):
-            s, x = Structure(system), Member(kind, place)
+        def at_a_point(s, place, *point):
+            x = Member(kind, place)
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
         real, array = jnp.result_type(float), jax.ShapeDtypeStruct
+        place = array((), jnp.result_type(int))
         point = array((), real), array((n,), real), array((self.nu,), real)
         try:
-            program, *_ = eqx.filter_make_jaxpr(at_a_point)(
-                one_lane(self.source), array((), jnp.result_type(int)), *point
-            )
-        except Exception:  # whatever a user's function raises, or JAX there
+            single = Structure(one_lane(self.source))
+            program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
+        except Exception:  # any error of a user's function, or of JAX in it
             return False
         return counts_alike(program.jaxpr)
 
     def member(self, g: int) -> Member:
-        """Transition g by its kind, for one lane."""
+        """Transition g as a member of its kind, for one lane."""
         kind = next(kind for kind in self.kinds if g in kind)
         return Member(kind, np.array([kind.index(g)], np.int32))
 
@@ -185,6 +220,10 @@ class Structure:
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a, by kind."""
         return [g for kind in self.guard_kinds(a) for g in kind]
+
+    @property
+    def has_schedules(self) -> bool:
+        return any(isinstance(tr.guard, Scheduled) for tr in self.transitions)
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
@@ -201,19 +240,19 @@ class Structure:
         alike = [self.transitions[x] for x in g.kind]
         if len(alike) == 1:
             return alike[0]
-        functions = chosen([(x.guard, x.reset, x.enabled) for x in alike], g.place)
+        functions = member_of([(x.guard, x.reset, x.enabled) for x in alike], g.place)
         guard, reset, enabled = functions
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
     def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
-        a = self.chart_index(tr.source)
-        return tr.sign * jnp.asarray(tr.guard(t, q, self.chart_input(a, t, u)), float)
+        assert not isinstance(tr.guard, Scheduled)
+        return tr.sign * jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)), float)
 
     def guard_values(self, kinds: Sequence[Kind], t: Array, q: Array, u: Array) -> list[jax.Array]:
-        """All guards of some kinds, in parts: a vector for each kind, or if each is the only one of
-        its kind, numbers."""
+        """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is
+        the only one of its kind."""
         if all(len(kind) == 1 for kind in kinds):
             return [self.guard(g, t, q, u) for (g,) in kinds]
         every = lambda kind: jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))  # noqa: E731
@@ -221,15 +260,16 @@ class Structure:
 
     def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         tr = self.transition(g)
-        return as_vector(tr.reset(t, q, self.chart_input(self.chart_index(tr.source), t, u)))
+        return as_vector(tr.reset(t, q, self._input_of(tr, t, u)))
 
     def enabled(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         tr = self.transition(g)
         if tr.enabled is None:
             return jnp.asarray(True)
-        return jnp.asarray(
-            tr.enabled(t, q, self.chart_input(self.chart_index(tr.source), t, u)), bool
-        )
+        return jnp.asarray(tr.enabled(t, q, self._input_of(tr, t, u)), bool)
+
+    def _input_of(self, tr: Transition, t: ArrayLike, u: Array) -> Array:
+        return self.chart_input(self.chart_index(tr.source), t, u)
 
     def state_function(self, name: str, a: int) -> Callable[[Any, Any, Any], Any] | None:
         """The state called `name` in chart a as a function (t, q, u), `None` if it is not there."""
@@ -243,11 +283,11 @@ class Structure:
 
     def state_names(self) -> tuple[str, ...]:
         """All state names, in order of first appearance."""
-        found: dict[str, Signal] = {}
+        names: dict[str, Signal] = {}
         for name in (name for a in range(len(self.charts)) for name in self.states(a)):
-            if not unit_of(found.get(name, "")):
-                found[name] = name
-        return tuple(found.values())
+            if not unit_of(names.get(name, "")):
+                names[name] = name
+        return tuple(names.values())
 
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
@@ -271,8 +311,8 @@ class Outputs:
             if isinstance(item, str) and item in defined:
                 item = defined[item]
             if isinstance(item, str) and item not in structure.state_names():
-                known = (*structure.state_names(), *defined)
-                raise DefinitionError(f"there is no output {item!r}; outputs are {quoted(known)}.")
+                names = (*structure.state_names(), *defined)
+                raise DefinitionError(f"there is no output {item!r}; outputs are {quoted(names)}.")
             self.items.append(item)
         states = {str(name): name for name in structure.state_names()}
         self.names = tuple(

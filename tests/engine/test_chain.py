@@ -6,7 +6,7 @@ import pytest
 
 from hybridjax._core.executor import from_host
 from hybridjax.engine.chain import chain
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until

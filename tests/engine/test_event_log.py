@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until

@@ -8,7 +8,7 @@ import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.compilation import quick_jit
 from hybridjax._core.executor import from_host, on_host, to_host
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.tape import IDLE

@@ -11,8 +11,7 @@ from scipy.linalg import expm
 
 import hybridjax as hj
 from hybridjax._core.executor import to_host
-from hybridjax.engine.solver import take_step
-from hybridjax.engine.solver.implicit import inverse
+from hybridjax.engine.runge_kutta import inverse, take_step
 from hybridjax.orbits.scale import stiff_charts
 from hybridjax.systems.solver import as_method
 from hybridjax.systems.structure import Structure

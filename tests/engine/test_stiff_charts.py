@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import brentq
 
 import hybridjax as hj
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move, record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until

@@ -9,7 +9,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.compilation import quick_jit
-from hybridjax.engine.events import start_lanes
+from hybridjax.engine.lanes import start_lanes
 from hybridjax.engine.move import move, record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until

@@ -10,7 +10,7 @@ import hybridjax as hj
 from hybridjax._core.executor import to_host
 from hybridjax.engine import kernels
 from hybridjax.engine.chain import chain
-from hybridjax.models.chain import Contact
+from hybridjax.models.balls import ChainContact as Contact
 from hybridjax.systems.structure import Structure
 
 from ..conftest import unchecked_host

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.models.walkers.walker import Step, _heelstrike
+from hybridjax.models.walkers import SimplestStep as Step, _heelstrike
 from hybridjax.systems.structure import Structure
 
 

@@ -1,5 +1,6 @@
-"""The part of the engine that decides: step sizes, which event comes first, when to give up.
+"""The adaptive part of the engine: step sizes, the order of events, failures.
 
-In each iteration every lane takes aim (`aim`), attempts a step (`attempt`), and meets its outcome
-(`outcome`). `search` is the loop around them, `state` what it carries, `stride` how lanes set out.
+In each iteration every lane takes aim (`aim.py`), attempts a step and lands on the zero that it
+aims at (`attempt.py`, `locate.py`); the step is accepted or rejected (`accept.py`), and events
+happen (`outcome.py`). `search.py` is the loop, `state.py` its state, `first_step.py` sets out.
 """

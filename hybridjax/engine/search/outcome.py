@@ -1,274 +1,215 @@
-"""What becomes of lanes after each of them has attempted a step.
+"""Outcome of attempted steps: accepted states, events, and reasons to stop."""
 
-As long as no watched function comes near to a zero in any lane, little has to be done (`calmly`);
-otherwise `eventfully` finds out what happened.
-"""
-
-import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
 from ..._core.executor import Array, cond, namespace, put
-from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
-from ..events import apply_resets, enabled, keep_pace, rearm, width
-from ..hermite import CubicCrossing, first_crossing
+from ..arrays import Index, Mask, Times
+from ..events import INSTANT, LEVEL_CLEAR, apply_resets, enabled, keep_pace, rearm, width
 from ..lanes import Lanes
-from ..solver.tableau import method_of
 from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
 from ..watch import Watch, watch
-from .aim import Aim, Way
-from .attempt import SLOW, Attempt, deviation
-from .state import Approach, State, Task
+from .accept import Verdict, accept, next_step, of_row, step_length
+from .attempt import SLOW, deviation
+from .state import Aim, Approach, Attempt, State, Task
 
 
-# Steps below this part of the time allowed (in double and in single precision) are not taken: the
-# lane is stuck. Twice as much gives up one halving earlier.
-_SHORTEST_STEP = 1e-13, 1e-6
-# A lane that is stuck blows up if its largest state changes by more than this part in that step:
-# otherwise its field jumps. Any number between rounding and a tenth tells the two apart.
+# A lane that is stuck blows up if its largest state changes by more than this part in that step;
+# otherwise its field jumps. Higher: fast growth is called a jump. Lower: rounding is called growth.
 _STILL = 1e-3
-# Attempts to land on a crossing before the step in which it was seen is halved. More of them only
-# cost time where the cubic interpolant is no guide to the crossing.
-_LANDING_TRIES = 8
-# A landing may lie beyond the step in which the crossing was seen by this part of that step, and by
-# this part of the time allowed (in double and in single precision). Twice as much accepts zeros
-# that may belong to the step after it.
-_BEYOND_STEP, _BEYOND_STEP_OF_SPAN = 1e-6, (1e-13, 1e-6)
-# A target's level counts once it is above what its rate makes in this part of the time allowed (in
-# double and in single precision). Twice as much may miss a level that falls right after the start;
-# half may meet one that was at zero up to rounding.
-_LEVEL_CLEAR = 1e-10, 1e-6
-# The next step has this part of the length that the error estimate asks for, and lies between these
-# multiples of the last one (the lowest where the estimate is no number). Nearer to 1, more steps
-# are rejected.
-_CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
 
 
-def calmly(
-    s: Structure, state: State, aim: Aim, way: Way, new: Attempt, task: Task
+def without_events(
+    s: Structure, state: State, aim: Aim, new: Attempt, task: Task
 ) -> tuple[State, Tape]:
-    """Nothing happened to any lane, except perhaps that it arrived. Also returns the row for the
-    tape."""
-    lanes, active, slack = state.lanes, state.active, task.stride.slack
+    """The state after steps that are accepted in all active lanes, without events, and the row of
+    the tape. Lanes may arrive."""
+    lanes, active = state.lanes, state.active
     xp = namespace(lanes.t)
-    level, on_time = active & new.lands, way.last
+    level, on_time = active & new.lands, aim.last
     moved = aim.step + xp.where(level, new.past, 0.0)
-    t = xp.where(way.last, way.known, lanes.t + moved)
+    t = xp.where(on_time, aim.due, lanes.t + moved)
     arrived = level | on_time
     pace = put(lanes.pace, 0, lanes.pace[0] + moved)
     lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
-    h = _next_step(state.h, aim.step, _length(s, lanes, new.error / slack))
-    h = xp.where(active, h, state.h)
+    h = next_step(s, state.h, aim, new.error / task.stride.slack, lanes)
     late = active & ~arrived & (t >= task.target.limit)
     code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
     code = xp.where(active, code, IDLE).astype(xp.int32)
-    row = Tape(moved, code, t, new.q, new.q, lanes.chart)
+    end = state._replace(
+        lanes=lanes,
+        seen=_merge(active, new.seen, state.seen),
+        h=xp.where(active, h, state.h),
+        along=new.along,
+        error=state.error + xp.where(active, new.error, 0.0),
+        result=update_result(state.result, late, task.target.missed),
+        arrived=state.arrived | arrived,
+        i=state.i + 1,
+    )
+    return end, Tape(moved, code, t, new.q, new.q, lanes.chart)
+
+
+def with_events(
+    s: Structure, state: State, aim: Aim, new: Attempt, task: Task
+) -> tuple[State, Tape]:
+    """The state after steps that may be rejected or end in events, and the row of the tape."""
+    lanes, active, target = state.lanes, state.active, task.target
+    xp, G, moved = namespace(lanes.t), len(s.transitions), step_length(aim, new)
+    t = xp.where(aim.last, aim.due, xp.where(active, lanes.t + moved, lanes.t))
+    verdict = accept(s, state, aim, new, t, task)
+    accepted, lands = verdict.accepted, verdict.lands
+    # Events, and arrivals.
+    fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
+    by_clock = verdict.plain & (aim.schedule >= 0)
+    fired = xp.where(fires, aim.which, xp.where(by_clock, aim.schedule, -1))
+    level = lands & (aim.which == G)
+    on_time = verdict.plain & aim.last & ~by_clock
+    arrived = on_time | level | ((fired >= 0) & (fired == target.event))
+    after, seen, aimed, zeno, slow = _after(s, state, aim, new, verdict, fired, t, task)
+    h, stuck = _next_step(s, state, aim, new, verdict, fired, task)
+    # Failures; the first one counts.
+    grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
+    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
+    unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
+    result = state.result
+    for failed, code in (
+        (grazes, Result.GRAZING),
+        (stuck & still, Result.STEP_COLLAPSE),
+        (stuck & ~xp.isfinite(new.q).all(axis=0), Result.FIELD_NOT_FINITE),
+        (stuck, Result.BLOW_UP),
+        (zeno, Result.ZENO),
+        (unexpected, Result.EVENT_ORDER),
+        (active & ~arrived & (after.t >= target.limit), target.missed),
+    ):
+        result = update_result(result, failed, code)
+    along = new.along
+    if along is not None:
+        fresh = cond((fired >= 0).any(), lambda: deviation(s, after, task.settings), lambda: along)
+        along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
-        lanes,
-        _merge(active, new.seen, state.seen),
-        state.aimed,
-        state.approach,
+        after,
+        seen,
+        aimed,
+        _approach(state, new, verdict, moved),
         h,
-        new.along,
-        state.error + xp.where(active, new.error, 0.0),
-        update_result(state.result, late, task.target.missed),
+        along,
+        state.error + xp.where(accepted, new.error, 0.0),
+        result,
         state.arrived | arrived,
         state.i + 1,
     )
-    return end, row
+    code = xp.where(on_time, ARRIVE_TIME, xp.where(accepted, MOVE, IDLE))
+    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(xp.int32)
+    return end, Tape(moved, code, t, new.q, after.q, after.chart)
 
 
-def eventfully(
-    s: Structure, state: State, aim: Aim, way: Way, new: Attempt, task: Task
-) -> tuple[State, Tape]:
-    """Find out what happened to each lane, and let it happen. Also returns the row for the tape."""
-    lanes, seen, end, approach = state.lanes, state.seen, new.seen, state.approach
-    active, target, slack = state.active, task.target, task.stride.slack
-    xp, G = namespace(lanes.t), len(s.transitions)
-    near = new.error <= slack
-
-    # 1. Which approaches succeed.
-    tau = approach.tau + new.past
-    beyond = _BEYOND_STEP * approach.reach + at_precision(*_BEYOND_STEP_OF_SPAN) * task.span
-    inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
-    falling = _of(end.rate, aim.which) < 0
-    lands = active & new.lands & falling & xp.where(approach.on, inside, near)
-    closer = active & approach.on & ~lands & (approach.tries < _LANDING_TRIES)
-    lost = active & approach.on & ~lands & ~closer
-    moved = aim.step + xp.where(new.lands, new.past, 0.0)
-    t = xp.where(way.last, way.known, xp.where(active, lanes.t + moved, lanes.t))
-
-    # 2. What was crossed on the way.
-    ready = state.ready
-    fresh = active & ~approach.on & near
-    crossing = _crossing(fresh | lands, seen, end, moved, ready)
+def _after(
+    s: Structure,
+    state: State,
+    aim: Aim,
+    new: Attempt,
+    verdict: Verdict,
+    fired: Index,
+    t: Times,
+    task: Task,
+) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
+    """Lanes after their steps and events, the watched functions there, whether the target's level
+    counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
+    lanes, end, accepted, xp = state.lanes, new.seen, verdict.accepted, namespace(t)
     zero = width(t, task.span, end.rate)
-    chosen = lands & (np.arange(G + 1)[:, None] == aim.which)
-    old = lands & (xp.abs(end.value) <= zero)
-    s_first = xp.where(chosen | old, xp.inf, crossing.position)
-    which = xp.argmin(s_first, axis=0).astype(xp.int32)
-    first = xp.min(s_first, axis=0)
-    bent = fresh & new.bent
-    crosses = ((fresh | lands) & xp.isfinite(first)) & ~bent
-    refine = bent | ((fresh | lands) & ~crosses & (crossing.near & ~chosen).any(axis=0))
-    touch = fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0)
-    lands = lands & ~crosses & ~refine
-    chosen = chosen & lands
-    plain = fresh & ~crosses & ~refine & ~lands
-    accept = plain | lands
-
-    # 3. What happens there.
-    clear = end.value > zero
-    ready = xp.where(accept, ((ready & ((end.value > 0) | lands)) | clear) & ~chosen, ready)
-    guard = lands & (aim.which < G)
-    fires = guard & enabled(s, t, new.q, task.u, aim.which)
-    by_clock = plain & (way.schedule >= 0)
-    fired = xp.where(fires, aim.which, xp.where(by_clock, way.schedule, -1))
-    level = lands & (aim.which == G)
-    on_time = plain & way.last & ~by_clock
-    arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    speed = xp.abs(_of(end.rate, aim.which))
-    slow = lands & (new.slow | (approach.on & (speed < SLOW * approach.rate)))
-    pace, zeno = keep_pace(lanes.pace, xp.where(accept, moved, 0.0), fired >= 0, slow)
-    expected = _expected(target.event_sequence, lanes.events, fired)
+    ready = (state.ready & ((end.value > 0) | verdict.lands)) | (end.value > zero)
+    ready = xp.where(accepted, ready & ~verdict.chosen, state.ready)
+    speed = xp.abs(of_row(end.rate, aim.which))
+    on = state.approach.on
+    slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
+    passed = xp.where(accepted, step_length(aim, new), 0.0)
+    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow)
     falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
     after = Lanes(
-        xp.where(accept, t, lanes.t),
+        xp.where(accepted, t, lanes.t),
         lanes.chart,
-        xp.where(accept, new.q, lanes.q),
+        xp.where(accepted, new.q, lanes.q),
         ready[:-1],
         lanes.events + (fired >= 0),
         pace,
     )
-    seen = _merge(accept, end, seen)
-    after, seen, aimed = _reset(s, after, seen, ready[-1], fired, together, task)
-
-    # 4. The next step, and reasons to stop.
-    fastest = xp.maximum(xp.abs(_of(state.seen.rate, which)), xp.abs(_of(end.rate, which)))
-    approach = Approach(
-        crosses | closer,
-        xp.where(crosses, which, approach.which),
-        xp.where(crosses, first * moved, xp.clip(tau, 0.0, approach.reach)),
-        xp.where(crosses, moved, approach.reach),
-        xp.where(crosses, fastest, approach.rate),
-        xp.where(crosses, 0, approach.tries + 1),
-    )
-    adapted = _next_step(state.h, aim.step, _length(s, lanes, new.error / slack))
-    too_long = active & ~state.approach.on & ~near
-    h = xp.where(plain | too_long, adapted, state.h)
-    h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
-    h = xp.where(refine, 0.5 * aim.step, xp.where(lost, 0.5 * aim.reach, h))
-    stuck = (too_long | refine | lost) & (h < at_precision(*_SHORTEST_STEP) * task.span)
-    graze = touch | (slow & ~zeno) | (stuck & (refine | lost))
-    result = update_result(state.result, graze, Result.GRAZING)
-    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
-    result = update_result(result, stuck & still, Result.STEP_COLLAPSE)
-    undefined = stuck & ~xp.isfinite(new.q).all(axis=0)
-    result = update_result(result, undefined, Result.FIELD_NOT_FINITE)
-    result = update_result(result, stuck, Result.BLOW_UP)
-    result = update_result(result, zeno, Result.ZENO)
-    result = update_result(result, (fired >= 0) & ~expected, Result.EVENT_ORDER)
-    result = update_result(result, active & ~arrived & (after.t >= target.limit), target.missed)
-
-    code = xp.where(accept, MOVE, IDLE)
-    code = xp.where(on_time, ARRIVE_TIME, code)
-    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code))
-    row = Tape(moved, code.astype(xp.int32), t, new.q, after.q, after.chart)
-    error = state.error + xp.where(accept, new.error, 0.0)
-    arrived = state.arrived | arrived
-    along = new.along
-    if along is not None:
-        anew = cond((fired >= 0).any(), lambda: deviation(s, after, task.settings), lambda: along)
-        along = xp.where(fired >= 0, anew, xp.where(accept, along, state.along))
-    end = State(after, seen, aimed, approach, h, along, error, result, arrived, state.i + 1)
-    return end, row
-
-
-def _crossing(
-    some: Bool[Array, " L"],
-    seen: Watch,
-    end: Watch,
-    moved: Float[Array, " L"],
-    ready: Bool[Array, "W L"],
-) -> CubicCrossing:
-    """What was crossed on the way. (In a branch, so that it is not computed anew by every user.)"""
-
-    xp = namespace(ready)
-
-    def look():
-        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
-
-    def nothing():
-        no = xp.zeros_like(ready)
-        return CubicCrossing(xp.full_like(end.value, xp.inf), no, no)
-
-    return cond(some.any(), look, nothing)
-
-
-def _length(s: Structure, lanes: Lanes, error: Float[Array, " L"]) -> Float[Array, " L"]:
-    """The length of a step with this error, as a multiple of the one with an error of 1."""
-    xp, orders = namespace(error), [method_of(s, a).order for a in range(len(s.charts))]
-    if set(orders) == {8.0}:  # cheaper than a power
-        return xp.sqrt(xp.sqrt(xp.sqrt(error)))
-    return error ** xp.asarray(1 / np.array(orders))[lanes.chart]
-
-
-def _next_step(
-    h: Float[Array, " L"], step: Float[Array, " L"], length: Float[Array, " L"]
-) -> Float[Array, " L"]:
-    """The step after one of length `step`, which is so many times as long as it might be, where h
-    was allowed."""
-    xp = namespace(length)
-    factor = xp.clip(_CAUTION / length, _SHRINK, _GROW)
-    factor = xp.where(xp.isfinite(length), factor, _SHRINK_BLINDLY)
-    return xp.where((step < h) & (length <= 1), xp.maximum(h, step * factor), step * factor)
+    seen = _merge(accepted, end, state.seen)
+    return *_reset(s, after, seen, ready[-1], fired, together, task), zeno, slow
 
 
 def _reset(
-    s: Structure,
-    lanes: Lanes,
-    seen: Watch,
-    aimed: Bool[Array, " L"],
-    fired: Int[Array, " L"],
-    together: Bool[Array, " L"],
-    task: Task,
-) -> tuple[Lanes, Watch, Bool[Array, " L"]]:
-    """The lanes after their events, what they see there, and whether they aim at their target."""
+    s: Structure, lanes: Lanes, seen: Watch, aimed: Mask, fired: Index, together: Mask, task: Task
+) -> tuple[Lanes, Watch, Mask]:
+    """Lanes after the resets of their events, the watched functions there, and whether the target's
+    level counts."""
     xp, fires = namespace(fired), fired >= 0
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
-        residue = xp.abs(_of(seen.value, fired))
+        residue = xp.abs(of_row(seen.value, fired))
         new = rearm(s, new, after, fired, together, task.span, task.u, residue)
-        return new, _merge(fires, after, seen), xp.where(fires, aims(after, task.span), aimed)
+        counts = xp.where(fires, level_counts(after, task.span), aimed)
+        return new, _merge(fires, after, seen), counts
 
     return cond(fires.any(), work, lambda: (lanes, seen, aimed))
 
 
-def aims(seen: Watch, span: Float[Array, " L"]) -> Bool[Array, " L"]:
+def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
+    """The crossing that each lane approaches next: one met in this step, or the same from nearer
+    by."""
+    approach, crosses, which = state.approach, verdict.crosses, verdict.which
+    xp = namespace(moved)
+    fastest = xp.maximum(
+        xp.abs(of_row(state.seen.rate, which)), xp.abs(of_row(new.seen.rate, which))
+    )
+    tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
+    return Approach(
+        crosses | verdict.closer,
+        xp.where(crosses, which, approach.which),
+        xp.where(crosses, verdict.position * moved, tau),
+        xp.where(crosses, moved, approach.reach),
+        xp.where(crosses, fastest, approach.rate),
+        xp.where(crosses, 0, approach.tries + 1),
+    )
+
+
+def _next_step(
+    s: Structure,
+    state: State,
+    aim: Aim,
+    new: Attempt,
+    verdict: Verdict,
+    fired: Index,
+    task: Task,
+) -> tuple[Times, Mask]:
+    """The next step, and lanes that are stuck: the step is too short to be taken."""
+    xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)
+    adapted = next_step(s, state.h, aim, new.error / task.stride.slack, state.lanes)
+    h = xp.where(plain | too_long, adapted, state.h)
+    h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
+    h = xp.where(verdict.lost, 0.5 * aim.reach, h)
+    h = xp.where(verdict.refine, 0.5 * aim.step, h)
+    rejected = too_long | verdict.refine | verdict.lost
+    return h, rejected & (h < at_precision(*INSTANT) * task.span)
+
+
+def level_counts(seen: Watch, span: Times) -> Mask:
     """Whether the target's level is clearly positive, so that its next fall counts."""
-    return seen.value[-1] > at_precision(*_LEVEL_CLEAR) * span * abs(seen.rate[-1])
+    return seen.value[-1] > at_precision(*LEVEL_CLEAR) * span * abs(seen.rate[-1])
 
 
-def _merge(mask: Bool[Array, " L"], new: Watch, old: Watch) -> Watch:
+def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
     xp = namespace(mask)
     return Watch(xp.where(mask, new.value, old.value), xp.where(mask, new.rate, old.rate))
 
 
-def _of(x: Float[Array, "W L"], which: Int[Array, " L"]) -> Float[Array, " L"]:
-    """Each lane's entry in the row `which`; 0 for -1."""
-    return pick(x, range(len(x)), which)
-
-
-def _expected(
-    sequence: tuple[int, ...] | None, events: Int[Array, " L"], fired: Int[Array, " L"]
-) -> Bool[Array, " L"]:
-    """Whether the next event of each lane is the one that the limit cycle has."""
+def _expected(sequence: tuple[int, ...] | None, events: Index, fired: Index) -> Bool[Array, " L"]:
+    """Whether the next event of each lane is that of the limit cycle."""
     xp = namespace(fired)
     if sequence is None:
         return xp.ones(fired.shape, bool)

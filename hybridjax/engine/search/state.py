@@ -1,4 +1,4 @@
-"""What a search is about, and what it carries from one iteration to the next."""
+"""The state of a search: constants of a task, the state of the iteration, an attempted step."""
 
 from typing import NamedTuple
 
@@ -6,67 +6,123 @@ from jaxtyping import Bool, Float, Int
 
 from ..._core.executor import Array, namespace
 from ..._core.results import Result
+from ..arrays import Index, Inputs, Mask, Padded, Times
 from ..lanes import Lanes
 from ..settings import Settings
 from ..target import Target
 from ..watch import Watch
-from .stride import Stride
+
+
+class Stride(NamedTuple):
+    """Knowledge of the way, before lanes set out."""
+
+    h: Times
+    """The first step."""
+    lead: Times
+    """Expected time to the target's level as a multiple of Newton's guess at the start; 0 if it is
+    not known."""
+    slack: Times
+    """A step's error estimate may be this many times the tolerance."""
 
 
 class Task(NamedTuple):
-    """What the lanes of a search are to do: the same in all of its iterations."""
+    """The constants of a search."""
 
-    u: Float[Array, "nu L"]
+    u: Inputs
     """The constant input of each lane."""
     target: Target
-    span: Float[Array, " L"]
-    """Time from the start to the limit. Times that are a matter of rounding are judged by it."""
+    span: Times
+    """Time from the start to the limit, relative to which rounding errors of times are judged."""
     stride: Stride
     settings: Settings
+    tangents: Bool[Array, ""] | bool
+    """Whether steps are also short enough for the derivatives of a replay."""
 
 
 class Approach(NamedTuple):
-    """Lanes that have seen a crossing in a step and are about to land on it."""
+    """Lanes that have met a crossing within a step and are about to land on it."""
 
-    on: Bool[Array, " L"]
-    which: Int[Array, " L"]
+    on: Mask
+    which: Index
     """The watched function that crosses."""
-    tau: Float[Array, " L"]
-    """Where the crossing is thought to be, as a time from where the lane is."""
-    reach: Float[Array, " L"]
-    """Length of the step in which it was seen."""
-    rate: Float[Array, " L"]
+    tau: Times
+    """Expected time from the lane's time to the crossing."""
+    reach: Times
+    """Length of the step in which it was met."""
+    rate: Times
     """The largest rate of that function at the ends of that step."""
-    tries: Int[Array, " L"]
+    tries: Index
 
 
 class State(NamedTuple):
-    """Where the lanes of a search stand."""
+    """The state of the iteration."""
 
     lanes: Lanes
     seen: Watch
-    """The watched functions where the lanes are."""
-    aimed: Bool[Array, " L"]
+    """The watched functions at the lanes."""
+    aimed: Mask
     """Whether the target's level would end the flow at its next falling zero."""
     approach: Approach
-    h: Float[Array, " L"]
-    """The next step, if nothing comes in between."""
-    along: Float[Array, "d L"] | None
-    """What has become of a deviation since the last event, in charts with implicit methods; `None`
-    where derivatives do not matter."""
-    error: Float[Array, " L"]
+    h: Times
+    """The next step, if no event comes in between."""
+    along: Padded | None
+    """A deviation that began with the flow or at the last event, in charts with implicit methods;
+    `None` where derivatives do not matter."""
+    error: Times
     """Sum of the error estimates of the steps so far, relative to the tolerance."""
-    result: Int[Array, " L"]
-    arrived: Bool[Array, " L"]
+    result: Index
+    arrived: Mask
     i: Int[Array, ""]
     """Number of iterations so far."""
 
     @property
-    def active(self) -> Bool[Array, " L"]:
-        """Lanes that are still on their way."""
+    def active(self) -> Mask:
+        """Lanes that have neither arrived nor failed."""
         return ~self.arrived & (self.result == Result.OK)
 
     @property
     def ready(self) -> Bool[Array, "W L"]:
         """Watched functions whose next falling zero counts."""
         return namespace(self.aimed).concatenate([self.lanes.armed, self.aimed[None]])
+
+
+class Aim(NamedTuple):
+    """The step that lanes attempt."""
+
+    which: Index
+    """The watched function on whose zero they are to land; -1 for none."""
+    step: Times
+    """Length of the step."""
+    reach: Times
+    """Length of the step in which that zero is expected."""
+    due: Times
+    """The next known time: the target's, or that of a scheduled event."""
+    schedule: Index
+    """The scheduled transition that is due at the end of this step; -1 for none."""
+    last: Mask
+    """Whether this step ends at the known time."""
+
+
+class Attempt(NamedTuple):
+    """A step of every lane, before it is accepted."""
+
+    q: Padded
+    """The state at its end: on the zero that the lane aims at, if it lands."""
+    seen: Watch
+    """The watched functions there."""
+    error: Times
+    """Estimate of the step's error, relative to the tolerance."""
+    past: Times
+    """Time from the end of the step aimed for to the zero, as far as is known."""
+    lands: Mask
+    slow: Mask
+    """The zero on which the lane lands is not crossed in falling, or at a vanishing speed."""
+    bent: Mask
+    """A watched function is not resolved by its cubic interpolant over the step.
+
+    Step control looks at the states only; where those are simple, a guard may still turn many
+    times within a step."""
+    along: Float[Array, "d L"] | None
+    """See `State`."""
+    calm: Mask
+    """No watched function comes near to a zero, save that on which the lane lands."""

@@ -95,8 +95,8 @@ def multisine(
       with fewer cosines each, and so less distortion; with the fewest of all lines, every
       second-order product falls on a line of the same experiment, so amplitudes must be small.
     - `highest_harmonic`: M, beyond which harmonics are taken as zero. Then 2 M + 1 experiments may
-      do instead of 20; what they assume is said by `predict_leakage`, if a model is at hand. The
-      estimate needs to know: `estimate_htf(data, highest=M)`.
+      do instead of 20; the estimate needs the same
+      number: `estimate_htf(data, highest=M)`.
     - `inputs`: their number or names; `experiments` is the number for all inputs together.
 
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too

@@ -20,10 +20,10 @@ from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.bound import MultiplierBound, exact_htf
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.error_weights import ROUNDING, check_values, error_weights
-from ..multipliers.multiplier_estimate import MultiplierEstimate
+from ..denominator import multipliers_of
+from ..htf_errors import ROUNDING, check_values, error_weights
+from ..multiplier_estimate import MultiplierEstimate
+from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
 from .descent import ModelPoint, Spread, minimize
 from .frequency import FrequencyProblem, transfer, transfer_slopes
@@ -382,7 +382,7 @@ def _finished(
 
 
 @checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
+def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
 
     The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
@@ -408,4 +408,4 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierBound:
     coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
     c, slopes = characteristic_slopes(coordinates)
     spread = problem.linearize(coordinates).spread()
-    return MultiplierBound(multipliers_of(c), c, spread.covariance(slopes))
+    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -1,0 +1,23 @@
+"""Types of arrays that have one entry for each of L lanes on their last axis.
+
+Each may be an array of either executor, which share the array API.
+"""
+
+from jaxtyping import Bool, Float, Int
+
+from .._core.executor import Array
+
+
+Times = Float[Array, " L"]
+"""One number for each lane: times, durations, errors."""
+States = Float[Array, "n L"]
+"""States of one chart."""
+Padded = Float[Array, "d L"]
+"""States of any chart, padded with zeros to the largest dimension d."""
+Inputs = Float[Array, "nu L"]
+Mask = Bool[Array, " L"]
+Index = Int[Array, " L"]
+"""A chart, a transition, a result code or a number of events for each lane."""
+# One entry for all lanes will do for these.
+AnyTimes = Float[Array, " #L"]
+AnyInputs = Float[Array, "nu #L"]

@@ -1,0 +1,115 @@
+"""Zero crossings of the cubic Hermite interpolant of a guard over one step.
+
+The interpolant is cut at its extrema into at most three monotone pieces, so that the first
+crossing is found also where the guard dips below zero and returns within the step.
+"""
+
+from typing import NamedTuple
+
+from jaxtyping import Bool, Float
+
+from .._core.executor import Array, namespace
+from .._core.precision import at_precision
+
+
+# An extremum within this part of the guard's values at the step's ends (in double and in single
+# precision) is a touch. Higher: passing near a guard is called grazing. Lower: grazing is missed.
+TOUCH = 1e-10, 1e-6
+# An extremum within this part of them is a near miss, for which the step is halved. Higher: more
+# steps. Lower: a guard that dips below zero within a step is missed.
+NEAR = 1e-2
+
+
+class CubicCrossing(NamedTuple):
+    """Zeros and extrema of a guard within a step."""
+
+    position: Float[Array, "*shape"]
+    """The first falling zero, as a fraction of the step; infinity if there is none."""
+    touch: Bool[Array, "*shape"]
+    """The guard touches zero without a clear crossing."""
+    near: Bool[Array, "*shape"]
+    """It comes so close to zero without crossing that the interpolant cannot be trusted."""
+
+
+Values = Float[Array, "*shape"]
+Flags = Bool[Array, "*shape"]
+
+
+def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags) -> CubicCrossing:
+    """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
+
+    A guard that is not armed at the start counts only after it has become positive.
+    """
+    xp, rise = namespace(v1), v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
+
+    def cubic(s):
+        return v0 + s * (d0 + s * (b + s * c))
+
+    def slope(s):
+        return d0 + s * (2 * b + s * 3 * c)
+
+    # Extrema: roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
+    disc = b * b - 3 * c * d0
+    pivot = -(b + xp.where(b < 0, -1.0, 1.0) * xp.sqrt(xp.maximum(disc, 0.0)))
+    r1 = _divide(pivot, 3 * c)
+    r2 = _divide(d0, pivot)
+    r1, r2 = (xp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
+    sa, sb = xp.minimum(r1, r2), xp.maximum(r1, r2)
+    va, vb = xp.where(sa < 1, cubic(sa), v1), xp.where(sb < 1, cubic(sb), v1)
+
+    first = armed & (va <= 0)
+    second = (va > 0) & (vb <= 0) & (sb > sa)
+    third = (vb > 0) & (v1 <= 0) & (sb < 1)
+    lo = xp.where(first, 0.0, xp.where(second, sa, sb))
+    hi = xp.where(first, sa, xp.where(second, sb, 1.0))
+    crosses = first | second | third
+
+    s = 0.5 * (lo + hi)
+    for _ in range(10):  # Newton's steps within a bracket that shrinks, to rounding
+        value = cubic(s)
+        lo, hi = xp.where(value > 0, s, lo), xp.where(value > 0, hi, s)
+        guess = s - _divide(value, slope(s))
+        s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
+
+    scale = xp.maximum(xp.abs(v0), xp.abs(v1))
+    small = at_precision(*TOUCH) * scale
+    touch = near = xp.zeros_like(armed)
+    for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
+        dips = before & (node < 1) & (b + 3 * c * node > 0)
+        touch = touch | (dips & (xp.abs(value) <= small))
+        near = near | (dips & (value > small) & (value < NEAR * scale))
+    return CubicCrossing(xp.where(crosses, s, xp.inf), touch, near & ~crosses)
+
+
+def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
+    """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
+    xp, rise = namespace(v1), v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
+    s = xp.ones_like(v1)
+    for _ in range(4):
+        value = v0 + s * (d0 + s * (b + s * c))
+        s = s - _divide(value, d0 + s * (2 * b + s * 3 * c))
+    return s
+
+
+def interpolate(x, h, q0, q1, f0, f1):
+    """The cubic at fraction x of a step of length h, from the states at its ends and the fields
+    there, for arrays of either executor."""
+    return (
+        q0 * (1 + 2 * x) * (1 - x) ** 2
+        + q1 * x**2 * (3 - 2 * x)
+        + h * x * (1 - x) * (f0 * (1 - x) - f1 * x)
+    )
+
+
+def control_points(v0, v1, d0, d1) -> tuple[Array, ...]:
+    """The cubic's Bernstein coefficients: it stays between the smallest and the largest of them."""
+    return v0, v0 + d0 / 3, v1 - d1 / 3, v1
+
+
+def _divide(a, b):
+    xp = namespace(b)
+    return xp.where(b == 0, xp.inf, a / xp.where(b == 0, 1.0, b))

@@ -1,0 +1,274 @@
+"""Steps of Runge-Kutta methods, explicit and implicit, for many lanes of one chart at once.
+
+Lanes stand on the last axis: `t`, `h` are (L,), `q` is (n, L); both t and h may be the same for all
+lanes, as arrays of one. A field is a function (t, q) -> (n, L) of whole arrays: one array per stage
+lets XLA compute each stage once. The default method of a chart is in `systems/verner.py`.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Inexact
+
+from .._core.executor import Array, for_each_row, namespace
+from ..systems.solver import Method
+from .arrays import AnyTimes, States, Times
+
+
+LaneField = Callable[[Array, Array], Array]
+
+# Stages are always unrolled from this number of lanes on. Higher: large batches run up to twice as
+# long. Lower: small batches compile for twice as long.
+_UNROLLED_LANES = 128
+# Eliminations are unrolled up to this number of columns. Higher: they compile for longer. Lower: a
+# loop for each small system.
+_UNROLLED_COLUMNS = 4
+# Newton's iterations for the stages end after this number. Higher: longer steps where the field is
+# most nonlinear. Lower: steps are rejected there.
+_ITERATIONS = 12
+
+
+class Step(NamedTuple):
+    """Result of one step."""
+
+    q: States
+    """State at t + h."""
+    f0: States
+    """Field at the start."""
+    f1: States
+    """Field at the end."""
+    error: States
+    """Embedded estimate of the local error."""
+
+
+def take_step(
+    method: Method,
+    field: LaneField,
+    t: AnyTimes,
+    q: States,
+    h: AnyTimes,
+    unroll: bool = False,
+    still: LaneField | None = None,
+) -> Step:
+    """One step of a method from (t, q) over h.
+
+    With `unroll`, or for many lanes, the stages of an explicit method are unrolled: faster, and
+    slower to compile. For derivatives of an implicit step give `still`, the field without any.
+    """
+    if method.implicit:
+        return _implicit_step(method, field, t, q, h, still)
+    unroll = unroll or q.shape[1] >= _UNROLLED_LANES
+    K = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
+    weights = np.array(method.b), np.array(method.error)
+    change, error = (_combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights)
+    end = q + h * change
+    return Step(end, K[0], field(t + h, end), h * error)
+
+
+def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
+    def stage(K, xs):
+        row, c, k = xs
+        return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
+
+    stages = len(method.c)
+    begin = jnp.zeros((stages, *q.shape), q.dtype)
+    tableau = jnp.asarray(method.a, q.dtype), jnp.asarray(method.c, q.dtype), jnp.arange(stages)
+    return jax.lax.scan(stage, begin, tableau)[0]
+
+
+def _unrolled_stages(method, field, t, q, h) -> list[States]:
+    K: list[jax.Array] = []
+    for row, c in zip(method.a, method.c, strict=True):
+        K.append(field(t + c * h, q + h * _combine(row, K)))
+    return K
+
+
+def _combine(weights, K):
+    """Sum of weights times stages. Unrolled, it is compiled into one loop with the stage."""
+    return sum((float(w) * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0)
+
+
+def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> States:
+    """The largest change of the field under rounding errors of time and states, where f is the
+    field at (t, q); zero where it is not finite."""
+    # Shifts of both signs, odd and even; not all states by the same part, since a common factor may
+    # cancel.
+    shifts = np.stack([np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)], axis=1)
+    xp = namespace(q)
+    shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
+
+    def change(shift):
+        return xp.abs(field(t * (1 + shift[0]), q * (1 + shift[1:, None])) - f)
+
+    changes = for_each_row(change, shifts)
+    return xp.max(xp.where(xp.isfinite(changes), changes, 0.0), axis=0)
+
+
+def short_step(field: LaneField, t: Times, q: States, f: States, h: Times) -> tuple[States, States]:
+    """A short step of the classical method of order 4, given the field f at its start.
+
+    Its derivatives at h = 0 are right to order 4.
+
+    **Returns:** the state at t + h, and its distance from the midpoint rule's, of order h^3.
+    """
+    half = 0.5 * h
+    k2 = field(t + half, q + half * f)
+    k3 = field(t + half, q + half * k2)
+    k4 = field(t + h, q + h * k3)
+    slope = (f + 2 * k2 + 2 * k3 + k4) / 6
+    return q + h * slope, h * (slope - k2)
+
+
+# Implicit methods. The increments w_i = h f(t + c_i h, q + sum_j a_ij w_j) of all stages are solved
+# for together, by Newton's method with the Jacobian J of the field at the start of the step. Its
+# linear systems (1 - h A x J) dw = r are decoupled as by E. Hairer and G. Wanner, Solving Ordinary
+# Differential Equations II, section IV.8: with A = T R T^-1 and R triangular, they need inverses of
+# 1 - h g J for the diagonal entries g of R only, real or complex. All of it is unrolled for small
+# matrices: LAPACK would be called once for each lane.
+
+
+class _Decoupled(NamedTuple):
+    """A matrix of stages as the real part of left @ R @ right, R lower triangular."""
+
+    left: np.ndarray
+    R: np.ndarray
+    right: np.ndarray
+
+
+@ft.lru_cache
+def _decoupled(method: Method) -> _Decoupled:
+    A = np.array(method.a)
+    if not np.any(np.triu(A, 1)):
+        return _Decoupled(np.eye(len(A)), A, np.eye(len(A)))
+    values, T = np.linalg.eig(A)
+    kept = values.imag >= 0  # one of each conjugate pair, twice
+    values, left, right = values[kept], T[:, kept], np.linalg.inv(T)[kept]
+    return _Decoupled(left * np.where(values.imag > 0, 2, 1), np.diag(values), right)
+
+
+def _implicit_step(method: Method, field: LaneField, t, q, h, still: LaneField | None) -> Step:
+    """One step of an implicit method. The last change of Newton's iterations counts as an error.
+
+    With `still`, the stages are corrected twice by Newton's method with the true Jacobian at their
+    solution: that changes them by rounding errors only, but carries their first and second
+    derivatives, by the implicit function theorem.
+    """
+    start = [jax.lax.stop_gradient(x) for x in (t, q, h)]
+    w, left, J = _increments(method, still or field, *start)
+    if still is not None:
+        w = _with_derivatives(method, field, still, (t, q, h), w)
+    end = q + jnp.tensordot(np.array(method.b), w, 1)
+    error = jnp.tensordot(np.array(method.error), w, 1)
+    if method.filter:
+        error = _apply(inverse(_shifted(J, method.filter * start[2])), error)
+    error = jnp.where(error < 0, error - left, error + left)
+    return Step(end, field(t, q), field(t + h, end), error)
+
+
+def integrated_divergence(method: Method, field: LaneField, t, q, h) -> Times:
+    """The divergence of the field, integrated over a step by the quadrature of the method."""
+    w = _increments(method, field, t, q, h)[0]
+    stages = q + jnp.tensordot(np.array(method.a), w, 1)
+    J = jax.vmap(lambda t, q: _jacobian(field, t, q))(t + np.array(method.c)[:, None] * h, stages)
+    return h * jnp.tensordot(np.array(method.b), jnp.trace(J, axis1=1, axis2=2), 1)
+
+
+def _increments(method, field, t, q, h):
+    """Increments (s, n, L) by Newton's method, their last change (n, L), and the Jacobian (n, n, L)
+    at the start."""
+    J, c = _jacobian(field, t, q), np.array(method.c)[:, None]
+    left, R, right = _decoupled(method)
+    solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
+    evaluate = jax.vmap(field)
+    small = 4.0 * jnp.finfo(q.dtype).eps  # a few rounding errors
+
+    def correction(w):
+        stages = q + jnp.tensordot(np.array(method.a), w, 1)
+        residual = h * evaluate(t + c * h, stages) - w
+        residual = jnp.tensordot(right, residual, 1)
+        solved = []
+        for row, r in zip(R, residual, strict=True):
+            before = sum((g * x for g, x in zip(row, solved, strict=False) if g != 0), start=0.0)
+            r = r if isinstance(before, float) else r + h * _apply(J, before)
+            g = row[len(solved)]
+            solved.append(_apply(solve[g], r) if g != 0 else r)
+        return jnp.real(jnp.tensordot(left, jnp.stack(solved), 1))
+
+    def iterate(carry):
+        w, last, _, i = carry
+        change = correction(w)
+        w, now = w + change, jnp.max(jnp.abs(change), axis=0)
+        size = jnp.abs(q) + jnp.max(jnp.abs(w), axis=0)
+        # A component goes on while it moves by more than rounding errors, and converges.
+        going = (now > small * size) & ((now < 0.5 * last) | (i < 2))
+        return w, now, going.any(), i + 1
+
+    def unsettled(carry):
+        *_, going, i = carry
+        return going & (i < _ITERATIONS)
+
+    w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
+    begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
+    w, last, *_ = jax.lax.while_loop(unsettled, iterate, begin)
+    return w, last, J
+
+
+def _with_derivatives(method, field, still, start, w):
+    """The increments w, as functions of the field and of the `start` (t, q, h) of the step."""
+    t, q, h = start
+    A, c = np.array(method.a), np.array(method.c)[:, None]
+    (s, n, L), at = w.shape, jax.lax.stop_gradient
+    stages = at(q + jnp.tensordot(A, w, 1))
+    J = jax.vmap(lambda t, q: _jacobian(still, t, q))(at(t + c * h), stages)
+    coupled = jnp.einsum("ij,iabL->iajbL", A, J).reshape(s * n, s * n, L)
+    back = inverse(jnp.eye(s * n)[..., None] - at(h) * coupled)
+    for _ in range(2):
+        stages = q + jnp.tensordot(A, w, 1)
+        residual = h * jax.vmap(field)(t + c * h, stages) - w
+        w = w + _apply(back, residual.reshape(s * n, L)).reshape(s, n, L)
+    return w
+
+
+def _jacobian(field: LaneField, t, q) -> Float[Array, "n n L"]:
+    def push(direction):
+        along = jnp.broadcast_to(direction[:, None], q.shape)
+        return jax.jvp(lambda q: field(t, q), (q,), (along,))[1]
+
+    return jax.vmap(push, out_axes=1)(jnp.eye(len(q), dtype=q.dtype))
+
+
+def _shifted(J, g):
+    """1 - g J."""
+    return jnp.eye(len(J))[..., None] - g * J
+
+
+def _apply(matrix: Inexact[Array, "n m #L"], x: Inexact[Array, "m L"]) -> Inexact[Array, "n L"]:
+    return jnp.sum(matrix * x, axis=1)
+
+
+def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
+    """Inverses of many small matrices, by Gauss-Jordan elimination with pivots."""
+    n = len(matrix)
+    rows = np.arange(n)[:, None]
+
+    def eliminate(k, X):
+        column = jnp.where(rows >= k, jnp.abs(X[:, k]), -1.0)
+        chosen = rows == jnp.argmax(column, axis=0)
+        pivot = jnp.sum(jnp.where(chosen[:, None], X, 0.0), axis=0)
+        X = jnp.where(chosen[:, None], X[k], X)
+        pivot = pivot / pivot[k]
+        X = X - X[:, k][:, None] * pivot
+        return jnp.where((rows == k)[:, None], pivot, X)
+
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
+    X = jnp.concatenate([matrix, eye], axis=1)
+    if n <= _UNROLLED_COLUMNS:
+        for k in range(n):
+            X = eliminate(k, X)
+    else:
+        X = jax.lax.fori_loop(0, n, eliminate, X)
+    return X[:, n:]

@@ -1,0 +1,155 @@
+"""The rule by which a step is accepted or rejected, and the length of the next one."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from ..._core.executor import Array, cond, namespace
+from ..._core.lanes import pick
+from ..._core.precision import at_precision
+from ...systems.structure import Structure
+from ..arrays import Index, Mask, Times
+from ..cubic import CubicCrossing, first_crossing
+from ..events import INSTANT, width
+from ..lanes import Lanes
+from ..watch import Watch
+from .locate import LANDING_TRIES
+from .state import Aim, Attempt, State, Task
+
+
+# A landing may lie beyond the step in which the crossing was met by this part of that step. Higher:
+# zeros of the step after it are accepted. Lower: those at its very end are missed.
+_BEYOND_STEP = 1e-6
+# The next step has this part of the length that the error estimate asks for, and lies between these
+# multiples of the last one (the lowest where the estimate is no number). Nearer to 1: more steps
+# are rejected. Farther: more steps are taken.
+_CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
+
+
+class Verdict(NamedTuple):
+    """The verdict on an attempted step: accepted on its `plain` way or where it `lands`; rejected
+    as `too_long`, or because of a crossing on the way."""
+
+    plain: Mask
+    """The step is accepted, and ends on no zero."""
+    lands: Mask
+    """The step is accepted, and ends on the zero aimed at."""
+    too_long: Mask
+    """Its error is too large."""
+    refine: Mask
+    """A watched function is not resolved: the step is halved."""
+    crosses: Mask
+    """A watched function crosses zero on the way: the lane approaches it."""
+    closer: Mask
+    """The landing failed, but may be tried again from nearer by."""
+    lost: Mask
+    """The landing failed for good."""
+    touch: Mask
+    """A watched function touches zero without a clear crossing."""
+    which: Index
+    """The function that crosses first."""
+    position: Times
+    """Position of that crossing, as a fraction of the step."""
+    chosen: Bool[Array, "W L"]
+    """The function on whose zero the lane has landed."""
+
+    @property
+    def accepted(self) -> Mask:
+        return self.plain | self.lands
+
+
+def accurate(new: Attempt, task: Task) -> Mask:
+    """Whether the error estimate of a step is at most the tolerance (times the lane's slack)."""
+    return new.error <= task.stride.slack
+
+
+def uneventful(s: Structure, state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
+    """Lanes whose step `accept` would accept on sight: accurate, no event, and no watched function
+    near a zero, save the target's level on which the lane lands."""
+    at_guard = new.lands & (aim.which < len(s.transitions))
+    calm = new.calm & accurate(new, task) & ~state.approach.on & (aim.schedule < 0) & ~at_guard
+    return calm | ~state.active
+
+
+def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdict:
+    """Accept or reject the attempted steps, which end at t.
+
+    A step is accepted if it is accurate, every watched function is resolved over it, and none
+    crosses zero on the way before the zero on which it lands.
+    """
+    approach, active, end = state.approach, state.active, new.seen
+    xp, within_error = namespace(t), accurate(new, task)
+    # Which approaches succeed.
+    tau = approach.tau + new.past
+    beyond = _BEYOND_STEP * approach.reach + at_precision(*INSTANT) * task.span
+    inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
+    falling = of_row(end.rate, aim.which) < 0
+    lands = active & new.lands & falling & xp.where(approach.on, inside, within_error)
+    failed = active & approach.on & ~lands
+    closer = failed & (approach.tries < LANDING_TRIES)
+    # What is crossed on the way.
+    fresh = active & ~approach.on & within_error
+    looked_at, moved = fresh | lands, step_length(aim, new)
+    crossing = _crossing(looked_at, state.seen, end, moved, state.ready)
+    zero = width(t, task.span, end.rate)
+    chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
+    at_end = lands & (xp.abs(end.value) <= zero)
+    positions = xp.where(chosen | at_end, xp.inf, crossing.position)
+    position = xp.min(positions, axis=0)
+    bent = fresh & new.bent
+    crosses = looked_at & xp.isfinite(position) & ~bent
+    refine = bent | (looked_at & ~crosses & (crossing.near & ~chosen).any(axis=0))
+    lands = lands & ~crosses & ~refine
+    return Verdict(
+        plain=fresh & ~crosses & ~refine & ~lands,
+        lands=lands,
+        too_long=active & ~approach.on & ~within_error,
+        refine=refine,
+        crosses=crosses,
+        closer=closer,
+        lost=failed & ~closer,
+        touch=fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0),
+        which=xp.argmin(positions, axis=0).astype(xp.int32),
+        position=position,
+        chosen=chosen & lands,
+    )
+
+
+def step_length(aim: Aim, new: Attempt) -> Times:
+    """Time from the start of the step to its end, or to the zero on which it lands."""
+    return aim.step + namespace(aim.step).where(new.lands, new.past, 0.0)
+
+
+def next_step(s: Structure, h: Times, aim: Aim, error: Times, lanes: Lanes) -> Times:
+    """The length of the step after one with this error relative to the tolerance, where h was
+    allowed."""
+    xp, orders = namespace(error), [s.method(a).order for a in range(len(s.charts))]
+    if set(orders) == {8.0}:  # cheaper than a power
+        length = xp.sqrt(xp.sqrt(xp.sqrt(error)))
+    else:
+        length = error ** xp.asarray(1 / np.array(orders))[lanes.chart]
+    factor = xp.clip(_CAUTION / length, _SHRINK, _GROW)
+    step = aim.step * xp.where(xp.isfinite(length), factor, _SHRINK_BLINDLY)
+    return xp.where((aim.step < h) & (length <= 1), xp.maximum(h, step), step)
+
+
+def of_row(x: Array, which: Index) -> Times:
+    """Each lane's entry in the row `which`; 0 for -1."""
+    return pick(x, range(len(x)), which)
+
+
+def _crossing(
+    some: Mask, seen: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
+) -> CubicCrossing:
+    """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
+    xp = namespace(ready)
+
+    def look():
+        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+
+    def none():
+        no = xp.zeros_like(ready)
+        return CubicCrossing(xp.full_like(end.value, xp.inf), no, no)
+
+    return cond(some.any(), look, none)

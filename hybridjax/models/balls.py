@@ -1,0 +1,205 @@
+"""Balls that bounce: on fixed ground, on a vibrating paddle, and in a row on a shaken table."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from .._core.boundary.kinds import Count
+from ..systems.chart import Chart
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class BallFall(Chart):
+    states = ("y", "v")
+    units = ("m", "m/s")
+    ball: "BouncingBall"
+
+    def field(self, t, q, u):
+        return q[1], u[0] - self.ball.g
+
+
+class BouncingBall(HybridSystem):
+    """A ball under gravity that keeps the share `restitution` of its speed at each bounce.
+
+    Input `u` is an acceleration. With a restitution below 1 the bounces accumulate in finite time
+    (Zeno), and the ball has no cycle but rest.
+    """
+
+    input_units = ("m/s^2",)
+    time_unit = "s"
+
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.7, doc="speed kept at a bounce")
+
+    def charts(self):
+        return {"fall": BallFall(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "bounce",
+                "fall",
+                "fall",
+                guard=lambda t, q, u: q[0],
+                reset=lambda t, q, u: (0.0, -self.restitution * q[1]),
+            ),
+        )
+
+
+class JugglerFall(Chart):
+    states = ("y", "v")
+    units = ("m", "m/s")
+    juggler: "PaddleJuggler"
+
+    def field(self, t, q, u):
+        return q[1], -self.juggler.g
+
+
+class PaddleJuggler(HybridSystem):
+    """A ball that bounces on a paddle in sinusoidal motion, once a period.
+
+    Input `u` is added to the speed of the paddle at the impact. Between impacts the ball falls
+    freely, so that everything is known in closed form (`exact`).
+
+    P. J. Holmes, The dynamics of repeated impacts with a sinusoidally vibrating table, J. Sound and
+    Vibration 84, 1982.
+    """
+
+    input_units = ("m/s",)
+    time_unit = "s"
+
+    A: Parameter = parameter(0.15, unit="m", doc="amplitude of the paddle")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the paddle")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.7, doc="relative speed kept at an impact")
+
+    @property
+    def rate(self):
+        return 2 * jnp.pi / self.T
+
+    def paddle(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Height and speed of the paddle."""
+        phase = self.rate * t
+        return self.A * jnp.sin(phase), self.A * self.rate * jnp.cos(phase)
+
+    def exact(self):
+        """Time of the impact, height and speed of the ball right after it, and the multipliers."""
+        a, v = self.restitution, self.g * self.T / 2
+        speed = (1 - a) * v / (1 + a)
+        t = jnp.arccos(speed / (self.A * self.rate)) / self.rate
+        y, _ = self.paddle(t)
+        acceleration = -(self.rate**2) * y
+        trace = 1 + a**2 + (1 + a) ** 2 * acceleration / self.g
+        root = jnp.sqrt(trace**2 / 4 - a**2 + 0j)
+        return t, y, v, jnp.stack([trace / 2 + root, trace / 2 - root])
+
+    def charts(self):
+        return {"fall": JugglerFall(self)}
+
+    def transitions(self):
+        def bounce(t, q, u):
+            a, (_, speed) = self.restitution, self.paddle(t)
+            return q[0], -a * q[1] + (1 + a) * (speed + u[0])
+
+        above = lambda t, q, u: q[0] - self.paddle(t)[0]  # noqa: E731
+        return (Transition("impact", "fall", "fall", guard=above, reset=bounce),)
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        # From the top of the flight on: half a period after an impact.
+        return Guess("fall", (1.3, 0.0), 0.56)
+
+
+class ChainFlight(Chart):
+    chain: "BouncingChain"
+
+    @property
+    def states(self):
+        masses = range(1, self.chain.n + 1)
+        return (*(f"y{i}" for i in masses), *(f"v{i}" for i in masses))
+
+    @property
+    def units(self):
+        return ("m",) * self.chain.n + ("m/s",) * self.chain.n
+
+    def field(self, t, q, u):
+        p = self.chain
+        y, v = q[: p.n], q[p.n :]
+        stretch = p.k * jnp.diff(y) + p.c * jnp.diff(v)
+        force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
+        return jnp.concatenate([v, force / p.m - p.g])
+
+
+class ChainContact(eqx.Module):
+    """Mass `i`, counted from 0, and the table below it."""
+
+    chain: "BouncingChain"
+    i: int
+
+    def table(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Its height and speed."""
+        chain = self.chain
+        rate = 2 * jnp.pi / chain.T
+        phase = rate * t - 2 * jnp.pi * self.i / chain.n
+        return chain.A * jnp.sin(phase), chain.A * rate * jnp.cos(phase)
+
+    def gap(self, t, q, u):
+        return q[self.i] - self.table(t)[0]
+
+    def impact(self, t, q, u):
+        e, n = self.chain.restitution, self.chain.n
+        _, speed = self.table(t)
+        return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
+
+
+class BouncingChain(HybridSystem):
+    """`n` equal masses in a row above a table, each joined to its neighbors by a spring and a
+    dashpot. Along the table a wave travels that is as long as the row: every mass bounces once a
+    period, one after the other.
+
+    States: heights `y1` to `yn` and speeds `v1` to `vn`. Input `u` is a force on the first mass.
+    Impacts keep the share `restitution` of the speed relative to the table.
+
+    Each mass alone is the ball of `juggler.py` (P. J. Holmes, J. Sound and Vibration 84, 1982). Of
+    any size: 2n states, n events.
+    """
+
+    input_units = ("N",)
+    time_unit = "s"
+
+    n: Count = eqx.field(static=True, default=2, metadata={"unit": "", "doc": "number of masses"})
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of each")
+    k: Parameter = parameter(0.3, unit="N/m", doc="stiffness between neighbors")
+    c: Parameter = parameter(0.05, unit="N s/m", doc="damping between neighbors")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    restitution: Parameter = parameter(0.5, doc="relative speed kept at an impact")
+    A: Parameter = parameter(0.3, unit="m", doc="amplitude of the table")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the table")
+
+    def charts(self):
+        return {"flight": ChainFlight(self)}
+
+    def transitions(self):
+        contacts = [ChainContact(self, i) for i in range(self.n)]
+        return [
+            Transition(f"impact {x.i + 1}", "flight", "flight", x.gap, reset=x.impact)
+            for x in contacts
+        ]
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        """The cycle of masses that are not coupled (see `PaddleJuggler.exact`)."""
+        a, v = self.restitution, self.g * self.T / 2
+        rate = 2 * jnp.pi / self.T
+        first = jnp.arccos((1 - a) / (1 + a) * v / (self.A * rate)) / rate
+        impact = first + jnp.arange(self.n) * self.T / self.n
+        past = -impact % self.T
+        lift = self.A * jnp.sin(rate * first)
+        y = lift + v * past - self.g * past**2 / 2
+        return Guess("flight", jnp.concatenate([y, v - self.g * past]))

@@ -1,0 +1,284 @@
+"""Actuated bipeds: the three-link walker with a torso, and the five-link robot RABBIT."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._core.vector_math.factorizations import solve_positive
+from ..mechanics.mechanism import Mechanism
+from ..systems.chart import Chart
+from ..systems.output import Output
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+def tips(arms: Float[Array, "k n"], q: Float[Array, " n"]) -> Float[Array, "2 k"]:
+    """Positions of points of a chain of links relative to its foot. `arms` are their coordinates
+    along each link, q the links' angles from the vertical."""
+    return jnp.stack([jnp.sin(q), jnp.cos(q)]) @ arms.T
+
+
+def chain(
+    arms: Float[Array, "k n"],
+    masses: Float[Array, " k"],
+    inertias: Float[Array, " n"] | float,
+    g: Parameter,
+) -> Mechanism:
+    """A chain of n links in a plane, by their angles and the place (x, y) of its foot, or by their
+    angles alone, with its foot at the origin."""
+    n = arms.shape[1]
+
+    def places(q):
+        return tips(arms, q[:n]) + (q[n:, None] if len(q) > n else 0.0)
+
+    def kinetic(q, v):
+        speeds = jax.jvp(places, (q,), (v,))[1]
+        return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
+
+    return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]))
+
+
+def accelerations_under_feedback(
+    mechanism: Mechanism,
+    q: Float[Array, " n"],
+    v: Float[Array, " n"],
+    desired: Float[Array, " n"],
+    direction: Float[Array, " n"],
+    torque: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """Accelerations `desired` + x `direction` of a chain that stands on a point, with motors
+    between its links.
+
+    Angles are absolute, so that the motors' torques have no sum: the sum of the equations of
+    motion, 1'(M a + h) = 0, gives x. The motors provide the remaining components (input-output
+    linearization) and do not compensate the further `torque`.
+    """
+    mass = mechanism.mass(q)
+    residual = jnp.sum(mechanism.bias(q, v)) + jnp.sum(mass @ desired)
+    x = -residual / jnp.sum(mass @ direction)
+    return desired + direction * x + solve_positive(mass, torque)
+
+
+def held(error: Array, rate: Array, stiffness: Parameter) -> Array:
+    """The acceleration that lets an error decay, critically damped."""
+    return -(stiffness**2) * error - 2 * stiffness * rate
+
+
+class TorsoStep(Chart):
+    states = ("th1", "th2", "th3", "w1", "w2", "w3")
+    units = ("rad", "rad", "rad", "rad/s", "rad/s", "rad/s")
+    walker: "TorsoWalker"
+
+    def field(self, t, state, u):
+        p, mechanism = self.walker, self.walker.mechanism()
+        q, v = state[:3], state[3:]
+        upright = held(q[2] - p.lean, v[2], p.stiffness)
+        mirrored = held(q[0] + q[1], v[0] + v[1], p.stiffness)
+        desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
+        direction, torque = jnp.array([1.0, -1.0, 0.0]), u[0] * jnp.array([0.0, -1.0, 1.0])
+        a = accelerations_under_feedback(mechanism, q, v, desired, direction, torque)
+        return jnp.concatenate([v, a])
+
+
+class TorsoWalker(HybridSystem):
+    """Two straight legs and a torso, which leans forward and thereby drives the walker.
+
+    States: angles `th1` of the stance leg, `th2` of the swing leg and `th3` of the torso from the
+    vertical, positive forward, and their rates. Motors at the hip hold the torso at the angle
+    `lean`, and let the swing leg mirror the stance leg. (The paper's feedback settles in finite
+    time; here errors decay as exp(-stiffness t).) Input `u` is a further torque between torso and
+    swing leg. A step ends where the stance leg has come to the angle `stride`; there the swing leg
+    takes over, sticks where it lands, and the legs change their names.
+
+    Masses, lengths, `lean` and `stride` are those of the program that goes with E. R. Westervelt,
+    J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control of Dynamic Bipedal Robot
+    Locomotion, 2007 (there with g = 9.8); the paper itself could not be compared.
+
+    J. W. Grizzle, G. Abba, F. Plestan, Asymptotically stable walking for biped robots: analysis via
+    systems with impulse effects, IEEE Trans. Automatic Control 46(1), 2001.
+    """
+
+    input_units = ("N m",)
+    time_unit = "s"
+
+    m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
+    mH: Parameter = parameter(15.0, unit="kg", doc="mass of the hip")
+    mT: Parameter = parameter(10.0, unit="kg", doc="mass of the torso")
+    r: Parameter = parameter(1.0, unit="m", doc="length of a leg, with its mass in the middle")
+    l: Parameter = parameter(0.5, unit="m", doc="from the hip to the torso's mass")  # noqa: E741
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    lean: Parameter = parameter(math.pi / 6, unit="rad", doc="angle of the torso")
+    stride: Parameter = parameter(math.pi / 8, unit="rad", doc="angle of the leg that ends a step")
+    stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
+
+    def mechanism(self) -> Mechanism:
+        """The walker by three angles, and for the floating base also by the position (x, y) of the
+        stance foot."""
+        half = self.r / 2
+        legs = half * jnp.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
+        arms = legs + self.l * jnp.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
+        return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
+
+    def charts(self):
+        return {"step": TorsoStep(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "touchdown",
+                "step",
+                "step",
+                guard=lambda t, q, u: q[0] - self.stride,
+                direction="rising",
+                reset=self._touchdown,
+            ),
+        )
+
+    def _touchdown(self, t, state, u):
+        q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
+        after = self.mechanism().impact(q, v, self._swing_foot).velocity
+        swapped = np.array([1, 0, 2])
+        return jnp.concatenate([q[swapped], after[swapped]])
+
+    def _swing_foot(self, q):
+        return q[3:] + tips(self.r * jnp.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
+
+    def guess(self):
+        start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
+        return Guess("step", start, after="touchdown")
+
+
+class BipedStep(Chart):
+    states = (
+        "shin", "thigh", "torso", "swing_thigh", "swing_shin",
+        "shin_rate", "thigh_rate", "torso_rate", "swing_thigh_rate", "swing_shin_rate",
+    )  # fmt: skip
+    units = ("rad",) * 5 + ("rad/s",) * 5
+    biped: "FiveLinkBiped"
+
+    def field(self, t, state, u):
+        p, mechanism = self.biped, self.biped.mechanism()
+        q, v = state[:5], state[5:]
+        leg, leg_rate = (q[0] + q[1]) / 2, (v[0] + v[1]) / 2
+        # The swing knee bends while the stance leg passes from -stride to stride.
+        bend, slope = p.lift * (1 - (leg / p.stride) ** 2), -2 * p.lift * leg / p.stride**2
+        knee = held(q[0] - q[1] - p.knee, v[0] - v[1], p.stiffness)
+        torso = held(q[2] - p.lean, v[2], p.stiffness)
+        mirrored = held((q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, p.stiffness)
+        swing_knee = (
+            held(q[4] - q[3] - p.knee - bend, v[4] - v[3] - slope * leg_rate, p.stiffness)
+            - 2 * p.lift * (leg_rate / p.stride) ** 2
+        )
+        desired = [knee / 2, -knee / 2, torso, mirrored - swing_knee / 2, mirrored + swing_knee / 2]
+        unit = jnp.ones_like(slope)
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
+        a = accelerations_under_feedback(mechanism, q, v, jnp.stack(desired), direction, torque)
+        return jnp.concatenate([v, a])
+
+
+class FiveLinkBiped(HybridSystem):
+    """Two legs with knees and a torso: ten states, four motors, and no torque at the foot.
+
+    States: absolute angles of the links from the vertical, positive forward, and their rates, of
+    the leg that stands (`shin`, `thigh`), the torso, and the leg that swings. The motors, by
+    input-output linearization, hold four virtual constraints: the knee that carries stays bent by
+    `knee`, the torso leans by `lean`, the swing leg mirrors the stance leg, and its knee bends
+    further by up to `lift` while the stance leg (the line from foot to hip) goes from -`stride` to
+    `stride`. Deviations, such as those that the impact makes, decay as exp(-stiffness t). What is
+    left, the rotation about the foot, is driven by the torso's lean. Input `u` is a further torque
+    between torso and swing thigh. A step ends when the swing foot comes down in front: it sticks,
+    the other foot lifts off, and the legs change their names. (That the ground only pushes, and
+    that no foot slips, is not checked.)
+
+    Where the numbers are from: masses, lengths, centers of mass and inertias are those that public
+    simulation programs give for RABBIT, among them one derived from E. R. Westervelt's and J. W.
+    Grizzle's of 2003; the two publications themselves could not be compared. Inertias are taken
+    about the joints, as in these authors' program of 2001 (which has an earlier set: 20, 6.8 and
+    3.2 kg; 2.22, 1.08 and 0.93 kg m^2); programs of others take the same numbers about the centers
+    of mass. RABBIT's motors, of 3.32e-4 kg m^2 behind gears of 50, and its friction are left out.
+    The virtual constraints, `lean`, `stride`, `knee`, `lift` and `stiffness` are none of theirs.
+
+    C. Chevallereau, G. Abba, Y. Aoustin, F. Plestan, E. R. Westervelt, C. Canudas-de-Wit, J. W.
+    Grizzle, RABBIT: a testbed for advanced control theory, IEEE Control Systems Magazine 23(5),
+    2003; E. R. Westervelt, J. W. Grizzle, C. Chevallereau, J. H. Choi, B. Morris, Feedback Control
+    of Dynamic Bipedal Robot Locomotion, CRC Press, 2007.
+    """
+
+    input_units = ("N m",)
+    time_unit = "s"
+
+    torso_mass: Parameter = parameter(12.0, unit="kg", doc="mass of the torso")
+    thigh_mass: Parameter = parameter(6.8, unit="kg", doc="mass of a thigh")
+    shin_mass: Parameter = parameter(3.2, unit="kg", doc="mass of a shin")
+    torso_inertia: Parameter = parameter(1.33, unit="kg m^2", doc="of the torso, about the hip")
+    thigh_inertia: Parameter = parameter(0.47, unit="kg m^2", doc="of a thigh, about the hip")
+    shin_inertia: Parameter = parameter(0.20, unit="kg m^2", doc="of a shin, about the knee")
+    length: Parameter = parameter(0.4, unit="m", doc="length of a thigh, and of a shin")
+    torso_center: Parameter = parameter(0.24, unit="m", doc="from the hip to the torso's mass")
+    thigh_center: Parameter = parameter(0.11, unit="m", doc="from the hip to a thigh's mass")
+    shin_center: Parameter = parameter(0.24, unit="m", doc="from the knee to a shin's mass")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    lean: Parameter = parameter(0.2, unit="rad", doc="angle of the torso")
+    stride: Parameter = parameter(0.2, unit="rad", doc="angle of the stance leg that ends a step")
+    knee: Parameter = parameter(0.2, unit="rad", doc="flexion of a knee that carries")
+    lift: Parameter = parameter(0.4, unit="rad", doc="further flexion of the swing knee")
+    stiffness: Parameter = parameter(20.0, unit="1/s", doc="rate at which errors decay")
+
+    def mechanism(self) -> Mechanism:
+        """The biped by five angles, and for the floating base also by the position (x, y) of
+        the stance foot."""
+        order = np.array([0, 1, 2, 1, 0])
+        m = jnp.stack([self.shin_mass, self.thigh_mass, self.torso_mass])[order]
+        about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]
+        center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])[order]
+        # Along whole links from the foot on, then along a part of the link itself.
+        links = jnp.array(
+            [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
+        )
+        arms = self.length * links + center[:, None] * jnp.diag(jnp.array([-1, -1, 1, -1, -1]))
+        return chain(arms, m, about_joint - m * center**2, self.g)
+
+    def _swing_foot(self, q):
+        """Position (x, y) of the swing foot relative to the stance foot."""
+        return tips(self.length * jnp.array([[1.0, 1.0, 0.0, -1.0, -1.0]]), q[:5])[:, 0]
+
+    def outputs(self):
+        """`leg`: the angle of the line from stance foot to hip, which grows all the time."""
+        return (Output("leg", lambda t, q, u: (q[0] + q[1]) / 2, "rad"),)
+
+    def charts(self):
+        return {"step": BipedStep(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "touchdown",
+                "step",
+                "step",
+                guard=lambda t, q, u: self._swing_foot(q)[1],
+                reset=self._touchdown,
+                enabled=lambda t, q, u: self._swing_foot(q)[0] > 0,
+            ),
+        )
+
+    def _touchdown(self, t, state, u):
+        q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
+        foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
+        after = self.mechanism().impact(q, v, foot).velocity
+        return jnp.concatenate([q[4::-1], after[4::-1]])
+
+    def guess(self):
+        s, k = self.stride, self.knee / 2
+        rate, bend = 1.5, 2 * self.lift / self.stride
+        return Guess(
+            "step",
+            (
+                *(-s + k, -s - k, self.lean, s - k, s + k),
+                *(rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)),
+            ),
+            after="touchdown",
+        )

@@ -1,0 +1,129 @@
+"""DC-DC converters with a switch that a controller closes and opens."""
+
+import equinox as eqx
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..systems.chart import Chart
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Scheduled, Transition
+
+
+class BuckCircuit(Chart):
+    states = ("v", "i", "ramp")
+    units = ("V", "A", "V")
+    buck: "BuckConverter"
+    closed: bool = eqx.field(static=True)
+
+    def field(self, t, q, u):
+        p = self.buck
+        v, i, _ = q
+        supply = p.Vin if self.closed else 0.0
+        return (i - v / p.R) / p.C, (supply - v) / p.L, (p.upper - p.lower) / p.T
+
+
+class BuckConverter(HybridSystem):
+    """A switch, a coil and a capacitor, and a comparator that closes the switch.
+
+    States: voltage `v` at the load, current `i` of the coil (it never rests: continuous
+    conduction), and the voltage `ramp` with which the amplified error is compared. The ramp starts
+    anew once a period; that is a scheduled event. Input `u` is added to the reference voltage.
+
+    E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans. Circuits and Systems I
+    43, 1996, whose parameters these are.
+    """
+
+    input_units = ("V",)
+    time_unit = "s"
+
+    R: Parameter = parameter(22.0, unit="ohm", doc="load")
+    C: Parameter = parameter(47e-6, unit="F", doc="capacitor")
+    L: Parameter = parameter(20e-3, unit="H", doc="coil")
+    Vin: Parameter = parameter(20.0, unit="V", doc="supply")
+    Vref: Parameter = parameter(11.3, unit="V", doc="reference")
+    gain: Parameter = parameter(8.4, doc="gain of the error amplifier")
+    lower: Parameter = parameter(3.8, unit="V", doc="start of the ramp")
+    upper: Parameter = parameter(8.2, unit="V", doc="end of the ramp")
+    T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
+
+    def control(self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]) -> Array:
+        """Amplified error less the ramp: the switch is closed where this is negative."""
+        return self.gain * (q[0] - self.Vref - u[0]) - q[2]
+
+    def charts(self):
+        return {"open": BuckCircuit(self, False), "closed": BuckCircuit(self, True)}
+
+    def transitions(self):
+        tick = Scheduled(self.T)
+        anew = lambda t, q, u: (q[0], q[1], self.lower)  # noqa: E731
+        return (
+            Transition("switch on", "open", "closed", self.control),
+            Transition("switch off", "closed", "open", self.control, direction="rising"),
+            Transition("ramp ends", "closed", "open", tick, reset=anew),
+            Transition("ramp ends (open)", "open", "open", tick, reset=anew),
+        )
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return Guess("open", (12.0, 0.6, self.lower))
+
+
+class CukCircuit(Chart):
+    states = ("i1", "v1", "i2", "v2")
+    units = ("A", "V", "A", "V")
+    cuk: "CukConverter"
+    closed: bool = eqx.field(static=True)
+
+    def field(self, t, q, u):
+        p = self.cuk
+        i1, v1, i2, v2 = q
+        # The capacitor between the coils stands in the loop of one or the other.
+        first, charge, second = (0.0, -i2, v1) if self.closed else (v1, i1, 0.0)
+        return (p.E - first) / p.L1, charge / p.C1, (second - v2) / p.L2, (i2 - v2 / p.R) / p.C2
+
+
+class CukConverter(HybridSystem):
+    """A clock closes the switch, and the sum of both coils' currents opens it at a reference.
+
+    States: current `i1` of the coil at the supply, voltage `v1` of the capacitor that carries the
+    energy over, current `i2` of the coil at the load, and the load's voltage `v2` (of opposite sign
+    to the supply, here counted as positive). While the switch is open the diode conducts, to the
+    end (continuous conduction). Input `u` is added to the reference current.
+
+    S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE Power
+    Electronics Specialists Conference, 1977; under such control, beyond its stable cycle: C. K.
+    Tse, W. C. Y. Chan, Chaos from a current-programmed Ćuk converter, Int. J. Circuit Theory and
+    Applications 23, 1995. The parameters are of a usual size, and from neither.
+    """
+
+    input_units = ("A",)
+    time_unit = "s"
+
+    E: Parameter = parameter(15.0, unit="V", doc="supply")
+    L1: Parameter = parameter(2e-3, unit="H", doc="coil at the supply")
+    L2: Parameter = parameter(2e-3, unit="H", doc="coil at the load")
+    C1: Parameter = parameter(20e-6, unit="F", doc="capacitor between the coils")
+    C2: Parameter = parameter(20e-6, unit="F", doc="capacitor at the load")
+    R: Parameter = parameter(10.0, unit="ohm", doc="load")
+    Iref: Parameter = parameter(2.0, unit="A", doc="reference for i1 + i2")
+    T: Parameter = parameter(100e-6, unit="s", doc="period of the clock")
+
+    def charts(self):
+        return {"open": CukCircuit(self, False), "closed": CukCircuit(self, True)}
+
+    def transitions(self):
+        tick = Scheduled(self.T)
+        left = lambda t, q, u: self.Iref + u[0] - q[0] - q[2]  # noqa: E731
+        return (
+            Transition("switch off", "closed", "open", left),
+            Transition("switch on", "open", "closed", tick),
+            Transition("stays on", "closed", "closed", tick),
+        )
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return Guess("open", (0.55, 25.0, 0.85, 10.0), 0.9 * self.T)

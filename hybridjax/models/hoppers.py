@@ -1,0 +1,224 @@
+"""The vertical hopper of the paper, the same on compliant ground, and a coupled pair of them."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..systems.chart import Chart
+from ..systems.solver import Radau
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class HopperFlight(Chart):
+    states = ("yM", "vM", "ym", "vm")
+    units = ("m", "m/s", "m", "m/s")
+    hopper: "VerticalHopper"
+
+    def field(self, t, q, u):
+        p = self.hopper
+        yM, vM, ym, vm = q
+        leg = p.leg(t, yM, ym)
+        return vM, (leg + u[0]) / p.M - p.g, vm, -(leg + p.b * vm) / p.m - p.g
+
+
+class HopperStance(Chart):
+    states = ("yM", "vM")
+    units = ("m", "m/s")
+    absent = {"ym": 0.0, "vm": 0.0}
+    hopper: "VerticalHopper"
+
+    def field(self, t, q, u):
+        p = self.hopper
+        yM, vM = q
+        return vM, (p.leg(t, yM, 0.0) + u[0]) / p.M - p.g
+
+
+class VerticalHopper(HybridSystem):
+    """Two masses on a leg spring with a sinusoidal actuator; the foot is damped in the air.
+
+    Input `u` is a force on the upper mass. With `retention` = r < 1 a touchdown multiplies the
+    speed of the upper mass by r.
+
+    S. A. Burden, S. Revzen, S. S. Sastry, Dimension reduction near periodic orbits of hybrid
+    systems, CDC-ECC 2011, and HSCC 2013, whose parameters these are.
+    """
+
+    input_units = ("N",)
+    time_unit = "s"
+
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of the foot")
+    M: Parameter = parameter(2.0, unit="kg", doc="mass of the body")
+    k: Parameter = parameter(10.0, unit="N/m", doc="stiffness of the leg")
+    b: Parameter = parameter(5.0, unit="N s/m", doc="damping of the foot in flight")
+    l0: Parameter = parameter(2.0, unit="m", doc="rest length of the leg")
+    a: Parameter = parameter(20.0, unit="N", doc="amplitude of the actuator")
+    g: Parameter = parameter(2.0, unit="m/s^2", doc="gravity")
+    omega: Parameter = parameter(2 * math.pi, unit="rad/s", doc="rate of the actuator")
+    retention: Parameter = parameter(1.0, doc="speed of the body kept at touchdown")
+
+    def leg(self, t: Array, yM: Array, ym: Array | float) -> Array:
+        """Force of the leg on the body."""
+        return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
+
+    def charts(self):
+        return {"flight": HopperFlight(self), "stance": HopperStance(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "touchdown",
+                "flight",
+                "stance",
+                guard=lambda t, q, u: q[2],
+                reset=lambda t, q, u: (q[0], self.retention * q[1]),
+            ),
+            Transition(
+                "liftoff",
+                "stance",
+                "flight",
+                guard=lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g,
+                reset=lambda t, q, u: (q[0], q[1], 0.0, 0.0),
+            ),
+        )
+
+    def period(self):
+        return 2 * jnp.pi / self.omega
+
+    def guess(self):
+        return Guess("stance", (2.0, 1.9), 0.5)
+
+
+class GroundContact(Chart):
+    states = ("yM", "vM", "ym", "vm")
+    units = ("m", "m/s", "m", "m/s")
+    solver = Radau()
+    hopper: "CompliantHopper"
+
+    def field(self, t, q, u):
+        p = self.hopper
+        yM, vM, ym, vm = q
+        leg = p.leg(t, yM, ym)
+        return vM, (leg + u[0]) / p.M - p.g, vm, (p.ground(ym, vm) - leg) / p.m - p.g
+
+
+class CompliantHopper(VerticalHopper):
+    """The hopper on a ground of stiffness `kg` and damping `cg`, from which the foot lifts off
+    where their force vanishes. There is no impact: all four states move in both charts.
+
+    Input `u` is a force on the upper mass.
+
+    The hopper is that of `hopper.py`; the ground is a spring and a dashpot in parallel, and only
+    pushes (on such contacts: K. H. Hunt, F. R. E. Crossley, J. Appl. Mech. 42 (1975) 440-445).
+    """
+
+    kg: Parameter = parameter(1e5, unit="N/m", doc="stiffness of the ground")
+    cg: Parameter = parameter(3e3, unit="N s/m", doc="damping of the ground")
+
+    def ground(self, ym: Array, vm: Array) -> Array:
+        """Force of the ground on the foot."""
+        return -self.kg * ym - self.cg * vm
+
+    def charts(self):
+        return {"flight": HopperFlight(self), "contact": GroundContact(self)}
+
+    def transitions(self):
+        force = lambda t, q, u: self.ground(q[2], q[3])  # noqa: E731
+        return (
+            Transition("touchdown", "flight", "contact", lambda t, q, u: q[2]),
+            Transition("liftoff", "contact", "flight", force),
+        )
+
+    def guess(self):
+        """The hopper's, where the ground carries the foot."""
+        return Guess("contact", (2.0, 1.9, -1e-4, 0.0), 0.5)
+
+
+_BODIES, _FEET = (("yM1", "vM1"), ("yM2", "vM2")), (("ym1", "vm1"), ("ym2", "vm2"))
+_STATES = sum(_BODIES + _FEET, ())
+# Chart by the feet that stand on the ground.
+_PAIR_CHARTS = {(): "air", (0,): "first", (1,): "second", (0, 1): "both"}
+
+
+class PairStanding(Chart):
+    pair: "HopperPair"
+    down: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def absent(self) -> dict[str, float]:
+        return {name: 0.0 for i in self.down for name in _FEET[i]}
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return tuple(name for name in _STATES if name not in self.absent)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ("m", "m/s") * (len(self.states) // 2)
+
+    def whole(self, q: Array) -> list[Array]:
+        """All eight states: feet on the ground rest."""
+        return [q[self.states.index(x)] if x in self.states else jnp.zeros(()) for x in _STATES]
+
+    def part(self, whole: Sequence) -> list:
+        return [x for name, x in zip(_STATES, whole, strict=True) if name in self.states]
+
+    def field(self, t, q, u):
+        p, whole = self.pair, self.whole(q)
+        pull = p.coupling * (whole[2] - whole[0])
+        bodies, feet = [], []
+        for i, between in enumerate((pull, -pull)):
+            (y, v), (ym, vm) = whole[2 * i : 2 * i + 2], whole[2 * i + 4 : 2 * i + 6]
+            leg = p.leg(t - i * p.lag, y, ym)
+            bodies += [v, (leg + between + u[i]) / p.M - p.g]
+            feet += [vm, -(leg + p.b * vm) / p.m - p.g]
+        return self.part(bodies + feet)
+
+
+class HopperPair(VerticalHopper):
+    """Two equal hoppers, a vertical spring between their bodies; the second actuator runs behind.
+
+    Inputs are a force on each body. A touchdown multiplies the speed of the body above it by
+    `retention`.
+
+    The hopper is that of `hopper.py`; the coupling is ours.
+    """
+
+    inputs = ("u1", "u2")
+    input_units = ("N", "N")
+
+    coupling: Parameter = parameter(1.0, unit="N/m", doc="stiffness of the spring between bodies")
+    lag: Parameter = parameter(0.3, unit="s", doc="by which the second actuator runs behind")
+
+    def charts(self):
+        return {name: PairStanding(self, down) for down, name in _PAIR_CHARTS.items()}
+
+    def transitions(self):
+        return tuple(self._step(i, down) for down in _PAIR_CHARTS for i in (0, 1))
+
+    def _step(self, i: int, down: tuple[int, ...]) -> Transition:
+        """Touchdown or liftoff of hopper i, while these feet are down."""
+        lifts = i in down
+        after = tuple(k for k in (0, 1) if (k in down) != (k == i))
+        before, landed = PairStanding(self, down), PairStanding(self, after)
+
+        def guard(t, q, u):
+            whole = before.whole(q)
+            force = self.leg(t - i * self.lag, whole[2 * i], 0.0) + self.m * self.g
+            return force if lifts else whole[2 * i + 4]
+
+        def reset(t, q, u):
+            whole = before.whole(q)
+            if not lifts:
+                whole[2 * i + 1] = self.retention * whole[2 * i + 1]
+            return landed.part(whole)
+
+        name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
+        return Transition(name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset)
+
+    def guess(self):
+        """Each as if it were alone: the first is about to lift off, the other comes down."""
+        return Guess("first", (2.0, 1.9, 1.6, -0.2, 0.55, -2.7), 0.5)

@@ -1,0 +1,148 @@
+"""Neurons that spike."""
+
+import jax.numpy as jnp
+
+from ..systems.chart import Chart
+from ..systems.solver import Radau
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class AdExMembrane(Chart):
+    states = ("v", "w")
+    units = ("mV", "pA")
+    neuron: "AdExNeuron"
+
+    def field(self, t, q, u):
+        p = self.neuron
+        v, w = q
+        current = p.current + p.amplitude * jnp.cos(2 * jnp.pi * t / p.T) + u[0]
+        spike = p.slope * jnp.exp((v - p.threshold) / p.slope)
+        leak = p.gL * (p.EL - v + spike)
+        return (leak - w + current) / p.C, (p.a * (v - p.EL) - w) / p.tau
+
+
+class AdExNeuron(HybridSystem):
+    """C v' = gL (EL - v + slope exp((v - threshold) / slope)) - w + I(t) + u and
+    tau w' = a (v - EL) - w, reset to v = EL, w + b at v = peak.
+
+    States: potential `v` of the membrane, and adaptation current `w`. The current I(t) = current +
+    amplitude cos(2 pi t / T) calls for one spike a period. Once the exponential has taken over, v
+    would be infinite after C / gL exp(-(v - threshold) / slope): 3.5e-4 ms from `peak` on. (The
+    paper's peak of 20 mV comes so late in it that double precision does not tell its time.)
+
+    R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective
+    description of neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but
+    for `peak`.
+    """
+
+    input_units = ("pA",)
+    time_unit = "ms"
+
+    C: Parameter = parameter(281.0, unit="pF", doc="capacitance")
+    gL: Parameter = parameter(30.0, unit="nS", doc="leak")
+    EL: Parameter = parameter(-70.6, unit="mV", doc="potential of the leak, and after a spike")
+    threshold: Parameter = parameter(-50.4, unit="mV")
+    slope: Parameter = parameter(2.0, unit="mV", doc="how sharply a spike sets in")
+    tau: Parameter = parameter(144.0, unit="ms", doc="time constant of the adaptation")
+    a: Parameter = parameter(4.0, unit="nS", doc="adaptation below the threshold")
+    b: Parameter = parameter(80.5, unit="pA", doc="step of the adaptation at a spike")
+    peak: Parameter = parameter(-30.0, unit="mV", doc="potential of a spike")
+    current: Parameter = parameter(1000.0, unit="pA", doc="mean of I(t)")
+    amplitude: Parameter = parameter(200.0, unit="pA", doc="amplitude of I(t)")
+    T: Parameter = parameter(40.0, unit="ms", doc="period of I(t)")
+
+    def charts(self):
+        return {"membrane": AdExMembrane(self)}
+
+    def transitions(self):
+        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
+        reset = lambda t, q, u: (self.EL, q[1] + self.b)  # noqa: E731
+        return (Transition("spike", "membrane", "membrane", below, reset=reset),)
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return Guess("membrane", (-53.0, 350.0), 0.5 * self.T)
+
+
+class IzhikevichMembrane(Chart):
+    states = ("v", "w")
+    units = ("mV", "mV/ms")
+    neuron: "IzhikevichNeuron"
+
+    def field(self, t, q, u):
+        p = self.neuron
+        v, w = q
+        current = p.current + p.amplitude * jnp.cos(2 * jnp.pi * t / p.T) + u[0]
+        return 0.04 * v**2 + 5 * v + 140 - w + current, p.a * (p.b * v - w)
+
+
+class IzhikevichNeuron(HybridSystem):
+    """v' = 0.04 v^2 + 5 v + 140 - w + I(t) + u, w' = a (b v - w), reset to v = c, w + d at v = 30.
+
+    States: potential `v` of the membrane, and its recovery `w` (u in the paper). The current I(t) =
+    current + amplitude cos(2 pi t / T) calls for one spike a period.
+
+    E. M. Izhikevich, Simple model of spiking neurons, IEEE Trans. Neural Networks 14, 2003, whose
+    parameters for regular spiking these are.
+    """
+
+    input_units = ("mV/ms",)
+    time_unit = "ms"
+
+    a: Parameter = parameter(0.02, unit="1/ms", doc="rate of the recovery")
+    b: Parameter = parameter(0.2, unit="1/ms", doc="how recovery follows the potential")
+    c: Parameter = parameter(-65.0, unit="mV", doc="potential after a spike")
+    d: Parameter = parameter(8.0, unit="mV/ms", doc="step of the recovery at a spike")
+    peak: Parameter = parameter(30.0, unit="mV", doc="potential of a spike")
+    current: Parameter = parameter(10.0, unit="mV/ms", doc="mean of I(t)")
+    amplitude: Parameter = parameter(4.0, unit="mV/ms", doc="amplitude of I(t)")
+    T: Parameter = parameter(40.0, unit="ms", doc="period of I(t)")
+
+    def charts(self):
+        return {"membrane": IzhikevichMembrane(self)}
+
+    def transitions(self):
+        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
+        reset = lambda t, q, u: (self.c, q[1] + self.d)  # noqa: E731
+        return (Transition("spike", "membrane", "membrane", below, reset=reset),)
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return Guess("membrane", (-74.0, -4.6), 0.5 * self.T)
+
+
+class NerveMembrane(Chart):
+    states = ("v", "w")
+    solver = Radau()
+    nerve: "FitzHughNagumo"
+
+    def field(self, t, q, u):
+        p = self.nerve
+        v, w = q
+        return (v - v**3 / 3 - w + p.current + u[0]) / p.eps, v + p.a - p.b * w
+
+
+class FitzHughNagumo(HybridSystem):
+    """eps v' = v - v^3 / 3 - w + I + u, w' = v + a - b w: spikes at a constant current I.
+
+    R. FitzHugh, Impulses and physiological states in theoretical models of nerve membrane, Biophys.
+    J. 1 (1961) 445-466; J. Nagumo, S. Arimoto, S. Yoshizawa, An active pulse transmission line
+    simulating nerve axon, Proc. IRE 50 (1962) 2061-2070.
+    """
+
+    eps: Parameter = parameter(0.01, doc="time scale of the membrane, of that of its recovery")
+    current: Parameter = parameter(0.5, doc="I")
+    a: Parameter = parameter(0.7)
+    b: Parameter = parameter(0.8)
+
+    def charts(self):
+        return {"membrane": NerveMembrane(self)}
+
+    def guess(self):
+        """A state on the slow branch, before the end of a spike."""
+        return Guess("membrane", (1.5, 0.9))

@@ -1,0 +1,273 @@
+"""Oscillators: clocked and autonomous, smooth and piecewise smooth."""
+
+import jax.numpy as jnp
+
+from ..systems.chart import Chart
+from ..systems.sliding import Sliding, sliding
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class DuffingLine(Chart):
+    states = ("x", "v")
+    units = ("m", "m/s")
+    duffing: "Duffing"
+
+    def field(self, t, q, u):
+        p = self.duffing
+        x, v = q
+        force = p.amplitude * jnp.cos(p.rate * t) + u[0]
+        return v, force - p.damping * v - p.alpha * x - p.beta * x**3
+
+
+class Duffing(HybridSystem):
+    """x'' + delta x' + alpha x + beta x^3 = gamma cos(omega t) + u, smooth and clocked.
+
+    With a hardening spring (beta > 0) the resonance leans over to higher frequencies: between two
+    folds there are three responses to one `rate`, the middle one unstable.
+
+    G. Duffing, Erzwungene Schwingungen bei veränderlicher Eigenfrequenz, Vieweg 1918; A. H. Nayfeh,
+    D. T. Mook, Nonlinear oscillations, Wiley 1979, Sec. 4.1.
+    """
+
+    input_units = ("m/s^2",)
+    time_unit = "s"
+
+    alpha: Parameter = parameter(1.0, unit="1/s^2", doc="linear stiffness")
+    beta: Parameter = parameter(0.05, unit="1/(m^2 s^2)", doc="cubic stiffness")
+    damping: Parameter = parameter(0.1, unit="1/s", doc="delta")
+    amplitude: Parameter = parameter(0.5, unit="m/s^2", doc="gamma, of the force")
+    rate: Parameter = parameter(0.5, unit="rad/s", doc="omega, of the force")
+
+    def charts(self):
+        return {"line": DuffingLine(self)}
+
+    def period(self):
+        return 2 * jnp.pi / self.rate
+
+    def guess(self):
+        """The response of the linear oscillator, far from resonance."""
+        return Guess("line", (self.amplitude / (self.alpha - self.rate**2), 0.0))
+
+
+class MathieuLine(Chart):
+    states = ("x", "v")
+    mathieu: "Mathieu"
+
+    def field(self, t, q, u):
+        p = self.mathieu
+        x, v = q
+        return v, u[0] - 2 * p.damping * v - (p.delta + p.epsilon * jnp.cos(t)) * x
+
+
+class Mathieu(HybridSystem):
+    """x'' + 2 c x' + (delta + epsilon cos t) x = u, with the period 2 pi; its cycle is rest.
+
+    At delta = 0.25, epsilon = 0.1 both multipliers are negative: no real N-th root of the monodromy
+    exists, and the argument of a multiplier does not say how often the state went round.
+
+    A. H. Nayfeh, D. T. Mook, Nonlinear oscillations, Wiley 1979, Ch. 5.
+    """
+
+    delta: Parameter = parameter(1.0, doc="stiffness")
+    epsilon: Parameter = parameter(0.4, doc="amplitude of the stiffness's oscillation")
+    damping: Parameter = parameter(0.1, doc="c")
+
+    def charts(self):
+        return {"line": MathieuLine(self)}
+
+    def period(self):
+        return jnp.asarray(2 * jnp.pi)
+
+    def guess(self):
+        return Guess("line", (0.0, 0.0))
+
+
+class RotorBlade(Chart):
+    states = ("b", "vb")
+    units = ("rad", "")
+    rotor: "RotorFlap"
+
+    def field(self, t, q, u):
+        p = self.rotor
+        b, vb = q
+        damping = p.lock / 8 * (1 + 4 / 3 * p.mu * jnp.sin(t))
+        stiffness = p.p**2 + p.lock / 8 * (4 / 3 * p.mu * jnp.cos(t) + p.mu**2 * jnp.sin(2 * t))
+        return vb, u[0] - damping * vb - stiffness * b
+
+
+class RotorFlap(HybridSystem):
+    """The flapping angle `b` of a rigid blade; time in radians of its rotation.
+
+    Input `u` is a flapping moment over the moment of inertia, such as pitch makes.
+
+    D. A. Peters, K. H. Hohenemser, Application of the Floquet transition matrix to problems of
+    lifting rotor stability, J. American Helicopter Society 16(2), 1971 (without reversed flow).
+    """
+
+    lock: Parameter = parameter(12.0, doc="Lock number, aerodynamic over inertial forces")
+    p: Parameter = parameter(1.0, doc="natural frequency over the rotor's")
+    mu: Parameter = parameter(0.3, doc="advance ratio")
+
+    def charts(self):
+        return {"blade": RotorBlade(self)}
+
+    def period(self):
+        return jnp.asarray(2 * jnp.pi)
+
+    def guess(self):
+        return Guess("blade", (0.0, 0.0))
+
+
+class HopfPlane(Chart):
+    states = ("x", "y")
+    oscillator: "HopfOscillator"
+
+    def field(self, t, q, u):
+        p = self.oscillator
+        x, y = q
+        growth, rate = p.mu - x**2 - y**2, 2 * jnp.pi / p.T
+        return growth * x - rate * y + u[0], rate * x + growth * y
+
+
+class HopfOscillator(HybridSystem):
+    """A smooth oscillator with a circular cycle of radius sqrt(mu) and multiplier exp(-2 mu T).
+
+    Input `u` is added to the rate of x.
+
+    J. Guckenheimer, P. Holmes, Nonlinear oscillations, dynamical systems, and bifurcations of
+    vector fields, Springer 1983, Sec. 3.4.
+    """
+
+    time_unit = "s"
+
+    mu: Parameter = parameter(0.1, unit="1/s", doc="growth rate at the origin")
+    T: Parameter = parameter(1.0, unit="s", doc="period")
+
+    def charts(self):
+        return {"plane": HopfPlane(self)}
+
+    def guess(self):
+        return Guess("plane", (1.1 * jnp.sqrt(self.mu), 0.0))
+
+
+class VanDerPolPlane(Chart):
+    states = ("x", "v")
+    oscillator: "VanDerPol"
+
+    def field(self, t, q, u):
+        x, v = q
+        return v, self.oscillator.mu * (1 - x**2) * v - x + u[0]
+
+
+class VanDerPol(HybridSystem):
+    """x'' = mu (1 - x^2) x' - x + u, with an attracting cycle for mu > 0.
+
+    B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926).
+    """
+
+    mu: Parameter = parameter(1.0, doc="strength of the nonlinear damping")
+
+    def charts(self):
+        return {"oscillation": VanDerPolPlane(self)}
+
+    def guess(self):
+        return Guess("oscillation", (2.0, 0.0))
+
+
+class BeltSlips(Chart):
+    states = ("x", "v")
+    units = ("m", "m/s")
+    block: "BeltOscillator"
+    side: float
+
+    def field(self, t, q, u):
+        p = self.block
+        friction = p.friction / (1 + p.decay * self.side * (q[1] - p.belt))
+        return q[1], (u[0] - p.k * q[0] - self.side * friction) / p.m
+
+
+class BeltOscillator(HybridSystem):
+    """A block on a spring, carried along by a belt until the spring tears it off.
+
+    States: extension `x` of the spring and speed `v`. Dry friction decreases with the speed
+    relative to the belt. On the belt (chart "sticks") both sides push towards the same speed
+    (`hj.sliding`). Every start that comes to stick leaves the belt at x = friction / k: all
+    multipliers are zero. Input `u` is a force.
+
+    R. I. Leine, D. H. van Campen, A. de Kraker, L. van den Steen, Stick-slip vibrations induced by
+    alternate friction models, Nonlinear Dynamics 16, 1998.
+    """
+
+    input_units = ("N",)
+    time_unit = "s"
+
+    m: Parameter = parameter(1.0, unit="kg", doc="mass")
+    k: Parameter = parameter(1.0, unit="N/m", doc="stiffness")
+    belt: Parameter = parameter(0.2, unit="m/s", doc="speed of the belt")
+    friction: Parameter = parameter(1.0, unit="N", doc="friction of a block that begins to slip")
+    decay: Parameter = parameter(3.0, unit="s/m", doc="how fast friction decreases with the speed")
+
+    def charts(self):
+        return self._parts().charts
+
+    def transitions(self):
+        return self._parts().transitions
+
+    def _parts(self) -> Sliding:
+        sides = {"ahead": BeltSlips(self, 1.0), "behind": BeltSlips(self, -1.0)}
+        return sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+
+    def guess(self):
+        return Guess("sticks", jnp.stack([0.5 * self.friction / self.k, self.belt]))
+
+
+class ChuaSlab(Chart):
+    states = ("x", "y", "z")
+    circuit: "ChuaCircuit"
+    side: float
+
+    def field(self, t, q, u):
+        p = self.circuit
+        x, y, z = q
+        resistor = (
+            p.inner * x if self.side == 0 else p.outer * (x - self.side) + p.inner * self.side
+        )
+        return p.alpha * (y - resistor) + u[0], x - y + z, -p.beta * y
+
+
+class ChuaCircuit(HybridSystem):
+    """x' = alpha (y - h(x)) + u, y' = x - y + z, z' = -beta y, with a resistor h of slope `inner`
+    where |x| < 1 (chart "middle"), and `outer` beyond (charts "left" and "right").
+
+    The field is continuous across x = 1 and x = -1; its derivative jumps. States: voltages `x` and
+    `y` of both capacitors, and current `z` of the coil, without dimensions.
+
+    T. Matsumoto, L. O. Chua, M. Komuro, The double scroll, IEEE Trans. Circuits and Systems 32,
+    1985, in whose dimensionless form it stands. Their double scroll is at alpha = 9; at alpha = 8,
+    before its periods double, there is a cycle around either of two equilibria.
+    """
+
+    alpha: Parameter = parameter(8.0, doc="ratio of the capacitors")
+    beta: Parameter = parameter(100 / 7, doc="of a capacitor to the coil")
+    inner: Parameter = parameter(-1 / 7, doc="slope of h for small voltages")
+    outer: Parameter = parameter(2 / 7, doc="the same for large ones")
+
+    def charts(self):
+        return {
+            "left": ChuaSlab(self, -1.0),
+            "middle": ChuaSlab(self, 0.0),
+            "right": ChuaSlab(self, 1.0),
+        }
+
+    def transitions(self):
+        right, left = (lambda t, q, u, x=x: q[0] - x for x in (1.0, -1.0))
+        return (
+            Transition("in from the right", "right", "middle", right),
+            Transition("out to the right", "middle", "right", right, "rising"),
+            Transition("in from the left", "left", "middle", left, "rising"),
+            Transition("out to the left", "middle", "left", left),
+        )
+
+    def guess(self):
+        return Guess("right", (2.1, 0.1, -3.0))

@@ -1,0 +1,239 @@
+"""Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
+
+import math
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .._core.boundary.checked import checked_methods
+from ..systems.chart import Chart
+from ..systems.output import Output
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+Leg = Literal["hind", "front"]
+Legs = tuple[Leg, ...]
+_LEGS: Legs = get_args(Leg)
+# Charts by the legs that stand on the table.
+_CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
+
+
+class BarStanding(Chart):
+    states = ("y", "v", "q", "p")
+    units = ("m", "m/s", "rad", "rad/s")
+    bar: "TwoLeggedBar"
+    legs: Legs = eqx.field(static=True)
+
+    def field(self, t, state, u):
+        bar = self.bar
+        _, v, _, p = state
+        forces: dict[Leg, Array] = {leg: bar.force(leg, t, state) for leg in self.legs}
+        torque = sum((bar.hip(leg) * F for leg, F in forces.items()), start=0.0)
+        return v, (sum(forces.values(), start=0.0) + u[0]) / bar.m - bar.g, p, torque / bar.J
+
+
+@checked_methods
+class TwoLeggedBar(HybridSystem):
+    """A rigid bar, hopping on a hind and a front leg over a table that shakes up and down.
+
+    States: height `y` of the center and its speed `v`, pitch `q` (a small angle by definition) and
+    its rate `p`. Input `u` is a vertical force at the center. A foot that lands loses the share
+    1 - rho of its speed relative to the table in an impulse; it lets go when its leg has its rest
+    length again.
+
+    The legs are linear spring-dampers without mass (R. Blickhan, The spring-mass model for running
+    and hopping, J. Biomech. 22, 1989). Both feet land, and both let go, within a few hundredths of
+    a period, and each touchdown changes the speed at which the other foot comes down.
+    """
+
+    input_units = ("N",)
+    time_unit = "s"
+
+    m: Parameter = parameter(1.0, unit="kg", doc="mass of the bar")
+    J: Parameter = parameter(0.2, unit="kg m^2", doc="moment of inertia of the bar")
+    hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
+    front: Parameter = parameter(0.55, unit="m", doc="position of the front hip")
+    k: Parameter = parameter(15.0, unit="N/m", doc="stiffness of a leg")
+    b: Parameter = parameter(1.0, unit="N s/m", doc="damping of a leg")
+    l0: Parameter = parameter(1.0, unit="m", doc="rest length of a leg")
+    g: Parameter = parameter(10.0, unit="m/s^2", doc="gravity")
+    rho: Parameter = parameter(0.8, doc="relative speed of a foot kept when it lands")
+    A: Parameter = parameter(0.2, unit="m", doc="amplitude of the table")
+    T: Parameter = parameter(1.0, unit="s", doc="period of the table")
+
+    def hip(self, leg: Leg) -> Parameter:
+        """Position of a leg's hip along the bar."""
+        return self.hind if leg == "hind" else self.front
+
+    def length(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+        """Length of a standing leg less its rest length: the foot's height while in the air."""
+        y, _, q, _ = state
+        table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
+        return y + self.hip(leg) * q - table - self.l0
+
+    def speed(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+        """Rate of `length`."""
+        _, v, _, p = state
+        rate = 2 * jnp.pi / self.T
+        return v + self.hip(leg) * p - self.A * rate * jnp.cos(rate * t)
+
+    def force(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
+        """Force of a standing leg on the bar."""
+        return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
+
+    def charts(self):
+        return {name: BarStanding(self, legs) for legs, name in _CHARTS.items()}
+
+    def transitions(self):
+        transitions = []
+        for legs, name in _CHARTS.items():
+            for leg in _LEGS:
+                lands = leg not in legs
+                other = tuple(x for x in _LEGS if (x in legs) != (x == leg))
+                transitions.append(
+                    Transition(
+                        f"{leg} {'lands' if lands else 'lifts'} ({name})",
+                        name,
+                        _CHARTS[other],
+                        guard=lambda t, q, u, leg=leg: self.length(leg, t, q),
+                        direction="falling" if lands else "rising",
+                        reset=lambda t, q, u, leg=leg, lands=lands: (
+                            self._impact(leg, t, q) if lands else q
+                        ),
+                    )
+                )
+        return tuple(transitions)
+
+    def _impact(self, leg, t, state):
+        y, v, q, p = state
+        s = self.hip(leg)
+        impulse = -(1 - self.rho) * self.speed(leg, t, state) / (1 / self.m + s**2 / self.J)
+        return y, v + impulse / self.m, q, p + s * impulse / self.J
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return Guess("both", (0.4, -0.9, 0.0, 0.5))
+
+
+class TrotSupport(BarStanding):
+    bar: "TrottingQuadruped"
+
+    def field(self, t, state, u):
+        both = len(self.legs) == 2
+        return super().field(t, state, u + self.bar.thrust if both else u)
+
+
+class TrottingQuadruped(TwoLeggedBar):
+    """A bar on four legs, of which a diagonal pair lands at once, and then the other.
+
+    Seen from the side both pairs are the same, so that a hop is a cycle, and two of them a stride.
+    Legs of the pair in turn lengthen and shorten by A sin(2 pi t / T). States and input as those of
+    `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both feet of a pair
+    stand, a reflex adds `thrust` to the force of the legs. Without it, the order in which the feet
+    land has no effect of first order, and the cycle has multipliers; with it, each order has a
+    derivative of its own (`hj.orbits.coincidences`), and `find_limit_cycle` says so.
+
+    The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
+    piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
+    Event-selected vector field discontinuities yield piecewise-differentiable flows, SIAM J.
+    Applied Dynamical Systems 15, 2016.
+    """
+
+    hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
+    front: Parameter = parameter(0.5, unit="m", doc="position of the front hip")
+    rho: Parameter = parameter(1.0, doc="relative speed of a foot kept when it lands")
+    thrust: Parameter = parameter(0.0, unit="N", doc="force of the reflex, of both legs")
+
+    def charts(self):
+        return {name: TrotSupport(self, chart.legs) for name, chart in super().charts().items()}
+
+    def guess(self):
+        return Guess("both", (0.4, -0.9, 0.0, 0.0))
+
+
+class RunnerFlight(Chart):
+    states = ("y", "vx", "vy")
+    units = ("m", "m/s", "m/s")
+    runner: "SLIPRunner"
+
+    def field(self, t, q, u):
+        return q[2], 0.0 * q[1], -self.runner.g
+
+
+class RunnerStance(Chart):
+    states = ("x", "y", "vx", "vy")
+    units = ("m", "m", "m/s", "m/s")
+    runner: "SLIPRunner"
+
+    def field(self, t, q, u):
+        p = self.runner
+        x, y, vx, vy = q
+        r = jnp.hypot(x, y)
+        push = p.k / p.m * (p.l0 - r) / r
+        return vx, vy, push * x, push * y - p.g
+
+
+class SLIPRunner(HybridSystem):
+    """A point mass on a massless spring, which touches down at a fixed angle of attack.
+
+    States: height `y` and speeds `vx`, `vy`; in stance also `x`, the place of the mass relative to
+    the foot. (In flight the place does not matter and is left out, so that a step is a cycle.)
+    Input `u` is added to the angle of attack. Energy is conserved (output `energy`): one multiplier
+    is exactly 1, and cycles come in families, one for each energy:
+    `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.
+
+    R. Blickhan, The spring-mass model for running and hopping, J. Biomechanics 22, 1989; H. Geyer,
+    A. Seyfarth, R. Blickhan, Spring-mass running: simple approximate solution and application to
+    gait stability, J. Theoretical Biology 232, 2005.
+    """
+
+    input_units = ("rad",)
+    time_unit = "s"
+
+    m: Parameter = parameter(80.0, unit="kg", doc="mass")
+    k: Parameter = parameter(20000.0, unit="N/m", doc="stiffness of the leg")
+    l0: Parameter = parameter(1.0, unit="m", doc="rest length of the leg")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
+
+    def energy(self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]) -> Array:
+        """Energy of the mass, and in stance of the spring."""
+        *x, y, vx, vy = q
+        spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0
+        return self.m * (self.g * y + (vx**2 + vy**2) / 2) + spring
+
+    def outputs(self):
+        return (Output("energy", self.energy, "J"),)
+
+    def charts(self):
+        return {"flight": RunnerFlight(self), "stance": RunnerStance(self)}
+
+    def transitions(self):
+        attack = lambda u: self.angle + u[0]  # noqa: E731
+        return (
+            Transition(
+                "touchdown",
+                "flight",
+                "stance",
+                guard=lambda t, q, u: q[0] - self.l0 * jnp.sin(attack(u)),
+                reset=lambda t, q, u: (-self.l0 * jnp.cos(attack(u)), *q),
+                enabled=lambda t, q, u: q[2] < 0,
+            ),
+            Transition(
+                "liftoff",
+                "stance",
+                "flight",
+                guard=lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0,
+                direction="rising",
+                reset=lambda t, q, u: q[1:],
+            ),
+        )
+
+    def guess(self):
+        return Guess("flight", (0.95, 5.07, 0.0))

@@ -1,0 +1,206 @@
+"""Passive walkers on a slope: the rimless wheel, the simplest walking model, the compass gait."""
+
+import math
+
+import jax.numpy as jnp
+
+from ..systems.chart import Chart
+from ..systems.system import Guess, HybridSystem, Parameter, parameter
+from ..systems.transition import Transition
+
+
+class WheelSwing(Chart):
+    states = ("th", "w")
+    units = ("rad", "rad/s")
+    wheel: "RimlessWheel"
+
+    def field(self, t, q, u):
+        th, w = q
+        return w, self.wheel.rate * jnp.sin(th) + u[0]
+
+
+class RimlessWheel(HybridSystem):
+    """An inverted pendulum about the spoke that stands, from one spoke to the next.
+
+    States: angle `th` of that spoke from the vertical, positive downhill, and its rate `w`. Input
+    `u` is a hip torque over the moment of inertia. The return map is linear in w^2, so that the
+    cycle and its multiplier cos^2(2 alpha) are known in closed form (`exact`).
+
+    T. McGeer, Passive dynamic walking, Int. J. Robotics Research 9(2), 1990; M. J. Coleman, PhD
+    thesis, Cornell University, 1998.
+    """
+
+    input_units = ("1/s^2",)
+    time_unit = "s"
+
+    rate: Parameter = parameter(1.0, unit="1/s^2", doc="g / l")
+    spokes: Parameter = parameter(8.0, doc="number of spokes")
+    slope: Parameter = parameter(0.08, unit="rad", doc="angle of the slope")
+
+    @property
+    def alpha(self):
+        """Half the angle between spokes."""
+        return jnp.pi / self.spokes
+
+    def exact(self):
+        """Speed right after an impact, and the multiplier."""
+        spread = jnp.sin(self.alpha) * jnp.sin(self.slope)
+        w = jnp.sqrt(4 * self.rate * spread) / jnp.tan(2 * self.alpha)
+        return w, jnp.cos(2 * self.alpha) ** 2
+
+    def charts(self):
+        return {"swing": WheelSwing(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "impact",
+                "swing",
+                "swing",
+                guard=lambda t, q, u: q[0] - self.slope - self.alpha,
+                direction="rising",
+                reset=lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1]),
+            ),
+        )
+
+    def guess(self):
+        return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))
+
+
+class SimplestStep(Chart):
+    states = ("th", "phi", "w", "p")
+    units = ("rad", "rad", "", "")
+    walker: "SimplestWalker"
+
+    def field(self, t, q, u):
+        th, phi, w, p = q
+        stance = jnp.sin(th - self.walker.slope)
+        swing = (w**2 - jnp.cos(th - self.walker.slope)) * jnp.sin(phi)
+        return w, p, stance, stance + swing + u[0]
+
+
+class SimplestWalker(HybridSystem):
+    """A heavy hip on massless legs with light feet; time in units of sqrt(l / g).
+
+    States: angle `th` of the stance leg from the normal of the slope, angle `phi` between the legs,
+    and their rates `w`, `p`. Input `u` is a hip torque, as an acceleration of phi. At heelstrike
+    the legs change their names. The feet scuff past each other in the middle of a step: there the
+    guard rises, and that is no event.
+
+    M. Garcia, A. Chatterjee, A. Ruina, M. Coleman, The simplest walking model: stability,
+    complexity, and scaling, J. Biomechanical Engineering 120, 1998.
+    """
+
+    slope: Parameter = parameter(0.009, unit="rad", doc="angle of the slope")
+
+    def charts(self):
+        return {"step": SimplestStep(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "heelstrike",
+                "step",
+                "step",
+                guard=lambda t, q, u: q[1] - 2 * q[0],
+                direction="rising",
+                reset=_heelstrike,
+                enabled=lambda t, q, u: q[0] < 0,
+            ),
+        )
+
+    def guess(self):
+        """The long-period gait; `short_gait` is the other one."""
+        return _after_heelstrike(0.2, -0.2)
+
+    def short_gait(self):
+        """A guess of the short-period gait, which is unstable."""
+        return _after_heelstrike(0.19, -0.2)
+
+
+def _heelstrike(t, q, u):
+    th, _, w, _ = q
+    c = jnp.cos(2 * th)
+    return -th, -2 * th, c * w, c * (1 - c) * w
+
+
+def _after_heelstrike(th, w):
+    return Guess("step", (th, 2 * th, w, (1 - jnp.cos(2 * th)) * w))
+
+
+class CompassStep(Chart):
+    states = ("n", "s", "vn", "vs")
+    units = ("rad", "rad", "rad/s", "rad/s")
+    walker: "CompassGait"
+
+    def field(self, t, q, u):
+        p = self.walker
+        n, s, vn, vs = q
+        coupling = p.m * p.l * p.b
+        c, d = jnp.cos(s - n), coupling * jnp.sin(s - n)
+        gravity = p.g * (p.mH * p.l + p.m * p.a + p.m * p.l)
+        torque_n = -d * vs**2 - p.m * p.g * p.b * jnp.sin(n) + u[0]
+        torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
+        # The inverse of [[A, B], [B, D]].
+        A, B, D = p.m * p.b**2, -coupling * c, (p.mH + p.m) * p.l**2 + p.m * p.a**2
+        det = A * D - B**2
+        return vn, vs, (D * torque_n - B * torque_s) / det, (A * torque_s - B * torque_n) / det
+
+
+class CompassGait(HybridSystem):
+    """A mass at the hip and one on each leg, walking down a slope.
+
+    States: angles `n` of the swing leg and `s` of the stance leg from the vertical, and their rates
+    `vn`, `vs`. Input `u` is a hip torque (+u on n, -u on s). At heelstrike the legs change their
+    names. The guard is zero right after that and moves down, away from its event: only when it has
+    been positive, past the scuff, may it fire.
+
+    A. Goswami, B. Thuilot, B. Espiau, A study of the passive gait of a compass-like biped robot,
+    Int. J. Robotics Research 17(12), 1998.
+    """
+
+    input_units = ("N m",)
+    time_unit = "s"
+
+    mH: Parameter = parameter(10.0, unit="kg", doc="mass of the hip")
+    m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
+    a: Parameter = parameter(0.5, unit="m", doc="from the foot to the leg's mass")
+    b: Parameter = parameter(0.5, unit="m", doc="from the leg's mass to the hip")
+    g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")
+    slope: Parameter = parameter(3.0 * math.pi / 180, unit="rad", doc="angle of the slope")
+
+    @property
+    def l(self):  # noqa: E743
+        """Length of a leg."""
+        return self.a + self.b
+
+    def charts(self):
+        return {"step": CompassStep(self)}
+
+    def transitions(self):
+        return (
+            Transition(
+                "heelstrike",
+                "step",
+                "step",
+                guard=lambda t, q, u: q[0] + q[1] + 2 * self.slope,
+                reset=self._heelstrike,
+                enabled=lambda t, q, u: q[1] < 0,
+            ),
+        )
+
+    def _heelstrike(self, t, q, u):
+        """Angular momentum about the new foot, and of the new swing leg about the hip, are kept."""
+        n, s, vn, vs = q
+        m, mH, a, b, length = self.m, self.mH, self.a, self.b, self.l
+        c = jnp.cos(s - n)
+        whole = -m * a * b * vn + (-m * a * b + (mH * length**2 + 2 * m * a * length) * c) * vs
+        leg = -m * a * b * vs
+        A, B = m * b * (b - length * c), m * length * (length - b * c) + m * a**2 + mH * length**2
+        C, D = m * b**2, -m * b * length * c
+        det = A * D - B * C
+        return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det
+
+    def guess(self):
+        s = 0.22
+        return Guess("step", (-2 * self.slope - s, s, -0.35, -1.1))
