@@ -12,9 +12,9 @@ import numpy as np
 from beartype import beartype
 
 import hybridjax as hj
-from hybridjax._core.boundary.values import Reals
 from hybridjax._core.boundary.checked import checked
 from hybridjax._core.boundary.kinds import Count, Index, Numbers, Order, Positive, SignalNames
+from hybridjax._core.boundary.values import Reals
 
 
 def count(n: Count): ...

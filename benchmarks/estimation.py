@@ -19,7 +19,7 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
   `HTF.confidence_radius`; `wider` is the ratio of their mean radii.
 - `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % regions of H_0, H_1 and H_-1 at ten fixed frequencies
-  (`region`: by `htf_p_values`, `disc`: discs) hold the best linear approximation, the mean over
+  (`disc`) hold the best linear approximation, the mean over
   2000 realizations without noise. `p`: the smallest binomial p-value times the number of tests
   (60, for each family and amplitude), which is above 0.01 where the regions are right.
   `distortion`: the part of the variance that is not noise. `bias`: the best linear approximation
@@ -145,9 +145,10 @@ def discs(draws: int = 200_000) -> None:
 
 def leakage(family: Family) -> None:
     design = hj.multisine(highest_harmonic=2)
-    for output, value in zip(
-        OUTPUTS, hj.identify.predict_leakage(design, family.model, (0,))[0], strict=True
-    ):
+    data = hj.experiments.simulate_experiments(family.model, design, start="periodic")
+    estimate = hj.estimate_htf(data, 0, highest=2)
+    errors = estimate.harmonic_errors(family.model.htf(estimate.f, 0))[0]
+    for output, value in zip(OUTPUTS, errors, strict=True):
         family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
 
 
@@ -167,22 +168,20 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         estimate = hj.estimate_htf(noisy, (-1, 0, 1), repeats=2).at(chosen)
         error = np.abs(np.asarray(estimate.H) - np.asarray(truth.H))
         return {
-            "region": hj.identify.htf_p_values(noisy, truth, repeats=2) > 0.05,
             "disc": error <= np.asarray(estimate.confidence_radius()),
             "variance": np.stack([estimate.variance, estimate.noise_variance]),
         }
 
     found = hj.monte_carlo(draw, runs, seed)
     name = f"coverage.{rms}.{each}_realizations"
-    for kind in ("disc", "region"):
-        hits = found[kind].sum("draw").values
-        tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
-        family.show(f"{name}.{kind}.mean", hits.mean() / runs)
-        family.show(f"{name}.{kind}.least", hits.min() / runs)
-        family.show(f"{name}.{kind}.most", hits.max() / runs)
-        family.show(f"{name}.{kind}.p", min(tests.min() * tests.size, 1.0))
-        m, i, k, _ = worst = np.unravel_index(np.argmin(hits), hits.shape)
-        print(f"# least: H_{m - 1} of {OUTPUTS[k]} at f = {chosen[i]}", flush=True)
+    hits = found["disc"].sum("draw").values
+    tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
+    family.show(f"{name}.disc.mean", hits.mean() / runs)
+    family.show(f"{name}.disc.least", hits.min() / runs)
+    family.show(f"{name}.disc.most", hits.max() / runs)
+    family.show(f"{name}.disc.p", min(tests.min() * tests.size, 1.0))
+    m, i, k, _ = worst = np.unravel_index(np.argmin(hits), hits.shape)
+    print(f"# least: H_{m - 1} of {OUTPUTS[k]} at f = {chosen[i]}", flush=True)
     total, noise = found.variance.mean("draw").values
     family.show(f"{name}.distortion.mean", np.mean(1 - noise / total))
     family.show(f"{name}.distortion.most", np.max(1 - noise / total))

@@ -30,6 +30,7 @@ import argparse
 import numpy as np
 from estimation import Family, N
 from scipy import stats
+from scipy.interpolate import AAA
 from second_order import OUTPUTS, sections
 
 import hybridjax as hj
@@ -59,10 +60,14 @@ def paper(family: Identification) -> None:
     data = family.run(hj.paper_design())
     estimate = hj.estimate_htf(data)
     family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
-    rational, aaa = hj.fit_rational(estimate), hj.identify.fit_aaa(estimate, tolerance=1e-4)
+    rational, H = hj.fit_rational(estimate), np.asarray(estimate[0])[..., 0]
+    z = np.exp(2j * np.pi * np.asarray(estimate.f) / N)
+    inner = z.imag > 1e-12
+    z, H = np.append(z, z[inner].conj()), np.concatenate([H, H[inner].conj()])
     for k, output in enumerate(OUTPUTS):
-        for name, fit in (("rational", rational), ("aaa", aaa)):
-            family.show(f"paper.{name}.{output}", np.nanmin(abs(fit.multipliers[k] - family.true)))
+        aaa = AAA(z, H[:, k], rtol=1e-4, clean_up=False).poles() ** N
+        for name, multipliers in (("rational", rational.multipliers[k]), ("aaa", aaa)):
+            family.show(f"paper.{name}.{output}", np.nanmin(abs(multipliers - family.true)))
     some = hj.ExperimentData(
         data.u[:20], data.y[:20], n_sections=N, periods=64, inputs=data.inputs, outputs=OUTPUTS
     )

@@ -28,14 +28,11 @@ import numpy as np
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.joint.characteristic import characteristic_slopes
-from hybridjax.identify.joint.coordinates import local_coordinates
-from hybridjax.identify.joint.periodic_model import PeriodicModel
-from hybridjax.identify.joint.prediction.predictor import Predictor
-from hybridjax.identify.joint.prediction.problem import SeriesProblem
-from hybridjax.identify.joint.prediction.series_part import SeriesPart
-from hybridjax.identify.multipliers.bound import MultiplierBound
-from hybridjax.identify.multipliers.denominator import multipliers_of
+from hybridjax.identify.denominator import multipliers_of
+from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
+from hybridjax.identify.joint.noise import Predictor
+from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.series.records import CycleGrid
 
 
@@ -91,7 +88,7 @@ def bound(joint: hj.LDTP, noise: hj.LDTP, records: list[hj.Record]) -> float:
     problem = SeriesProblem(parts, filtered.S, True, True, 0)
     c, slopes = characteristic_slopes(coordinates)
     root = slopes @ problem.linearize(coordinates).spread().root * np.sqrt(len(records))
-    found = MultiplierBound(multipliers_of(c), c, root @ root.T)
+    found = MultiplierEstimate(multipliers_of(c), c, root @ root.T, np.inf)
     true = system().multipliers[0]
     return float(found.standard_errors[np.abs(found.multipliers - true).argmin()])
 

@@ -44,11 +44,11 @@ from .fitting.observations import (
     ObservedHTF as ObservedHTF,
     ObservedSeries as ObservedSeries,
 )
-from .identify.htf.nonparametric import estimate_htf as estimate_htf
+from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
-from .identify.multipliers.order import select_order as select_order
-from .identify.multipliers.structured import fit_multipliers as fit_multipliers
-from .identify.rational.fit import fit_rational as fit_rational
+from .identify.multipliers import fit_multipliers as fit_multipliers
+from .identify.order import select_order as select_order
+from .identify.rational import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
 from .identify.validation.validate import validate as validate
 from .io import load as load, save as save
@@ -66,6 +66,7 @@ from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
 from .scale.sweep import sweep as sweep
 from .sections.families import (
+    ArcLength as ArcLength,
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,
     SectionList as SectionList,

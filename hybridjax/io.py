@@ -18,8 +18,8 @@ from .errors import DefinitionError
 from .experiments.data import ExperimentData
 from .experiments.design.design import Design
 from .experiments.record import Record
-from .identify.multipliers.structured import StructuredFit
-from .identify.rational.fit import RationalFit
+from .identify.multipliers import StructuredFit
+from .identify.rational import RationalFit
 from .identify.series.fit import SeriesFit
 from .linear.htf import HTF
 from .linear.ldtp import LDTP

@@ -12,6 +12,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, complex_number, multiplier_table, picture
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.orbits.branch import BranchEnd, BranchPoint
 
 
@@ -138,11 +139,11 @@ def test_fits():
 
 def test_intervals_are_those_of_the_normal_distribution(model):
     """Half-widths of a real multiplier whose coefficient is known to 0.01."""
-    known = hj.identify.MultiplierBound(np.array([0.5 + 0j]), np.array([-0.5]), np.array([[1e-4]]))
+    known = MultiplierEstimate(np.array([0.5 + 0j]), np.array([-0.5]), np.array([[1e-4]]), np.inf)
     np.testing.assert_allclose(known.half_widths(), [[1.959964e-2, 0.0]], rtol=1e-6)
     assert "0.500 ± 0.020" in shown(known).texts
-    unknown = hj.identify.MultiplierBound(
-        known.multipliers, known.coefficients, np.array([[np.inf]])
+    unknown = MultiplierEstimate(
+        known.multipliers, known.coefficients, np.array([[np.inf]]), np.inf
     )
     assert "0.5 (unknown)" in shown(unknown).texts
 

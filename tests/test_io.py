@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
+from hybridjax.identify.rational import RationalFit
 
 
 def same(a, b):
@@ -116,7 +117,7 @@ def test_round_trip_of_any_fit(folder, data):
     other = [data.draw(arrays(complex, s)) for s in ((ny, p), (ny, q), (ny, p))]
     code = data.draw(arrays(np.int64, ny))
     names = tuple(f"y{i}" for i in range(ny))
-    fit = hj.identify.RationalFit(
+    fit = RationalFit(
         *real[:2], *other, real[2], code, 0, 32, "delayed", "uniform", names, data.draw(st.text())
     )
     assert same(fit, trip(folder, fit))

@@ -39,7 +39,7 @@ GIVEN = UNCHECKED["made by this package"] | {
     "AbstractLevels", "AbstractObservation", "Arrival", "BranchEnd", "BranchPoint", "Coincidence",
     "ComputationError", "CyclePoint", "Design", "Event", "ExperimentEvent", "FamilyLike",
     "FileFormatError", "HTF", "HeldOut", "IntervalEvents", "LDTP",
-    "MultiplierEstimate", "PhaseDefinition", "PrecisionError", "Response", "SectionsLike",
+    "PhaseDefinition", "PrecisionError", "Response", "SectionsLike",
     "Simulated", "StoredExperiments", "Structure",
 }  # fmt: skip
 

@@ -24,9 +24,9 @@ from ..errors import ComputationError, DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
 from ..experiments.run import run_experiments
-from ..identify.htf.nonparametric import estimate_htf
-from ..identify.multipliers.structured import StructuredFit, fit_multipliers
-from ..identify.rational.fit import RationalFit, fit_rational
+from ..identify.htf_estimate import estimate_htf
+from ..identify.multipliers import StructuredFit, fit_multipliers
+from ..identify.rational import RationalFit, fit_rational
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..models.hoppers import VerticalHopper

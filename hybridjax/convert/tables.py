@@ -6,8 +6,8 @@ import numpy as np
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
-from ..identify.rational.fit import RationalFit
+from ..identify.multiplier_estimate import MultiplierEstimate
+from ..identify.rational import RationalFit
 from ..linear.htf import HTF
 from ..orbits.branch import Branch
 from ..orbits.limit_cycles import LimitCycles

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
-from ..identify.multipliers.denominator import multipliers_of
+from ..identify.denominator import multipliers_of
 from .candidates import Candidates, Model, Noise, Powers, measured_htfs
 from .criterion import Average, Criterion, Information, LinearCriterion
 from .goals import Goal, Multipliers, Order, Parameters

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
-from ..identify.multipliers.variable_projection import powers_basis
+from ..identify.variable_projection import powers_basis
 from .candidates import Kept, Powers
 
 

@@ -7,8 +7,8 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.variable_projection import HTFGroup, group_htf, misfit_of
 from ..linear.htf import HTF
 from .candidates import Model, NoiseLike, make_noise, with_variance
 from .criteria import wanted_parts

@@ -14,9 +14,9 @@ from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 
 from ..errors import DefinitionError
-from ..identify.multipliers.denominator import chi
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.variable_projection import powers_basis
+from ..identify.denominator import chi
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.variable_projection import powers_basis
 from ..linear.htf import HTF
 from .candidates import Candidates, Kept, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Bound, Channel, Criterion, Information, only_channels
@@ -188,7 +188,7 @@ class OrderCriterion(Criterion):
 
 def order_criterion(goal: Order, model: Model, cosines: Candidates, noise: Noise) -> OrderCriterion:
     """**Raises:** `DefinitionError` for a rival with as many multipliers."""
-    multipliers, rival = np.asarray(model.multipliers), goal.fewer
+    multipliers, rival = np.asarray(model.multipliers, complex), goal.fewer
     if rival >= len(multipliers):
         raise DefinitionError(
             f"`goal`: {rival} multipliers are not fewer than the model's {len(multipliers)}."
@@ -198,7 +198,7 @@ def order_criterion(goal: Order, model: Model, cosines: Candidates, noise: Noise
     for htf, cosine, _ in measured_htfs(model, cosines, goal.harmonics, noise):
         require_frequencies(htf, rival, size)
         channels += _channels(htf, cosine, np.zeros(rival), size, range(rival + 1))
-    largest = multipliers[:rival].real
+    largest = np.real(multipliers[:rival])
     starts = tuple(np.atleast_1d(np.poly(part * largest))[1:] for part in _STARTS)
     name = f"misfit with {rival} multiplier{'s' * (rival != 1)}"
     delay = np.exp(-2j * np.pi * cosines.f)

@@ -1,6 +1,5 @@
 """The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -8,13 +7,11 @@ from jaxtyping import Complex, Float
 
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..identify.htf.spectral_sums import SumOptions, spectral_sums
-from ..identify.multipliers.error_weights import check_values, error_weights, require_frequencies
-from ..identify.multipliers.maximum_likelihood import maximum_likelihood
-from ..identify.multipliers.order import estimated_noise, noise_ratios, refuse_invented
-from ..identify.multipliers.structured import StructuredFit, fit_multipliers
-from ..identify.multipliers.variable_projection import HTFGroup, group_htf, misfit_of
-from ..linear.frequency_response import check_harmonics
+from ..identify.htf_errors import check_values, error_weights, require_frequencies
+from ..identify.multipliers import StructuredFit, fit_multipliers
+from ..identify.order import require_order
+from ..identify.spectral_sums import spectral_sums
+from ..identify.variable_projection import HTFGroup, group_htf, maximum_likelihood, misfit_of
 from ..linear.htf import HTF
 from .goals import Multipliers
 from .numerators import coefficients
@@ -50,19 +47,17 @@ class Block(NamedTuple):
 
 def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
-    select = functools.partial(check_harmonics, goal.fitted_harmonics)
-    options = SumOptions(select, repeats=repeats)
     each = []
     for s in np.flatnonzero(data.ok):
         single = ExperimentData(
             data.u[s : s + 1], data.y[s : s + 1], n_sections=data.n_sections,
             periods=data.periods, inputs=data.inputs, outputs=data.outputs,
         )  # fmt: skip
-        each.append(spectral_sums(single, options))
+        each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
     if not each:
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")
-    power = np.concatenate([np.real(sums.ran.power[:, 0, 0]) for sums in each])
-    H = np.concatenate([sums.direct[:, 0] for sums in each]) / power[:, None, None]
+    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])
+    H = np.concatenate([sums.along[:, 0] for sums in each]) / power[:, None, None]
     return Block(
         f=np.concatenate([sums.line for sums in each]) / data.periods,
         H=np.moveaxis(H, 1, 0),
@@ -158,10 +153,8 @@ def _relative_noise(
 
 def _objection(groups: list[HTFGroup], htf: HTF, fit: StructuredFit) -> str:
     """Return the objection of `fit_multipliers` to an order that the data do not support."""
-    level, tails = estimated_noise(htf, fit.cost / fit.freedom)
-    ratios = noise_ratios(groups, np.zeros(len(fit.coefficients)))
     try:
-        refuse_invented(ratios.values / level, tails * ratios.deviation)
+        require_order(groups, htf, len(fit.coefficients), fit.cost / fit.freedom)
     except DefinitionError as error:
         return str(error)
     return ""

@@ -84,7 +84,8 @@ class Settings(eqx.Module):
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
         self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)
-        self.max_steps, self.solver = max_steps, solver if solver == "auto" else solvers(solver)
+        self.max_steps = max_steps
+        self.solver = solver if isinstance(solver, str) else solvers(solver)
 
     def filled(self, accuracy: float) -> "Settings":
         """Settings with this accuracy where none is given."""

@@ -93,13 +93,13 @@ class Minimum(NamedTuple):
 def least_squares(
     linearize: Callable[[Coefficients], tuple[np.ndarray, np.ndarray]],
     start: Coefficients,
-    max_steps: int,
+    max_steps: int = 200,
     settled_gain: float = 0.0,
 ) -> Minimum:
     """Minimize a sum of squares whose linear unknowns are eliminated.
 
     **Arguments:** `linearize(c)` returns the residuals (n,) and their Jacobian (n, d).
-    `settled_gain`: a decrease of the sum that does not matter. Default: 0.
+    `max_steps`: default 200. `settled_gain`: a decrease of the sum that does not matter.
     """
     point, converged = descend(_Squares(linearize, start, settled_gain), max_steps)
     return Minimum(point.c, converged)

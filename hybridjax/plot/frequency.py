@@ -10,8 +10,8 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
 from .._core.signal import ratio, with_unit
 from ..errors import DefinitionError
-from ..identify.multipliers.structured import StructuredFit
-from ..identify.rational.fit import RationalFit
+from ..identify.multipliers import StructuredFit
+from ..identify.rational import RationalFit
 from ..linear.htf import HTF
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, label_of, letters, panels
 

@@ -9,9 +9,8 @@ from matplotlib.patches import Circle
 
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
-from ..identify.multipliers.compare import Multipliers, compare_multipliers
-from ..identify.multipliers.multiplier_estimate import MultiplierEstimate
-from ..identify.rational.fit import RationalFit
+from ..identify.multiplier_estimate import MultiplierEstimate, Multipliers, compare_multipliers
+from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from .look import (
@@ -51,7 +50,7 @@ def multipliers(
     - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them; or the estimate with which
         others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
-        `SeriesFit` or `MultiplierBound`, or multipliers.
+        `SeriesFit` or the result of `multiplier_bound`, or multipliers.
     - `zoom`: draw the inset. `labels`: texts for the outputs by name.
 
     **Raises:** `DefinitionError` if there are no multipliers.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
+from .._core.boundary.values import show
 from ..errors import DefinitionError
 
 
@@ -126,7 +127,7 @@ def as_method(solver: Any) -> Method:
 def _no_solver(given: Any) -> DefinitionError:
     return DefinitionError(
         "a solver must be one of diffrax, such as `diffrax.Kvaerno5()`, or `hj.Radau()`, not "
-        f"{given!r}."
+        f"{show(given)}."
     )
 
 

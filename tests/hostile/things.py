@@ -78,11 +78,6 @@ class Things:
         return hj.ExperimentData(u, y, n_sections=6, periods=16, result=self.data.result)
 
     @ft.cached_property
-    def four_times(self):
-        design = self.design.realizations(4)
-        return hj.experiments.simulate_experiments(self.model, design, start="periodic")
-
-    @ft.cached_property
     def estimate(self):
         return hj.estimate_htf(self.data, (-1, 0, 1))
 
@@ -98,10 +93,6 @@ class Things:
     @ft.cached_property
     def rational(self):
         return hj.fit_rational(self.estimate, output=0, poles=1, zeros=1)
-
-    @ft.cached_property
-    def aaa(self):
-        return hj.identify.fit_aaa(self.estimate)
 
     @ft.cached_property
     def structured(self):

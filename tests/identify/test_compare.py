@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from hybridjax.identify.multipliers.compare import compare_multipliers
+from hybridjax.identify.multiplier_estimate import compare_multipliers
 
 
 @pytest.mark.parametrize(("estimated", "true"), [(1, 3), (3, 2), (2, 2), (4, 4)])

@@ -1,6 +1,5 @@
-"""The number of multipliers: found by rank and by criteria, refused where it is too high; AAA."""
+"""The number of multipliers: found by rank and by criteria, refused where it is too high."""
 
-import equinox as eqx
 import numpy as np
 import pytest
 
@@ -75,18 +74,3 @@ def test_bad_requests(small):
         hj.select_order(htf, 0)
     with pytest.raises(hj.DefinitionError, match="80 frequencies are too few"):
         hj.select_order(htf, 60)
-
-
-def test_aaa_finds_the_roots_of_the_multipliers(exact, multipliers):
-    """All 64 poles of H_0, from twice that many coefficients."""
-    fit = hj.identify.fit_aaa(exact)
-    comparison = fit.compare(multipliers)
-    assert comparison.max_error < 1e-6 and comparison.outputs == ("yM", "yM", "vM", "vM")
-    assert fit.compare(multipliers, "vM").max_error == comparison.error[2:].max()
-    assert "yM" in repr(comparison)
-    assert np.all(fit.residual < 1e-11)
-    assert fit.outputs == ("yM", "vM") and "poles, residual" in repr(fit)
-    with pytest.raises(hj.DefinitionError, match="no input 'v'"):
-        hj.identify.fit_aaa(exact, input="v")
-    with pytest.raises(hj.DefinitionError, match="H_1 holds NaN"):
-        hj.identify.fit_aaa(eqx.tree_at(lambda h: h.H, exact, exact.H * np.nan), 1)

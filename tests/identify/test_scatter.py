@@ -1,14 +1,12 @@
 """Variances of estimates: noise, distortion, degrees of freedom, and when they cannot be had."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.htf.realizations import Realizations
+from hybridjax.identify.htf_estimate import roundness
 
 
 N, P = 4, 16
@@ -59,19 +57,6 @@ def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, varian
     assert stats.binomtest(int(hits), of, 0.95).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("R", [2, 4, 8])
-@pytest.mark.parametrize("kind", ["normal", "constant"])
-def test_p_values_are_right_whatever_the_errors_are(kind, R):
-    rng, runs = np.random.default_rng(R), 4000
-    errors = np.exp(2j * np.pi * rng.random((R, runs)))
-    errors *= rng.rayleigh(size=(R, runs)) if kind == "normal" else 1
-    realizations = Realizations(errors.reshape(R, 1, runs, 1, 1) / R, np.full((R, runs, 1), 1 / R))
-    p = realizations.p_values(np.zeros((1, runs, 1, 1), complex))
-    for level in (0.05, 0.2):
-        assert stats.binomtest(int(np.sum(p < level)), runs, level).pvalue > 1e-3
-    assert realizations.p_values(np.full((1, runs, 1, 1), 1e6 + 0j)).max() < 0.05
-
-
 @pytest.mark.parametrize("R", [2, 3, 4, 8])
 @pytest.mark.parametrize("constant, noise", [(0, 1), (1, 0), (1, 0.3), (1, 1)])
 def test_discs_whatever_the_errors_are(constant, noise, R):
@@ -86,10 +71,10 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
     variance = np.sum(shares * np.abs(error - mean) ** 2, axis=0) / (R - 1)
-    parts = (shares * error).reshape(R, 1, runs, 1, 1)
-    single = Realizations(parts, np.broadcast_to(shares[..., None], (R, runs, 1)))
-    roundness = single.roundness(mean.reshape(1, runs, 1, 1))
-    scatter = hj.Scatter(np.full(runs, R - 1.0), roundness)
+    residuals = np.sqrt(shares) * (error - mean)
+    square, turned = (np.abs(residuals) ** 2).sum(axis=0), (residuals**2).sum(axis=0)
+    shape = roundness(square, turned, np.full(runs, 1.0 * R))[None, :, None, None]
+    scatter = hj.Scatter(np.full(runs, R - 1.0), shape)
     for level in (0.5, 0.8, 0.95, 0.99):
         square = np.asarray(scatter.quantile(level))[0, :, 0, 0] * variance
         inside = np.abs(mean) ** 2 <= square
@@ -98,50 +83,7 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
         elif R > 3 and level == 0.95:
             assert 0.935 < inside.mean() < 0.965
     if R == 2:
-        np.testing.assert_array_equal(roundness, 1)
-
-
-def test_p_values_of_a_model(model):
-    """The truth is rejected as often as it should be, another model always."""
-    data = [realized(model, 4, noise=0.1, seed=seed) for seed in range(40)]
-    truth = model.htf(LINES.frequencies[::3], (-1, 0, 1))
-    p = np.stack([hj.identify.htf_p_values(one, truth) for one in data])
-    assert stats.kstest(p[:, 0, 0, 0, 0], "uniform").pvalue > 1e-3
-    assert 0.03 < np.mean(p < 0.05) < 0.07
-    parts = [
-        hj.ExperimentData(data[0].u[k : k + 4], data[0].y[k : k + 4], n_sections=N, periods=P)
-        for k in range(0, 16, 4)
-    ]
-    np.testing.assert_allclose(hj.identify.htf_p_values(parts, truth), p[0], atol=1e-12)
-    other = hj.HTF(truth.f, truth.H + 2, (-1, 0, 1), N, truth.inputs, truth.outputs)
-    assert hj.identify.htf_p_values(data[0], other).max() < 0.05
-
-
-def test_p_values_of_experiments_of_different_strength(model):
-    """The weaker ones have larger errors, and a smaller part of the estimate."""
-    truth, design = model.htf(LINES.frequencies[::3], 0), LINES.realizations(4)
-    strength = np.repeat([0.2, 1.0, 1.0, 3.0], 4)[design.experiment]
-    design = dataclasses.replace(design, amplitude=strength * design.amplitude)
-    clean = hj.experiments.simulate_experiments(model, design, start="periodic")
-    data = [hj.experiments.add_noise(clean, std=0.1, seed=seed) for seed in range(40)]
-    p = np.stack([hj.identify.htf_p_values(one, truth) for one in data])
-    assert stats.kstest(p.ravel(), "uniform").pvalue > 1e-3
-    # The estimate, of which no errors are left, is as likely as can be.
-    assert hj.identify.htf_p_values(data[0], hj.estimate_htf(data[0], 0)).min() > 0.99
-
-
-@pytest.mark.parametrize(
-    "message, count, f",
-    [
-        ("measured in one realization only", 1, None),
-        ("at most 16 realizations", 17, None),
-        ("f = 0.123 was not excited", 4, [0.123]),
-    ],
-)
-def test_p_values_that_cannot_be_had(model, message, count, f):
-    supposed = model.htf(LINES.frequencies if f is None else f, 0)
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.identify.htf_p_values(realized(model, count, noise=0.1), supposed)
+        np.testing.assert_array_equal(shape, 1)
 
 
 def test_the_parts_of_the_variance(model):
@@ -255,21 +197,6 @@ def test_noise_by_its_ratio(model):
         hj.DefinitionError, match="ProcessNoise: `std` must be a nonnegative number"
     ):
         realized(model, 1, process_noise=-1.0)
-
-
-def test_coherence_is_one_but_for_noise(model):
-    """Power that goes to other harmonics is explained; noise of a known ratio is not."""
-    clean = realized(model, 6)
-    np.testing.assert_allclose(hj.identify.estimate_coherence(clean).values, 1.0, atol=1e-9)
-    noisy = hj.identify.estimate_coherence(
-        hj.experiments.add_noise(realized(model, 60), std=1.0), 0
-    )
-    # White noise: |Y|^2 = N P; signal: (N P a / 2)^2 |H|^2.
-    signal = (N * P * 0.1 / 2 * np.abs(model.htf(noisy.f, 0)[0][..., 0])) ** 2
-    np.testing.assert_allclose(noisy.values[0], signal / (signal + N * P), atol=0.2)
-    assert np.all((noisy.total > noisy.values[0].min(axis=0)) & (noisy.total < 1))
-    with pytest.raises(hj.DefinitionError, match="no line was measured in several"):
-        hj.identify.estimate_coherence(realized(model, 1))
 
 
 @settings(max_examples=25)

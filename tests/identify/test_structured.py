@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.multipliers.compare import compare_multipliers
+from hybridjax.identify.multiplier_estimate import compare_multipliers
 
 from ..linear.conftest import blocks_at_random
 

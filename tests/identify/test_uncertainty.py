@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.identify.multipliers.error_spectrum import error_spectrum
-from hybridjax.identify.multipliers.error_weights import spectral_weights
-from hybridjax.identify.multipliers.variable_projection import group_htf
+from hybridjax.identify.htf_errors import error_spectrum, weights_of
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.identify.variable_projection import group_htf
 
 from ..linear.conftest import blocks_at_random
 
@@ -125,7 +125,8 @@ def test_the_spectrum_of_errors_is_found(small):
     c = np.poly(model.multipliers).real[1:]
     chi = np.polyval(np.append(1, c)[::-1], np.exp(-2j * np.pi * f))
     true = np.array([3e-3, 1e-2]) + np.array([1e-2, 2e-3]) / np.abs(chi[:, None]) ** 2
-    supposed = spectral_weights(htf, np.ones(2), np.linspace(1e-3, 4e-3, 160).reshape(80, 2))
+    supposed = weights_of(np.linspace(1e-3, 4e-3, 160).reshape(80, 2, 1), np.ones(2))
+    supposed = np.broadcast_to(supposed, htf.H.shape)
     variance = np.broadcast_to(true[..., None], htf.H.shape)
     found = []
     for seed in range(100):
@@ -140,7 +141,7 @@ def pair_and_real():
     true = np.array([0.6 + 0.3j, 0.6 - 0.3j, -0.4])
     rng = np.random.default_rng(1)
     square = rng.normal(size=(3, 3))
-    return hj.identify.MultiplierBound(true, np.poly(true).real[1:], 1e-6 * square @ square.T), rng
+    return MultiplierEstimate(true, np.poly(true).real[1:], 1e-6 * square @ square.T, np.inf), rng
 
 
 def test_first_order_covariances_and_regions(pair_and_real):
@@ -167,8 +168,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
         np.testing.assert_allclose(distance, stats.chi2.ppf(0.9, degrees), rtol=0.05)
     # The share of draws that a region around the truth holds.
     held = [
-        hj.identify.MultiplierBound(true, draw, estimate.covariance).contains(true)
-        for draw in draws
+        MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true) for draw in draws
     ]
     assert np.all([covered(n, 4000) for n in np.sum(held, axis=0)])
 

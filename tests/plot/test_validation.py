@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.identify.validation.amplitude import AmplitudeSweep
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def test_validation_draws_signals_and_correlations(found):
 
 
 def test_amplitude_marks_the_limit():
-    sweep = hj.identify.AmplitudeSweep(
+    sweep = AmplitudeSweep(
         np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
         ("u",), ("y",),
     )  # fmt: skip
@@ -40,7 +42,7 @@ def test_amplitude_marks_the_limit():
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
     c = np.poly(true).real[1:]
-    estimate = hj.identify.MultiplierBound(true * 1.01, c, 1e-4 * np.eye(2))
+    estimate = MultiplierEstimate(true * 1.01, c, 1e-4 * np.eye(2), np.inf)
     ax = hj.plot.multipliers(hopper, {"fit": estimate}).ax
     (inset,) = ax.child_axes
     drawn = [line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100]

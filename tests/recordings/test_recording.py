@@ -6,7 +6,8 @@ from hypothesis import given, strategies as st
 
 import hybridjax as hj
 from hybridjax.errors import FileFormatError
-from hybridjax.recordings.formats.text.layouts import read_text
+from hybridjax.recordings.formats.columns import Wanted
+from hybridjax.recordings.formats.motion import read_text
 
 
 T = np.arange(5.0)
@@ -92,7 +93,7 @@ def test_what_is_no_number_is_not_read_as_one(tmp_path_factory, rows):
     rows = [["1.5"] * len(rows[0]), *rows]  # no row of units
     file.write_text("\n".join(["a,b,c"[: 2 * len(rows[0]) - 1], *map(",".join, rows)]) + "\n")
     try:
-        (found,) = (x.values for x in read_text(file))
+        (found,) = (x.values for x in read_text(file, Wanted("time")))
     except FileFormatError:
         return
     width = len(rows[0])

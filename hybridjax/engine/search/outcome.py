@@ -185,13 +185,7 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
 
 
 def _next_step(
-    s: Structure,
-    state: State,
-    aim: Aim,
-    new: Attempt,
-    verdict: Verdict,
-    fired: Index,
-    task: Task,
+    s: Structure, state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
     """The next step, and lanes that are stuck: the step is too short to be taken."""
     xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)

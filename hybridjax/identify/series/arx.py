@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..denominator import multipliers_of
 from ..descent import Coefficients
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.order import refuse_invented
+from ..order import refuse_invented
 from .linearization import sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, delay_cycles, lagged_inputs

@@ -5,17 +5,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..multipliers.covariance import (
+from ..denominator import (
     Covariance,
     block_freedom,
     correlated_cycles,
     fading,
     in_blocks,
     inverse_of_remainder,
+    multipliers_of,
     sandwich,
 )
-from ..multipliers.denominator import multipliers_of
-from ..multipliers.error_spectrum import amounts
+from ..htf_errors import amounts
 from .linearization import Linearization, each_part, linearize, measured_outputs
 from .output_error import OutputErrorProblem
 from .records import CycleGrid, divide_by_chi

@@ -18,8 +18,8 @@ from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..multipliers.denominator import Denominator, chi, multipliers_of
-from ..multipliers.multiplier_estimate import MultiplierEstimate
+from ..denominator import Denominator, chi, multipliers_of
+from ..multiplier_estimate import MultiplierEstimate
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .covariance import coefficient_covariance
 from .linearization import Linearization, minimize

@@ -1,0 +1,140 @@
+r"""The denominator $\chi$ that all transfer functions of a periodic system share.
+
+$$\chi(q^{-N}) = 1 + c_1 q^{-N} + \ldots + c_d q^{-dN} = \prod_i (1 - \lambda_i q^{-N})$$
+
+Its coefficients c are real, its roots are the d non-zero Floquet multipliers. The covariances of
+estimated coefficients hold whatever the errors are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Inexact
+
+from .descent import Coefficients
+
+
+# Smallest eigenvalue of the curvature relative to its largest. Smaller: rounding counts as
+# information; larger: coefficients that are identified count as unknown.
+_SINGULAR = 1e-12
+# Part of a response that is left when it counts as forgotten (the number of cycles whose scores
+# are correlated). Smaller: more lags, and covariances that scatter more; larger: they miss more.
+_FORGOTTEN = 0.1
+# Largest modulus of a multiplier assumed here: 0.99 takes 230 cycles.
+_SLOWEST = 0.99
+# Share of a record that lags may take. Larger: sums over fewer pairs, which scatter more.
+_LARGEST_SHARE = 0.25
+# Smallest share of its errors that a fit leaves to a block or line. Smaller: blocks that alone
+# determine a coefficient dominate the covariance; larger: covariances are too small.
+_SMALLEST_REMAINDER = 0.1
+
+
+def chi(period_delay: Complex[np.ndarray, " E"], c: Coefficients) -> Complex[np.ndarray, " E"]:
+    r"""Return $1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$ at values of $z^{-N}$, the period's delay."""
+    return np.polynomial.polynomial.polyval(period_delay, np.concatenate([[1.0], c]))
+
+
+def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
+    """Return the multipliers by decreasing modulus, of each pair the upper one first."""
+    roots = np.roots([1.0, *coefficients]).astype(complex)
+    roots = np.pad(roots, (0, len(coefficients) - len(roots)))  # numpy drops roots at zero
+    return roots[np.lexsort((-roots.imag, -np.abs(roots)))]
+
+
+class Covariance(NamedTuple):
+    """A covariance matrix, infinite where nothing is known, and how well it is known."""
+
+    matrix: Float[np.ndarray, "d d"]
+    freedom: float
+    """Degrees of freedom that it was estimated with; infinite where it is exact."""
+
+    @classmethod
+    def unknown(cls, size: int) -> "Covariance":
+        return cls(np.full((size, size), np.inf), np.inf)
+
+
+class Denominator(NamedTuple):
+    """An estimate of the denominator and the covariance of its coefficients."""
+
+    coefficients: Coefficients
+    covariance: Covariance
+    converged: bool
+
+    @classmethod
+    def of_unknown_accuracy(cls, coefficients: Coefficients) -> "Denominator":
+        return cls(coefficients, Covariance.unknown(len(coefficients)), False)
+
+
+def sandwich(
+    curvature: Float[np.ndarray, "d d"],
+    gradient: Float[np.ndarray, "d d"],
+    shares: Float[np.ndarray, "parts d d"] | None = None,
+) -> Covariance:
+    r"""Return the covariance of a minimum, $K^{-1} M K^{-1}$ (White 1980); unknown unless K > 0.
+
+    **Arguments:** `curvature`: K. `gradient`: M, the covariance of the gradient. `shares`: the
+    expected contributions of independent parts, if M was estimated from these. The degrees of
+    freedom are then the number of parts that contribute: one over the sum of the squares of their
+    shares (Satterthwaite 1946). Default: M is exact.
+    """
+    values, vectors = np.linalg.eigh(curvature)
+    if not values[0] > _SINGULAR * values[-1]:
+        return Covariance.unknown(len(curvature))
+    inverse = vectors / values @ vectors.T
+    freedom = np.inf
+    if shares is not None:
+        half = np.linalg.inv(np.linalg.cholesky(shares.sum(axis=0)))
+        share = np.einsum("ij,ejk,ik->ei", half, shares, half)
+        freedom = float(1 / (share**2).sum(axis=0).mean())
+    return Covariance(inverse @ gradient @ inverse, freedom)
+
+
+def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> int:
+    """Return the cycles after which a tenth of the slowest response is left.
+
+    At most a quarter of a record.
+    """
+    slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, _SLOWEST)
+    needed = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
+    return int(min(needed, int(cycles * _LARGEST_SHARE)))
+
+
+def fading(c: Coefficients) -> Coefficients:
+    """Return the coefficients of chi, with multipliers moved to a modulus of at most 0.99."""
+    slowest = np.abs(np.roots([1.0, *c])).max(initial=_SLOWEST)
+    return c * (_SLOWEST / slowest) ** np.arange(1, len(c) + 1)
+
+
+def in_blocks(x: Float[np.ndarray, "S T *rest"], count: int) -> Float[np.ndarray, "B length *rest"]:
+    """Divide the T cycles of each record into blocks, the last one filled up with zeros."""
+    S, T, *rest = x.shape
+    length = -(-T // count)
+    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(rest)
+    return np.pad(x, padding).reshape(S * count, length, *rest)
+
+
+def inverse_of_remainder(
+    taken: Float[np.ndarray, "B k k"], power: float = 1.0
+) -> Float[np.ndarray, "B k k"]:
+    """Return (1 - taken)^-power, `taken` being the share of a block's errors that a fit takes."""
+    values, vectors = np.linalg.eigh(np.eye(taken.shape[1]) - taken)
+    left = np.maximum(values, _SMALLEST_REMAINDER)[:, None] ** power
+    return vectors / left @ vectors.swapaxes(1, 2)
+
+
+def block_freedom(
+    score: Float[np.ndarray, "blocks d"], share: Float[np.ndarray, "blocks d d"]
+) -> float:
+    """Return the degrees of freedom of a covariance from the scores of independent blocks.
+
+    From their dispersion (Pan and Wall 2002), at most those of Gaussian errors (Satterthwaite
+    1946).
+
+    **Arguments:** `share`: the expected contribution of each block, in units in which they add up
+    to one.
+    """
+    d = score.shape[1]
+    part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(score.T @ score), score) / d
+    normal = np.trace(share, axis1=1, axis2=2) / d
+    scatter = max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum())
+    return float(1 / scatter)

@@ -1,0 +1,318 @@
+"""Harmonic transfer functions from measured inputs and outputs (Sec. V)."""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Index, Probability
+from .._core.precision import require_x64
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.design.partition import line_class
+from ..linear.frequency_response import Harmonics
+from ..linear.htf import HTF, Scatter
+from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
+
+
+# Part of the power of a line by which |sum of U^2| may fall short of the sum of |U|^2 where all
+# phases are the same. Smaller: the scatter of recorded repetitions counts as distortion; larger:
+# random phases that happen to be close are refused.
+_SAME_PHASES = 1e-6
+# Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
+# errors of constant size are too small; the mean of more is normally distributed.
+_FEW_REALIZATIONS = 16
+# Residuals of a line, relative to its power, that are rounding and have no shape.
+_NO_RESIDUAL = 1e-13
+
+
+@checked
+def estimate_htf(
+    data: Experiments,
+    harmonics: Harmonics | None = None,
+    *,
+    repeats: Count = 1,
+    variance: Literal["auto", "noise", "total"] = "auto",
+    highest: Index | None = None,
+    half_integers: Literal["error", "skip"] = "error",
+    threshold: Probability = SILENT_LINE,
+) -> HTF:
+    """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
+
+    `H_l(w_k) = Y[k + l P] / U[k]`, both DFTs over the same window of the last P whole periods.
+    The excited lines k are found from U itself, so any experiments that obey the rules of a
+    `Design` will do. Where a frequency was measured more than once the
+    estimate is the least-squares one. On multiples of 1/2 (other than 0 and N/2) the line
+    coincides with its own mirror image, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`;
+    both unknowns are solved for, from two or more experiments with different phases. Inputs that
+    excite one line together need as many experiments to be separated. Failed experiments are left
+    out (`missing_frequencies` lists the frequencies lost), and with several inputs only frequencies
+    that were measured from each of them are kept.
+
+    The estimate is that of the best linear approximation for signals of the class that was applied
+    (Pintelon and Schoukens 2012, ch. 3), with its `variance`. Frequencies that
+    were measured in several realizations of random phases scatter by noise and by nonlinear
+    distortion together; with `repeats` the scatter between windows is that of noise alone, the
+    `noise_variance`. Without realizations, `variance` itself is that of noise alone.
+
+    **Arguments:**
+
+    - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
+      `StoredExperiments` return them, of which only sums over experiments are kept.
+    - `harmonics`: the harmonics to estimate. Default: all N (with `highest`, all up to it).
+    - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
+    - `variance`: "auto", the default, is the variance that the experiments allow; "noise", from
+      the repeats alone, and "total", from realizations, raise errors where they are not available.
+    - `highest`: harmonics beyond this one are taken as zero, as in designs with few experiments
+      (`multisine(highest_harmonic=...)`). Default: none.
+    - `half_integers`: "error", the default, or "skip" multiples of 1/2 measured with one phase.
+    - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
+      Raise it where the recorded input is noisy. Default: 1e-6.
+
+    **Returns:** `HTF` with ascending frequencies, source "estimate". Its `variance` is infinite
+    where failed experiments have left one realization.
+
+    **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines
+    of one experiment disturb each other (the message lists the pair); for one phase only on a
+    multiple of 1/2; for too few periods or realizations for the requested variance; or for parts
+    that do not belong together.
+    """
+    if variance == "noise" and repeats < 2:
+        raise DefinitionError(
+            "the variance of noise alone needs two windows or more: record P periods more, and "
+            "pass repeats=2."
+        )
+    require_x64()
+    sums = spectral_sums(data, harmonics, highest=highest, threshold=threshold, repeats=repeats)
+    unsolved = sums.one_phase()
+    if unsolved.any() and half_integers == "error":
+        raise DefinitionError(
+            f"f = {sums.f[unsolved][0]:.10g} lies on a multiple of 1/2 and was measured with one "
+            "phase only: measure it in a second experiment with a phase 90 degrees apart "
+            "(multisine(lines='two-phase') does so), or leave it out here with "
+            "half_integers='skip' and use HTF.interpolate."
+        )
+    rows = np.flatnonzero(sums.solvable(sums.gram))
+    setup, (tried, ran) = sums.setup, sums.experiments
+    if len(rows) == 0:
+        raise DefinitionError(
+            f"no frequency is left to estimate: {ran}/{tried} ok; a frequency must have been "
+            f"measured from each of the {len(setup.inputs)} inputs."
+        )
+    f, lines = sums.f[rows], _solve_lines(sums, rows)
+    why_not = _why_not_total(sums, rows)
+    if variance == "total" and why_not:
+        raise DefinitionError(why_not)
+    if variance == "total" and (lines.realizations < 1).any():
+        raise DefinitionError(
+            f"f = {f[lines.realizations < 1][0]:.10g} was measured in one realization only, which "
+            "does not show the distortion: apply several (`Design.realizations`), or pass "
+            "variance='noise'."
+        )
+    total, noise, scatter = lines.noise, None, None
+    if variance != "noise" and (lines.realizations > 0).any() and not why_not:
+        total, noise = lines.total, lines.noise
+        freedom = np.maximum(lines.realizations, 1).astype(float)
+        scatter = Scatter(freedom, _roundness(sums, rows, lines.H))
+    elif lines.noise is not None:
+        scatter = Scatter(sums.count[rows] * (repeats - 1.0))
+    return HTF(
+        f, lines.H, sums.harmonics, setup.n_sections, setup.inputs, setup.outputs, "estimate",
+        variance=total, noise_variance=noise, scatter=scatter,
+    )  # fmt: skip
+
+
+@checked
+def missing_frequencies(
+    data: Experiments, threshold: Probability = SILENT_LINE, *, highest: Index | None = None
+) -> Float[np.ndarray, " F"]:
+    """Return the frequencies (cycles per period) that were excited but cannot be estimated.
+
+    Their experiments failed, or not all inputs were applied there, or they lie on a multiple of
+    1/2 and were measured with one phase only. Arguments as of `estimate_htf`.
+    """
+    sums = spectral_sums(data, (), highest=highest, threshold=threshold)
+    return sums.f[~sums.solvable(sums.gram)]
+
+
+class _LineEstimates(NamedTuple):
+    """Least-squares estimates at F lines."""
+
+    H: Complex[np.ndarray, "M F ny nu"]
+    residual: Float[np.ndarray, "F M ny"]
+    """Sum of squares over experiments."""
+    realizations: Int[np.ndarray, " F"]
+    """Experiments beyond those that the unknowns need: degrees of freedom of the residual."""
+    total: Float[np.ndarray, "M F ny nu"]
+    """Variance from the residual; infinite where there is one realization."""
+    noise: Float[np.ndarray, "M F ny nu"] | None
+    """Variance from repeated windows; None where there was one window."""
+
+
+def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstimates:
+    r"""Solve `Y = H U + G conj(U)`, with G = 0 unless the line coincides with its mirror image.
+
+    With p unknowns and R experiments the residuals have R - p complex degrees of freedom, and the
+    variance of H is their mean square times the diagonal of the inverse of the normal matrix. The
+    noise of each experiment, from repeated windows, is propagated in the same way.
+    """
+    nu, shape = len(sums.setup.inputs), sums.energy.shape[1:]
+    H = np.zeros((len(rows), nu, *shape), complex)
+    spread = np.zeros((len(rows), nu))
+    residual = np.zeros((len(rows), *shape))
+    for mirrored, unknowns in ((False, nu), (True, 2 * nu)):
+        entries = np.flatnonzero(sums.mirrored[rows] == mirrored)
+        lines = rows[entries]
+        right = sums.along[lines, :unknowns]
+        inverse = np.linalg.inv(sums.gram[lines, :unknowns, :unknowns])
+        solution = np.einsum("kij,kjml->kiml", inverse, right)
+        H[entries] = solution[:, :nu]
+        spread[entries] = np.einsum("kii->ki", inverse).real[:, :nu]
+        explained = np.einsum("kiml,kiml->kml", solution.conj(), right).real
+        residual[entries] = np.maximum(sums.energy[lines] - explained, 0)
+
+    def variance(square):
+        return (square[:, None] * spread[:, :, None, None]).transpose(2, 0, 3, 1)
+
+    count = sums.count[rows]
+    realizations = count - np.where(sums.mirrored[rows], 2 * nu, nu)
+    mean = residual / np.maximum(realizations, 1)[:, None, None]
+    mean[realizations < 1] = np.inf
+    noise = variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
+    return _LineEstimates(H.transpose(2, 0, 3, 1), residual, realizations, variance(mean), noise)
+
+
+def _roundness(
+    sums: SpectralSums, rows: Int[np.ndarray, " F"], H: Complex[np.ndarray, "M F ny nu"]
+) -> Float[np.ndarray, "M F ny nu"] | None:
+    r"""Return `Scatter.roundness` of the residuals of realizations.
+
+    None where inputs share experiments, lines are mirrored, or realizations are many. With the
+    residuals $d_j = (Y_j - H U_j) \overline{U_j} / |U_j|$ of each input, $\sum_j |d_j|^2$ is the
+    energy of Y less $|H|^2$ times the power of U, and $\sum_j d_j^2$ follows in the same way.
+    """
+    nu = len(sums.setup.inputs)
+    gram = sums.gram[rows, :nu, :nu]
+    shared = (gram * ~np.eye(nu, dtype=bool)).any()
+    if shared or sums.mirrored[rows].any() or sums.count.max() > _FEW_REALIZATIONS:
+        return None
+    power = np.einsum("kii->ki", gram).real[None, :, None]
+    energy, turned = (x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned))
+    square = energy - np.abs(H) ** 2 * power
+    square = np.where(square > _NO_RESIDUAL * energy, square, 0.0)
+    return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
+
+
+def roundness(
+    square: Float[np.ndarray, "*shape"],
+    turned: Complex[np.ndarray, "*shape"],
+    count: Float[np.ndarray, "*#shape"],
+) -> Float[np.ndarray, "*shape"]:
+    r"""Return $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ relative to its mean for Gaussian errors.
+
+    Of n errors the mean is $(n - 2) / n$: it is Mauchly's criterion of their covariance in the
+    plane, squared (Annals of Mathematical Statistics 1940). 1 for two errors or fewer, or none.
+
+    **Arguments:** `square`: $\sum_j |d_j|^2$. `turned`: $\sum_j d_j^2$. `count`: n.
+    """
+    shaped = (count > 2) & (square > 0)
+    part = np.divide(np.abs(turned), square, out=np.zeros_like(square), where=shaped)
+    mean = np.where(count > 2, 1 - 2 / np.maximum(count, 1), 1)
+    return np.where(shaped, (1 - np.minimum(part, 1) ** 2) / mean, 1.0)
+
+
+def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
+    """Return the reason why the scatter over experiments is not that over random phases, if any."""
+    nu = len(sums.setup.inputs)
+    gram = sums.gram[rows]
+    power, square = (np.einsum("kii->k", x) for x in (gram[:, :nu, :nu], gram[:, nu:, :nu]))
+    several = sums.count[rows] > nu
+    alike = several & (np.abs(square) > (1 - _SAME_PHASES) * power.real)
+    tested, low = sums.crest_factors
+    if several.any() and alike.sum() > several.sum() / 2:
+        return (
+            "the experiments repeat the same phases, so that their scatter is noise alone and does "
+            "not show the distortion: apply realizations with new random phases "
+            "(`Design.realizations`)."
+        )
+    if low >= max(2, tested / 2):  # by chance once in 10 000 times or less
+        return (
+            f"the phases are not random: {low} of {tested} signals "
+            "have a crest factor below that of 200 random draws. The scatter of optimized phases "
+            "does not show the distortion of a class of signals: pass variance='noise', or use "
+            "random phases."
+        )
+    return ""
+
+
+class OutputLevels(eqx.Module):
+    """Rms of one line of the output spectrum, by the kind of line; NaN where there is none.
+
+    A linear periodic system responds only at lines whose class (distance of f from the nearest
+    integer) is excited. The output at the other lines is noise or nonlinear distortion: of even
+    order at even j, of odd order at odd j. The excited lines hide as much distortion.
+
+    **Fields**, one entry per output: `excited`, `odd`, `even`; `noise`, from repeated windows, of
+    their mean; `outputs`, names.
+    """
+
+    excited: Float[np.ndarray, " ny"]
+    odd: Float[np.ndarray, " ny"]
+    even: Float[np.ndarray, " ny"]
+    noise: Float[np.ndarray, " ny"]
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        rows = [f"{'output':>12}  {'excited':>9}  {'odd':>9}  {'even':>9}  {'noise':>9}"]
+        levels = np.stack([self.excited, self.odd, self.even, self.noise], axis=1)
+        for name, row in zip(self.outputs, levels, strict=True):
+            rows.append(f"{name:>12}  " + "  ".join(f"{x:9.2e}" for x in row))
+        return "\n".join(rows)
+
+
+@checked
+def output_levels(data: ExperimentData, repeats: Count = 1) -> OutputLevels:
+    """Return the rms of the output at excited lines, and at odd and even ones that are not.
+
+    Only where P is even and all excited lines are odd (`multisine(lines="odd")`) are the two kinds
+    of distortion separated. Integer f are left out: they hold the error of the limit cycle.
+    Transients appear at all lines: remove them first.
+
+    **Arguments:** `repeats`: windows that are averaged; two or more give the noise. Default: 1.
+
+    **Raises:** `DefinitionError` for excited lines that are not odd, an odd P, records that are
+    too short, or no good experiment.
+    """
+    N, P = data.n_sections, data.periods
+    if P % 2 or not data.ok.any():
+        raise DefinitionError(
+            f"output_levels needs an even number of periods (P = {P}) and a good experiment."
+        )
+    windows = data.windows(repeats)
+    u, y = data.u[data.ok], data.y[data.ok]
+    size = np.abs(np.fft.rfft(u[:, windows[-1]], axis=1)).max(axis=2)
+    experiment, line = np.nonzero(size > SILENT_LINE * size.max(axis=1, keepdims=True))
+    if (line % 2 == 0).any():
+        raise DefinitionError(
+            f"f = {line[line % 2 == 0][0] / P:.10g} is an even line (j = f P), which hides even "
+            "distortion: use a design of odd lines (multisine(lines='odd'))."
+        )
+    spectra = np.stack([np.fft.rfft(y[:, w], axis=1) for w in windows]) / (N * P / 2)
+    Y = spectra.mean(axis=0)
+    classes = line_class(np.arange(Y.shape[1]), P)
+    excited = np.zeros((len(u), P // 2 + 1), bool)
+    excited[experiment, line_class(line, P)] = True
+    excited, odd = excited[:, classes], classes % 2 == 1
+
+    def level(kind):
+        power = np.abs(Y[kind & (classes > 0)]) ** 2
+        return np.sqrt(power.mean(axis=0)) if len(power) else np.full(Y.shape[2], np.nan)
+
+    noise = np.full(Y.shape[2], np.nan)
+    if repeats > 1:
+        noise = np.sqrt(np.mean(np.var(spectra, axis=0, ddof=1), axis=(0, 1)) / repeats)
+    return OutputLevels(
+        level(excited), level(~excited & odd), level(~excited & ~odd), noise, data.outputs
+    )

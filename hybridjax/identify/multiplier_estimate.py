@@ -1,0 +1,263 @@
+"""Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from .._core.arguments import Numbers
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import PeriodCount, Probability
+from .._core.boundary.values import Complexes
+from .._core.html import card, complex_number, multiplier_table, table, text, unit_circle
+from ..errors import DefinitionError
+
+
+Multipliers = Annotated[Numbers, Complexes()]
+"""Supposed or true multipliers, one or several."""
+
+
+class MultiplierComparison(eqx.Module):
+    """Estimated Floquet multipliers, each paired with a true one.
+
+    The pairing has the smallest sum of distances; if the numbers of multipliers differ, the
+    unpaired ones are not listed. Printing it shows a table.
+
+    **Fields**, sorted by output, then by decreasing modulus of the true multiplier:
+
+    - `true` and `estimated` (k,); `error` (k,), their distance, and `max_error`, the largest.
+    - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
+    """
+
+    true: Complex[np.ndarray, " k"]
+    estimated: Complex[np.ndarray, " k"]
+    outputs: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def error(self) -> Float[np.ndarray, " k"]:
+        return np.abs(self.estimated - self.true)
+
+    @property
+    def max_error(self) -> float:
+        return float(np.max(self.error))
+
+    def _rows(self):
+        names = self.outputs or [""] * len(self.true)
+        return zip(names, self.true, self.estimated, self.error, strict=True)
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.outputs), default=-2) + 2
+        rows = [" " * width + f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
+        for name, true, estimated, error in self._rows():
+            label = f"{name:>{width - 2}}  " if width else ""
+            rows.append(f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
+        return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, complex_number(true, 9), complex_number(estimated, 9), f"{error:.1e}")
+            for name, true, estimated, error in self._rows()
+        ]
+        return card("MultiplierComparison", "", table(("", "true", "estimated", "error"), rows))
+
+
+def _show(value: complex) -> str:
+    return f"{value.real:+.9f} {value.imag:+.9f}i"
+
+
+def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComparison:
+    """Pair estimated with true multipliers so that the sum of distances is smallest.
+
+    **Raises:** `DefinitionError` if either is empty.
+    """
+    from scipy.optimize import linear_sum_assignment  # (a third of a second)
+
+    found, truth = np.asarray(estimated, complex).ravel(), np.asarray(true, complex).ravel()
+    if found.size == 0 or truth.size == 0:
+        raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
+    rows, columns = linear_sum_assignment(np.abs(found[:, None] - truth))
+    order = np.lexsort((-truth[columns].imag, -np.abs(truth[columns])))
+    return MultiplierComparison(true=truth[columns][order], estimated=found[rows][order])
+
+
+def compare_by_output(
+    estimated: Sequence[Complex[np.ndarray, " _"]],
+    true: Multipliers,
+    outputs: Sequence[str],
+    output: str | int | None = None,
+) -> MultiplierComparison:
+    """Compare fits with separate multipliers for each output.
+
+    **Arguments:** `output`: name or index of the only one to compare. Default: all.
+
+    **Raises:** `DefinitionError` for an output that is not there, or if there is no multiplier.
+    """
+    chosen = range(len(outputs)) if output is None else [channel_index("output", output, outputs)]
+    parts = [compare_multipliers(estimated[k], true) for k in chosen]
+    names = [outputs[k] for k, part in zip(chosen, parts, strict=True) for _ in part.true]
+    return MultiplierComparison(
+        np.concatenate([part.true for part in parts]),
+        np.concatenate([part.estimated for part in parts]),
+        tuple(names),
+    )
+
+
+def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:
+    """Return the index of an input or output that is given by its name or index.
+
+    **Raises:** `DefinitionError` if it is not there.
+    """
+    if isinstance(wanted, str) and wanted in names:
+        return names.index(wanted)
+    if not isinstance(wanted, str) and 0 <= wanted < len(names):
+        return int(wanted)
+    raise DefinitionError(f"there is no {kind} {wanted!r}; the {kind}s are {', '.join(names)}.")
+
+
+class MultiplierEstimate(eqx.Module):
+    r"""Multipliers and their uncertainty: the part that all fits with the denominator $\chi$ share.
+
+    **Fields:**
+
+    - `multipliers` (d,): by decreasing modulus, the roots of
+      $p(\lambda) = \lambda^d + c_1 \lambda^{d-1} + \ldots + c_d$.
+    - `coefficients` (d,): c_1 to c_d, real.
+    - `covariance` (d, d): that of the coefficients, infinite where it is unknown, estimated with
+      `covariance_freedom` degrees of freedom (infinite where it is exact). All standard errors and
+      confidence regions follow from it.
+    """
+
+    multipliers: Complex[np.ndarray, " d"]
+    coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    covariance_freedom: float = eqx.field(static=True)
+
+    @property
+    def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:
+        r"""Covariance of (Re, Im) of each multiplier, to first order.
+
+        From $d\lambda / dc_j = -\lambda^{d-j} / p'(\lambda)$. The imaginary part of a real
+        multiplier has no variance. Where two multipliers nearly coincide, the first order is too
+        small: `contains` does not use it.
+        """
+        d = len(self.coefficients)
+        powers = self.multipliers[:, None] ** np.arange(d - 1, -1, -1)
+        slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
+        with np.errstate(all="ignore"):
+            gradient = -powers / slope[:, None]
+        real = self.multipliers.imag == 0
+        parts = np.stack([gradient.real, np.where(real[:, None], 0.0, gradient.imag)], axis=1)
+        return np.einsum("iaj,jk,ibk->iab", parts, self.covariance, parts)
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " d"]:
+        """Root of the expected squared distance of each multiplier from the true one."""
+        return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
+
+    @checked
+    def distance(self, true: Multipliers) -> Float[np.ndarray, " k"]:
+        r"""Squared distance of the estimate from supposed multipliers, in units of its covariance.
+
+        $\lambda$ is a multiplier if $p(\lambda) = 0$, which is linear in c: one real equation for
+        a real $\lambda$, two for a complex one. The result is
+        $p^T \mathrm{Cov}(p)^{-1} p$, chi-squared distributed with one or two degrees of freedom at
+        a true multiplier (Hotelling's $T^2$ where the covariance is estimated), also where
+        multipliers are close to each other (Fieller 1954). Zero where the covariance is infinite.
+        """
+        truth = np.atleast_1d(np.asarray(true, complex)).ravel()
+        if not np.isfinite(self.covariance).all():
+            return np.zeros(len(truth))
+        powers = truth[:, None] ** np.arange(len(self.coefficients), -1, -1)
+        value = powers @ np.concatenate([[1.0], self.coefficients])
+        out = np.empty(len(truth))
+        for i, z in enumerate(truth):
+            equations = 1 if z.imag == 0 else 2
+            rows = np.array([powers[i, 1:].real, powers[i, 1:].imag])[:equations]
+            p = np.array([value[i].real, value[i].imag])[:equations]
+            cov = rows @ self.covariance @ rows.T
+            # Scaled, since a tiny multiplier makes one of the two equations tiny.
+            scale = np.sqrt(np.diag(cov))
+            if not (scale > 0).all():
+                out[i] = np.inf if p.any() else 0.0
+                continue
+            p, cov = p / scale, cov / scale / scale[:, None]
+            out[i] = p @ np.linalg.lstsq(cov, p)[0]
+        return out
+
+    @checked
+    def contains(self, true: Multipliers, level: Probability = 0.95) -> Bool[np.ndarray, " k"]:
+        """Test whether supposed multipliers lie in the confidence region of this level.
+
+        A conjugate pair is one hypothesis, not two.
+        """
+        truth = np.atleast_1d(np.asarray(true, complex)).ravel()
+        return self.distance(truth) <= self._radius(level, np.where(truth.imag == 0, 1, 2))
+
+    @checked
+    def ellipse(
+        self, index: int = 0, level: Probability = 0.95, points: PeriodCount = 100
+    ) -> Complex[np.ndarray, " points"]:
+        """Return the border of a multiplier's confidence region, to first order: a closed curve.
+
+        For a real multiplier it is an interval, drawn forth and back.
+
+        **Raises:** `DefinitionError` for an index that is not there.
+        """
+        if not -len(self.multipliers) <= index < len(self.multipliers):
+            raise DefinitionError(
+                f"there is no multiplier {index}: the fit has {len(self.multipliers)}."
+            )
+        degrees = 1 if self.multipliers[index].imag == 0 else 2
+        values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
+        angle = np.linspace(0, 2 * np.pi, points)
+        circle = np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+        x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
+        return self.multipliers[index] + x + 1j * y
+
+    @checked
+    def compare(self, true: Multipliers) -> MultiplierComparison:
+        """Pair the multipliers with the true ones; printing the result shows a table."""
+        return compare_multipliers(self.multipliers, true)
+
+    @checked
+    def half_widths(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
+        """Return half the widths of the confidence intervals of real and imaginary parts.
+
+        To first order, for each multiplier.
+        """
+        variances = np.diagonal(self.multiplier_covariances, axis1=1, axis2=2)
+        return np.sqrt(self._radius(level, 1) * np.maximum(variances, 0))
+
+    def __repr__(self) -> str:
+        about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))
+        return f"{type(self).__name__}(multipliers {about})"
+
+    def _repr_html_(self) -> str:
+        regions = []
+        if np.isfinite(self.multiplier_covariances).all():
+            regions = [self.ellipse(k) for k in range(len(self.multipliers))]
+        shown = multiplier_table(self.multipliers, self.half_widths())
+        circle = unit_circle(self.multipliers, regions)
+        return card(type(self).__name__, "", shown, circle, text(self._about()))
+
+    def _about(self) -> str:
+        """The rest of a `repr`, after the multipliers."""
+        return ""
+
+    def show_multipliers(self) -> str:
+        """Return the multipliers and their standard errors, for a `repr`."""
+        return ", ".join(
+            f"{x.real:+.7f}{x.imag:+.7f}i ± {s:.1e}"
+            for x, s in zip(self.multipliers, self.standard_errors, strict=True)
+        )
+
+    def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
+        """Quantile of `distance`."""
+        from scipy import special  # (a fifth of a second)
+
+        if np.isinf(self.covariance_freedom):
+            return 2 * special.gammaincinv(degrees / 2, level)
+        left = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
+        return degrees * self.covariance_freedom / left * special.fdtri(degrees, left, level)

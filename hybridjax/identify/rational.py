@@ -1,0 +1,267 @@
+"""The paper's parametric fit: one rational function of z for one harmonic (Sec. VI-C3)."""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Order, Scalar, Vector
+from .._core.html import card, complex_number, table, unit_circle
+from .._core.precision import require_x64
+from .._core.results import Result
+from ..errors import ComputationError, DefinitionError
+from ..linear.htf import HTF
+from .descent import least_squares
+from .multiplier_estimate import (
+    MultiplierComparison,
+    Multipliers,
+    channel_index,
+    compare_by_output,
+)
+
+
+# Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found for
+# some forms and weightings; more: the same result in longer time.
+_STARTS = (0, 1, 4, 29)
+# Part of the residual, relative to H, that a step may still explain at the end. Smaller: descents
+# on exact data stall in rounding; larger: coefficients that are off by as much.
+_ACCURACY = 1e-8
+# Relative difference of costs that are equal: a converged fit is then preferred.
+_EQUAL_COST = 1e-9
+# |H| relative to its rms that counts as zero: relative weights would be infinite.
+_ZERO = 1e-12
+
+
+class RationalFit(eqx.Module):
+    r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to one harmonic, one per output.
+
+    $$H(z) \approx \frac{z^{-\delta} (b_0 + b_1 z^{-1} + \ldots + b_q z^{-q})}
+    {1 + a_1 z^{-1} + \ldots + a_p z^{-p}}$$
+
+    with real coefficients; $\delta = 1$ in the form "delayed" (no feed-through), 0 in "direct".
+    A pole $p$ stands for the Floquet multiplier $p^N$. The true $H_m$ has all N-th roots of
+    every multiplier as poles, so a fit of low order is biased even on exact data, by an amount
+    that depends on form and weighting: both are part of the result.
+
+    **Fields** (ny outputs on the first axis):
+
+    - `numerator` b (ny, q+1); `denominator` (ny, p+1), its first entry 1.
+    - `poles` (ny, p) and `zeros` (ny, q) in z, without those at the origin; a zero at infinity is
+      NaN. Sorted by decreasing modulus.
+    - `multipliers` (ny, p): poles to the power N, in the order of the poles.
+    - `residual` (ny,): root mean square misfit; relative to the rms of H with uniform weighting,
+      of the relative error with relative weighting.
+    - `result` (ny,): codes of `Result`, OK or NOT_CONVERGED.
+    - `harmonic`, `n_sections`, `form`, `weighting`, `outputs`, `input`: the arguments of the fit.
+    """
+
+    numerator: Float[np.ndarray, "ny b"]
+    denominator: Float[np.ndarray, "ny a"]
+    poles: Complex[np.ndarray, "ny p"]
+    zeros: Complex[np.ndarray, "ny q"]
+    multipliers: Complex[np.ndarray, "ny p"]
+    residual: Float[np.ndarray, " ny"]
+    result: Int[np.ndarray, " ny"]
+    harmonic: int = eqx.field(static=True)
+    n_sections: int = eqx.field(static=True)
+    form: str = eqx.field(static=True)
+    weighting: str = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    input: str = eqx.field(static=True)
+
+    @checked
+    def htf(self, f: Scalar | Vector) -> HTF:
+        """Return the fitted functions at frequencies f (F,), cycles per period."""
+        f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
+        w = np.exp(-2j * np.pi * f / N)
+        top, bottom = (
+            np.polynomial.polynomial.polyval(w, x.T) for x in (self.numerator, self.denominator)
+        )
+        H = (top / bottom * (w if self.form == "delayed" else 1.0)).T[None, :, :, None]
+        harmonic = (self.harmonic + N // 2) % N - N // 2  # (they count modulo N)
+        return HTF(f, H, harmonic, N, self.input, self.outputs, "rational fit")
+
+    @checked
+    def compare(self, true: Multipliers, output: str | int | None = None) -> MultiplierComparison:
+        """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
+
+        **Raises:** `DefinitionError` for an output that is not there.
+        """
+        return compare_by_output(list(self.multipliers), true, self.outputs, output)
+
+    def __repr__(self) -> str:
+        rows = [
+            f"RationalFit(H_{self.harmonic} from {self.input}, {self.denominator.shape[1] - 1} "
+            f"poles, {self.numerator.shape[1] - 1} zeros, {self.form}, {self.weighting} weighting)"
+        ]
+        for name, multipliers, residual, code in zip(
+            self.outputs, self.multipliers, self.residual, self.result, strict=True
+        ):
+            shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in multipliers)
+            state = "" if code == Result.OK else f" ({Result(int(code)).message})"
+            rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}{state}")
+        return "\n".join(rows)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, *map(complex_number, (pole, multiplier)), f"{residual:.2e}")
+            for name, poles, multipliers, residual in zip(
+                self.outputs, self.poles, self.multipliers, self.residual, strict=True
+            )
+            for pole, multiplier in zip(poles, multipliers, strict=True)
+        ]
+        of = repr(self).splitlines()[0].removeprefix("RationalFit(").removesuffix(")")
+        head = ("output", "pole", "multiplier", "residual")
+        return card("RationalFit", of, table(head, rows), unit_circle(self.multipliers.ravel()))
+
+
+@checked
+def fit_rational(
+    htf: HTF,
+    harmonic: int = 0,
+    *,
+    output: str | int | None = None,
+    input: str | int = 0,
+    poles: Order = 2,
+    zeros: Index = 1,
+    form: Literal["delayed", "direct"] = "delayed",
+    weighting: Literal["uniform", "relative"] = "uniform",
+) -> RationalFit:
+    """Fit a rational function of z with real coefficients to one harmonic.
+
+    The residual `W (H - B/A)` is minimized by Gauss-Newton steps in
+    the denominator only: for a given denominator the best numerator solves a linear problem
+    (variable projection). The descents start from several solutions of the linearized
+    problem (Levy 1959; Sanathanan and Koerner 1963) and the best result is kept.
+
+    **Arguments:**
+
+    - `htf`: estimated or exact. `harmonic`: usually 0, the default; the others of a real system
+      have complex coefficients, which this form does not have.
+    - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
+    - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
+    - `form`: `"delayed"`, the default, numerator from z^-1 on (the output does not depend on the
+      input of its own section), or `"direct"`, from z^0 on.
+    - `weighting`: `"uniform"`, the default, or `"relative"`, each residual divided by |H|.
+
+    **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
+
+    **Raises:** `DefinitionError` for a harmonic, output or input that is not there, for fewer
+    lines than coefficients, for NaN or, with relative weighting, zeros in H;
+    `ComputationError` if no start leads to a finite fit.
+    """
+    require_x64(htf.H)
+    column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
+    if output is not None:
+        rows = [channel_index("output", output, htf.outputs)]
+    H = np.asarray(htf.harmonic(harmonic))[:, :, column]
+    if 2 * len(H) < poles + zeros + 1:
+        raise DefinitionError(
+            f"{poles} poles and {zeros} zeros have {poles + zeros + 1} coefficients, too many for "
+            f"{len(H)} frequencies."
+        )
+    w = np.exp(-2j * np.pi * np.asarray(htf.f) / htf.n_sections)[:, None]
+    powers_b, powers_a = (
+        w ** (int(form == "delayed") + np.arange(zeros + 1)),
+        w ** (1 + np.arange(poles)),
+    )
+    fits = []
+    for row in rows:
+        h = H[:, row]
+        name = f"H_{harmonic} of {htf.outputs[row]}"
+        if not np.isfinite(h).all():
+            raise DefinitionError(f"{name} holds NaN or infinity.")
+        rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
+        if rms == 0 or (weighting == "relative" and np.abs(h).min() < _ZERO * rms):
+            raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
+        weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
+        problem = _Problem(powers_b, powers_a, h / rms, weight / np.sqrt(len(h)))
+        with np.errstate(all="ignore"):
+            ends = [least_squares(problem.linearize, a, settled_gain=_ACCURACY**2)
+                    for a in problem.starts()]  # fmt: skip
+            projected = [problem.project(end.coefficients) for end in ends]
+        cost = np.array([float(np.linalg.norm(residual)) for _, residual, _ in projected])
+        cost[~np.isfinite(cost)] = np.inf
+        if not np.isfinite(cost).any():
+            raise ComputationError(f"no start led to a finite fit of {name}: try fewer poles.")
+        lowest = cost <= cost.min() * (1 + _EQUAL_COST)
+        best = int(np.argmax(lowest * [1 + end.converged for end in ends]))
+        a, converged = ends[best]
+        result = Result.OK if converged else Result.NOT_CONVERGED
+        fits.append((projected[best][0] * rms, np.append(1.0, a), cost[best], int(result)))
+    numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
+    roots = np.stack([_roots(a) for a in denominator])
+    with np.errstate(over="ignore", invalid="ignore"):  # a useless pole far outside overflows
+        multipliers = roots**htf.n_sections
+    return RationalFit(
+        numerator=numerator,
+        denominator=denominator,
+        poles=roots,
+        zeros=np.stack([_roots(b) for b in numerator]),
+        multipliers=multipliers,
+        residual=residual,
+        result=result,
+        harmonic=harmonic,
+        n_sections=htf.n_sections,
+        form=form,
+        weighting=weighting,
+        outputs=tuple(htf.outputs[row] for row in rows),
+        input=htf.inputs[column],
+    )
+
+
+def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
+    """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
+    finite = np.roots(coefficients).astype(complex)
+    finite = finite[np.lexsort((-finite.imag, -np.abs(finite)))]
+    return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
+
+
+class _Problem(NamedTuple):
+    """The weighted residual W (H - B/A) of F lines."""
+
+    powers_b: Complex[np.ndarray, "F q1"]
+    """The powers of z of the coefficients of B,"""
+    powers_a: Complex[np.ndarray, "F p"]
+    """and of those of A after its leading 1."""
+    h: Complex[np.ndarray, " F"]
+    weight: Float[np.ndarray, " F"]
+
+    def project(
+        self, a: Float[np.ndarray, " p"]
+    ) -> tuple[Float[np.ndarray, " q1"], Float[np.ndarray, " rows"], Float[np.ndarray, "rows p"]]:
+        """Return the best numerator, the residual and its derivative by the coefficients of A."""
+        bottom = 1 + self.powers_a @ a
+        by_numerator = (self.weight / bottom)[:, None] * self.powers_b
+        q, triangle = np.linalg.qr(_real(by_numerator))
+        target = _real((self.weight * self.h)[:, None])[:, 0]
+        b = np.linalg.solve(triangle, q.T @ target)
+        residual = target - q @ (q.T @ target)
+        # B/A and the space of all B/A change with the denominator (Golub and Pereyra 1973).
+        slope = -self.powers_a / bottom[:, None]
+        moved = _real((by_numerator @ b)[:, None] * slope)
+        turned = np.stack([_real(x[:, None] * by_numerator).T @ residual for x in slope.T], axis=1)
+        jacobian = q @ (q.T @ moved) - moved - q @ np.linalg.solve(triangle.T, turned)
+        return b, residual, jacobian
+
+    def linearize(self, a: Float[np.ndarray, " p"]):
+        return self.project(a)[1:]
+
+    def starts(self) -> Iterator[Float[np.ndarray, " p"]]:
+        """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
+        h, p = self.h[:, None], self.powers_a.shape[1]
+        a = np.zeros(p)
+        for step in range(1 + max(_STARTS)):
+            scale = (self.weight / np.abs(1 + self.powers_a @ a))[:, None]
+            columns = _real(scale * np.concatenate([h * self.powers_a, -self.powers_b], axis=1))
+            size = np.linalg.norm(columns, axis=0)
+            a = (np.linalg.lstsq(columns / size, -_real(scale * h)[:, 0])[0] / size)[:p]
+            if step in _STARTS:
+                yield a
+
+
+def _real(z: Complex[np.ndarray, "F n"]) -> Float[np.ndarray, "rows n"]:
+    return np.concatenate([z.real, z.imag])

@@ -1,0 +1,290 @@
+"""Sums over experiments, for each line of the spectrum, from which HTFs are estimated.
+
+Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the
+same memory for any number of experiments, and those of two sets of experiments add.
+"""
+
+from collections.abc import Iterable
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from .._core.boundary.containers import Stream
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.design.partition import check_sharing, meets_itself, regular
+from ..linear.frequency_response import Harmonics, check_harmonics
+
+
+Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
+"""Experiments, or parts of them one after the other."""
+
+
+# Largest change of a line of the input from one window to the next, relative to the largest line.
+# Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
+_REPEATS = 1e-2
+# Part of the largest line of all inputs below which a line is rounding.
+_ROUNDING = 1e-12
+# Part of the largest line of an input below which a line is not excited, where nobody chose it.
+# Smaller: rounding counts as a line; larger: weak lines are missed.
+SILENT_LINE = 1e-6
+# Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
+# lines. Fewer signals or redraws: random phases count as optimized more often, by chance; fewer
+# lines: chance does as well as any choice of phases.
+_TESTED, _REDRAWS, _FEWEST_LINES = 12, 200, 8
+
+
+class Setup(NamedTuple):
+    """The names and numbers that all experiments of one estimate share."""
+
+    n_sections: int
+    periods: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+class SpectralSums(NamedTuple):
+    """Sums over experiments that did not fail, for K lines, ascending.
+
+    The regressors X of a line are its inputs U and their conjugates.
+    """
+
+    setup: Setup
+    harmonics: tuple[int, ...]
+    line: Int[np.ndarray, " K"]
+    mirrored: Bool[np.ndarray, " K"]
+    """Lines that coincide with their own mirror images: responses to U and conj(U) add there."""
+    tried: Complex[np.ndarray, "K 2*nu 2*nu"]
+    """Sums of conj(X) X^T over all experiments, also those that failed."""
+    gram: Complex[np.ndarray, "K 2*nu 2*nu"]
+    """Sums of conj(X) X^T."""
+    count: Int[np.ndarray, " K"]
+    """The number of experiments."""
+    along: Complex[np.ndarray, "K 2*nu M ny"]
+    """Sums of conj(X) Y[k + l P], Y the mean over the repeated windows."""
+    energy: Float[np.ndarray, "K M ny"]
+    """Sums of |Y[k + l P]|^2."""
+    present: Float[np.ndarray, "K nu"]
+    """The number of experiments with each input."""
+    energies: Float[np.ndarray, "K nu M ny"]
+    """Sums of |Y[k + l P]|^2 over the experiments with each input."""
+    turned: Complex[np.ndarray, "K nu M ny"]
+    """Sums of Y[k + l P]^2, turned back by twice the phase of each input."""
+    noise: Float[np.ndarray, "K M ny"]
+    """Sums of the variance of Y[k + l P] between windows; zero for one window."""
+    crest_factors: tuple[int, int]
+    """Signals that were tested, and those with crest factors below all redraws of their phases."""
+    repeats: int
+    """The number of windows that were averaged."""
+    experiments: tuple[int, int]
+    """The number of experiments, and of those that did not fail."""
+
+    @property
+    def f(self) -> Float[np.ndarray, " K"]:
+        return self.line / self.setup.periods
+
+    def solvable(self, gram: Complex[np.ndarray, "K n n"]) -> Bool[np.ndarray, " K"]:
+        """Test which lines tell the responses to all inputs (and mirror images) apart."""
+        nu = len(self.setup.inputs)
+        single = regular(gram[:, :nu, :nu])
+        return np.where(self.mirrored, single & regular(gram), single)
+
+    def one_phase(self) -> Bool[np.ndarray, " K"]:
+        """Test which mirrored lines were excited with one phase only."""
+        nu = len(self.setup.inputs)
+        return self.mirrored & regular(self.tried[:, :nu, :nu]) & ~regular(self.tried)
+
+
+def spectral_sums(
+    data: Experiments,
+    harmonics: Harmonics | None,
+    *,
+    highest: int | None = None,
+    threshold: float = SILENT_LINE,
+    repeats: int = 1,
+) -> SpectralSums:
+    """Return the sums over all experiments, which may come in parts.
+
+    **Arguments:** as of `estimate_htf`; no harmonics are `()`.
+
+    **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
+    other, if records are too short, or if parts do not belong together.
+    """
+    total, count = None, 0
+    for part in [data] if isinstance(data, ExperimentData) else data:
+        setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
+        if total is not None and setup != total.setup:
+            raise DefinitionError(
+                f"these experiments do not belong together: some have {total.setup}, others "
+                f"{setup}."
+            )
+        chosen = _choose_harmonics(harmonics, highest, part.n_sections)
+        reach = None if highest is None else highest + max(map(abs, chosen), default=0)
+        sums = _sums_of_part(part, setup, chosen, reach, threshold, repeats, count)
+        total = sums if total is None else _add(total, sums)
+        count += len(part.ok)
+    if total is None:
+        raise DefinitionError("`data` holds no experiments.")
+    if len(total.line) == 0:
+        raise DefinitionError("the inputs are zero in the window: there is nothing to estimate.")
+    return total
+
+
+def _choose_harmonics(
+    harmonics: Harmonics | None, highest: int | None, n_sections: int
+) -> tuple[int, ...]:
+    if harmonics == ():
+        return ()
+    chosen = check_harmonics(harmonics, n_sections)
+    if highest is None:
+        return chosen
+    if harmonics is None:
+        return tuple(m for m in chosen if abs(m) <= highest)
+    if max(map(abs, chosen)) > highest:
+        raise DefinitionError(
+            f"harmonics beyond highest = {highest} are taken as zero, so {chosen} cannot all be "
+            "estimated."
+        )
+    return chosen
+
+
+def _sums_of_part(
+    data: ExperimentData,
+    setup: Setup,
+    harmonics: tuple[int, ...],
+    highest: int | None,
+    threshold: float,
+    repeats: int,
+    first: int,
+) -> SpectralSums:
+    """Return the sums over one part, whose first experiment has the number `first`."""
+    windows = data.windows(repeats)
+    experiment, line, U = _excited(data, windows, threshold, highest, first)
+    lines, index = np.unique(line, return_inverse=True)
+    good = data.ok[experiment]
+
+    def total(values, keep):
+        """Sums over the entries of each line."""
+        values, where = values[keep], index[keep]
+        order = np.argsort(where, kind="stable")
+        begin = np.flatnonzero(np.diff(where[order], prepend=-1))
+        out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
+        if len(begin):
+            out[where[order][begin]] = np.add.reduceat(values[order], begin, axis=0)
+        return out
+
+    X = np.concatenate([U, U.conj()], axis=1)
+    products = X[:, :, None].conj() * X[:, None]
+    Y, noise = _outputs(data, windows, experiment, line, harmonics)
+    size = np.abs(U)
+    phase = np.divide(U.conj(), size, out=np.zeros_like(U), where=size > 0)
+    turned = phase[:, :, None, None] * Y[:, None]
+    tested = (0, 0)
+    if first or len(lines) < len(line):  # lines were measured several times
+        tested = _compare_crest_factors(data.u[:, data.window])
+    return SpectralSums(
+        setup,
+        harmonics,
+        lines,
+        meets_itself(lines, setup.periods, setup.n_sections, highest),
+        tried=total(products, np.ones(len(U), bool)),
+        gram=total(products, good),
+        count=total(np.ones(len(U), int), good),
+        along=total(X.conj()[:, :, None, None] * Y[:, None], good),
+        energy=total(np.abs(Y) ** 2, good),
+        present=total(1.0 * (size > 0), good),
+        energies=total(np.abs(turned) ** 2, good),
+        turned=total(turned**2, good),
+        noise=total(noise, good),
+        crest_factors=tested,
+        repeats=repeats,
+        experiments=(len(data.ok), int(data.ok.sum())),
+    )
+
+
+def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
+    """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
+    N, P = data.n_sections, data.periods
+    output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
+    Y = np.stack([np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows])
+    mean = Y.sum(axis=0) / len(Y)
+    spread = (np.abs(Y - mean) ** 2).sum(axis=0)
+    return mean, spread / max(len(Y) - 1, 1) / len(Y)
+
+
+def _excited(
+    data: ExperimentData, windows: list[slice], threshold: float, highest: int | None, first: int
+):
+    """Return experiment, line and U of every excited line, checked that they do not meet."""
+    u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
+    spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
+    U = spectra.sum(axis=0) / len(spectra)
+    size = np.abs(U)
+    peak = size.max(axis=(1, 2), keepdims=True)
+    worst = float(np.max(np.abs(spectra - U) / np.where(peak > 0, peak, 1)))
+    if worst > max(threshold, _REPEATS):
+        raise DefinitionError(
+            f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
+            f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
+            "right number of periods."
+        )
+    excited = ((size > threshold * peak) & (size > _ROUNDING * peak.max())).any(axis=2)
+    experiment, line = np.nonzero(excited)
+    number = excited.sum(axis=1)
+
+    def hint(experiment: int) -> str:
+        lines = number[experiment - first]
+        if lines <= data.periods // 2 + 1:
+            return ""
+        return (
+            f" ({lines} lines are excited, more than any experiment can hold: is the "
+            f"input periodic over the last P = {data.periods} periods, and without noise above "
+            "`threshold`?)"
+        )
+
+    check_sharing(experiment + first, line, data.periods, hint, data.n_sections, highest)
+    return experiment, line, U[experiment, line]
+
+
+def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
+    """Compare crest factors with those of 200 redraws of the phases, for some of the signals.
+
+    The realizations of a random-phase multisine show the distortion that its class of signals
+    causes; signals with phases chosen for a low crest factor (the largest value relative to the
+    rms, about 3 for random phases) do not. Return the numbers of signals that were tested, and of
+    those with crest factors below all redraws.
+    """
+    chosen = np.unique(np.linspace(0, len(u) - 1, _TESTED).round().astype(int))
+    rng = np.random.default_rng(0)
+    tested = low = 0
+    for signal in u[chosen].transpose(0, 2, 1).reshape(-1, u.shape[1]):
+        size = np.abs(np.fft.rfft(signal))
+        lines = np.flatnonzero(size > SILENT_LINE * size.max())
+        if not np.isfinite(signal).all() or not _FEWEST_LINES <= len(lines) <= len(signal) // 4:
+            continue
+        spectra = np.zeros((_REDRAWS, len(size)), complex)
+        angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
+        spectra[:, lines] = size[lines] * np.exp(1j * angle)
+        draws = np.abs(np.fft.irfft(spectra, len(signal), axis=1)).max(axis=1)
+        tested += 1
+        low += bool(np.abs(signal).max() < draws.min())
+    return tested, low
+
+
+def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
+    line = np.union1d(a.line, b.line)
+    rows = [np.searchsorted(line, x.line) for x in (a, b)]
+
+    def add(x, y):
+        out = np.zeros((len(line), *x.shape[1:]), x.dtype)
+        out[rows[0]] += x
+        out[rows[1]] += y
+        return out
+
+    common = ("setup", "harmonics", "line", "repeats")
+    both = {}
+    for name in set(SpectralSums._fields).difference(common):
+        x, y = getattr(a, name), getattr(b, name)
+        both[name] = (x[0] + y[0], x[1] + y[1]) if isinstance(x, tuple) else add(x, y)
+    return a._replace(line=line, **both)

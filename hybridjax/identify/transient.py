@@ -1,0 +1,233 @@
+r"""Transients subtracted from records whose initial condition could not be chosen.
+
+Sampled once a period, at one section, the response to an input of P periods is a sum of the few
+sinusoids $e^{2 \pi i c p / P}$, c the classes that are excited, and the response to the initial
+condition decays like $\sum_i a_i \lambda_i^p$. The multipliers $\lambda$ are the same at every
+section, in every output and every experiment (after the first period, in which the part of the
+state with zero multipliers vanishes). All amplitudes are linear unknowns, which are eliminated, so
+that d multipliers are left (variable projection: Golub and Pereyra 1973).
+"""
+
+import dataclasses
+from typing import Annotated
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.arguments import Numbers
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Order
+from .._core.boundary.values import Complexes
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData, Simulated
+from ..experiments.design.partition import line_class
+from .denominator import multipliers_of
+from .spectral_sums import SILENT_LINE
+
+
+# The largest number of multipliers that is tried. Larger: records need 8 more cycles for each one
+# to be separated from all that repeats; smaller: slow modes of larger systems are missed.
+_LARGEST_ORDER = 4
+# Change of the input after P periods, relative to its largest value, and imaginary part of
+# coefficients, that are rounding.
+_REPEATS, _REAL = 1e-6, 1e-9
+# Scale of steps for coefficients that start near zero. Smaller: they hardly move.
+_SMALLEST_SCALE = 0.1
+
+
+class TransientFit(eqx.Module):
+    """Records without their transients.
+
+    **Fields:**
+
+    - `data`: the records from period `skip` on, less the transient.
+    - `multipliers` (d,): those of the decay, by decreasing modulus. A by-product: fits to all of
+      the data are more accurate.
+    - `removed` (S, ny): rms of the transient in the window, per experiment and output; NaN
+      where an experiment failed.
+    """
+
+    data: ExperimentData
+    multipliers: Complex[np.ndarray, " d"]
+    removed: Float[np.ndarray, "S ny"]
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
+        removed = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
+        return f"TransientFit(multipliers {shown}; removed rms up to {removed}; {self.data!r})"
+
+
+@checked
+def remove_transient(
+    data: ExperimentData,
+    order: Order | None = None,
+    *,
+    multipliers: Annotated[Numbers, Complexes("d")] | None = None,
+    skip: Index = 1,
+) -> TransientFit:
+    """Fit the decay of the initial condition's response, and subtract it.
+
+    Needs no model. The input has the period P over all of the record, which is longer than P
+    periods, by `skip` at least. If it is longer by several (20, say), the decay is separated from
+    everything that repeats after P periods, distortion included, and any design will do. With
+    fewer, it is separated only from the response at excited lines, so that the design must leave
+    out half of them (`multisine(lines="odd")`).
+
+    **Arguments:**
+
+    - `order`: d, the number of non-zero multipliers. Default: the one of 1 to 4 with the
+      shortest description (Rissanen 1978).
+    - `multipliers`: the multipliers, if they are known, conjugates in pairs. Default: fitted.
+    - `skip`: periods at the start in which zero multipliers vanish; they are cut off. Default: 1.
+
+    **Returns:** `TransientFit`, whose `data` are the argument of `estimate_htf`.
+
+    **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
+    and if no experiment ran well.
+    """
+    N, P = data.n_sections, data.periods
+    S, n, ny = data.y.shape
+    cycles = n // N - skip
+    if order is not None and order > cycles // 2:
+        raise DefinitionError(
+            f"`order` must be at most half of the {cycles} cycles, but is {order}."
+        )
+    if cycles < P:
+        raise DefinitionError(
+            f"the record has {n // N} cycles, but to remove a transient it must hold the "
+            f"window of P = {P} and the {skip} skipped ones before it: record some more."
+        )
+    if not data.ok.any():
+        raise DefinitionError(f"no experiment ran well: {data.summary()}.")
+    _require_periodic(data)
+    c = None if multipliers is None else _polynomial(np.asarray(multipliers))
+    if c is not None:
+        order = len(c)
+
+    size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
+    good = np.flatnonzero(data.ok).tolist()
+    scaled = data.y[data.ok] / np.where(size > 0, size, 1.0)
+    y = scaled.reshape(len(good), -1, N * ny)[:, skip:]
+    everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
+    if everything:
+        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
+    else:
+        free = [_free(_classes(data, s), P, cycles) for s in good]
+    left = [Q @ record for Q, record in zip(free, y, strict=True)]
+    least = min(map(len, free))
+    if least <= (order or 1):
+        raise DefinitionError(
+            f"{cycles} cycles with {cycles - least} lines per section leave nothing to tell the "
+            "transient from the response: record more cycles, or excite half of the lines "
+            "(`multisine(lines='odd')`)."
+        )
+    if c is None:
+        tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
+        blocks = _compressed(free, left, everything)
+        count = sum(z.size for z in left)
+        fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
+        c = min(fits, key=lambda fit: fit[0])[1]
+
+    basis = _decays(c, cycles)
+    clean, removed = data.y[:, skip * N :].copy(), np.full((S, ny), np.nan)
+    for Q, z, s in zip(free, left, good, strict=True):
+        transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
+        transient = transient.reshape(-1, ny) * size
+        clean[s] -= transient
+        removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
+    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - skip * N, 0), -1)
+    # Events, some of which lie in the cycles that were cut off, are left out.
+    simulated = None if data.simulated is None else Simulated(failed_at, data.error)
+    data = dataclasses.replace(data, u=data.u[:, skip * N :], y=clean, simulated=simulated)
+    return TransientFit(data, multipliers_of(c), removed)
+
+
+def _require_periodic(data: ExperimentData) -> None:
+    length = data.n_sections * data.periods
+    u = data.u[data.ok]
+    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    worst = int(np.argmax(change))
+    if change[worst] > _REPEATS * np.abs(u[worst]).max():
+        raise DefinitionError(
+            f"experiment {np.flatnonzero(data.ok)[worst]}: the input does not repeat after P = "
+            f"{data.periods} periods over all of the record, so that response and transient cannot "
+            "be told apart."
+        )
+
+
+def _polynomial(multipliers: np.ndarray) -> Float[np.ndarray, " d"]:
+    if len(multipliers) == 0:
+        raise DefinitionError("`multipliers` must hold one or more.")
+    c = np.poly(multipliers)[1:]
+    if np.abs(np.imag(c)).max() > _REAL:
+        raise DefinitionError(f"`multipliers` must be real or in conjugate pairs: {multipliers}.")
+    return np.real(c)
+
+
+def _classes(data: ExperimentData, s: int) -> np.ndarray:
+    """Return the classes of lines that an experiment excites, and 0."""
+    size = np.abs(np.fft.rfft(data.u[s, data.window], axis=0)).max(axis=1)
+    lines = np.flatnonzero(size > SILENT_LINE * size.max())
+    return np.unique(np.append(line_class(lines, data.periods), 0))
+
+
+def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
+    """Return rows that are orthogonal to the sinusoids of these classes at one section."""
+    angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
+    inner = (classes > 0) & (2 * classes < P)
+    signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
+    if signals.shape[1] >= cycles:
+        return np.zeros((0, cycles))
+    return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+
+
+def _decays(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
+    """Return a basis of the solutions of `v[p] + c_1 v[p-1] + ... + c_d v[p-d] = 0`."""
+    d = len(c)
+    v = np.zeros((cycles, d))
+    v[:d] = np.eye(d)
+    for p in range(d, cycles):
+        v[p] = -c @ v[p - d : p][::-1]
+    return v
+
+
+def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
+    """Solve the equation of the decay, which `y` obeys but for sinusoids, by least squares."""
+    normal, right = np.zeros((d, d)), np.zeros(d)
+    cycles = y.shape[1]
+    for Q, record in zip(free, y, strict=True):
+        # The same sinusoids, d periods fewer.
+        signals = np.linalg.svd(Q, full_matrices=True)[2][len(Q) :].T[d:]
+        keep = np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+        lags = np.stack([keep @ record[d - i : cycles - i] for i in range(d + 1)])
+        normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
+        right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
+    return np.linalg.lstsq(normal, right, rcond=None)[0]
+
+
+def _compressed(free, left, everything: bool):
+    """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
+    if everything:
+        free, left = free[:1], [np.concatenate(left, axis=1)]
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T for z in left]
+    return list(zip(free, fewer, strict=True))
+
+
+def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
+    """Return the length of the description, and the coefficients."""
+    from scipy.optimize import least_squares  # (a third of a second)
+
+    cycles = blocks[0][0].shape[1]
+
+    def residual(c):
+        basis, out = _decays(c, cycles), []
+        for Q, z in blocks:
+            q = np.linalg.qr(Q @ basis)[0]
+            out.append((z - q @ (q.T @ z)).ravel())
+        return np.concatenate(out)
+
+    fit = least_squares(residual, start, x_scale=np.maximum(np.abs(start), _SMALLEST_SCALE))
+    parameters = len(start) * (series + 1)
+    mean = max(2 * fit.cost, 1e-300) / count
+    return count * np.log(mean) + parameters * np.log(count), fit.x

@@ -1,0 +1,342 @@
+r"""Harmonic transfer functions with their numerators eliminated.
+
+Every entry of the HTFs (one harmonic, output and input) obeys $H = B / \chi + \varepsilon$ with a
+polynomial B in $z^{-1}$ of its own and one $\chi(z^{-N}) = 1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$
+for all. For given c the best numerators solve a linear least-squares problem, whose residual
+depends on c alone (variable projection: Golub and Pereyra 1973).
+
+Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Inexact, Int
+
+from ..linear.htf import HTF
+from .denominator import Covariance, chi, inverse_of_remainder, sandwich
+from .descent import Coefficients, Minimum, least_squares
+
+
+# Singular values of the powers of z^-1 relative to the largest one. Smaller: bases of rounding
+# errors; larger: combinations of powers are missing from the numerators.
+_RANK = 1e-13
+# Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
+# group for each entry, which takes longer; fewer: weights that are off by as much.
+_EQUAL_WEIGHTS = 9
+# Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
+# that ends them. More, smaller: a closer start, which the descent does not need.
+_MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
+# Leading coefficient of a solution relative to its largest one, below which c would be infinite.
+_NO_LEADING_COEFFICIENT = 1e-8
+
+
+class HTFGroup(NamedTuple):
+    """Entries of the HTFs with the same equations and, up to a factor, the same weights.
+
+    There are E equations, one per frequency (positive, and negative for pairs of harmonics), K
+    entries and R coefficients of each numerator, which are real if `real`. Equations of real
+    numerators are split into real and imaginary parts: then there are twice as many `rows`.
+    """
+
+    harmonic: Int[np.ndarray, " K"]
+    """The position of an entry's harmonic in the HTFs,"""
+    mirror: Int[np.ndarray, " K"] | None
+    """that of the opposite harmonic, whose conjugate has the same numerator,"""
+    channel: Int[np.ndarray, "K 2"]
+    """and its output and input."""
+    real: bool
+    line: Int[np.ndarray, " E"]
+    """The frequency that an equation belongs to."""
+    period_delay: Complex[np.ndarray, " E"]
+    """z^-N, the delay by one period."""
+    basis: Inexact[np.ndarray, "rows r"]
+    """Orthonormal basis of the powers of z^-1 on these frequencies."""
+    to_powers: Inexact[np.ndarray, "R r"]
+    """The (smallest) coefficients of the powers that make each element of the basis."""
+    weight: Float[np.ndarray, " E"]
+    scale: Float[np.ndarray, " K"]
+    data: Complex[np.ndarray, "E K"]
+    """H times `scale`."""
+
+    @property
+    def freedom(self) -> int:
+        """Real equations that the numerators of one entry leave."""
+        return 2 * len(self.period_delay) - self.basis.shape[1] * (1 if self.real else 2)
+
+    @property
+    def size(self) -> int:
+        """K, the number of entries."""
+        return self.data.shape[1]
+
+    def split(self, values: Complex[np.ndarray, "E n"]) -> Inexact[np.ndarray, "rows n"]:
+        """Return one row for each equation of the numerators."""
+        return np.concatenate([values.real, values.imag]) if self.real else values
+
+    def components(self, rows: Inexact[np.ndarray, "rows n"]) -> Float[np.ndarray, "2 E n"]:
+        """Return the real and imaginary parts of rows that `split` has made."""
+        if self.real:
+            return rows.reshape(2, len(self.period_delay), -1)
+        return np.stack([rows.real, rows.imag])
+
+    def weighted(
+        self, c: Coefficients, values: Complex[np.ndarray, "E n"]
+    ) -> Inexact[np.ndarray, "rows n"]:
+        """Return the rows of chi H = B, weighted: errors of H are multiplied by chi there."""
+        return self.split((self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values)
+
+    def numerator_space(
+        self, c: Coefficients
+    ) -> tuple[Inexact[np.ndarray, "rows r"], Inexact[np.ndarray, "r r"]]:
+        """Return an orthonormal basis of the numerators' weighted values, and its QR's triangle."""
+        w = self.weight / np.abs(chi(self.period_delay, c))
+        return np.linalg.qr(np.concatenate([w, w])[: len(self.basis), None] * self.basis)
+
+    def leverage(self, q: Inexact[np.ndarray, "rows r"]) -> Float[np.ndarray, "2 E"]:
+        """Return the share of each real equation that the numerators explain for any data."""
+        share = (np.abs(q) ** 2).sum(axis=1)
+        return share.reshape(2, -1) if self.real else np.stack([share, share])
+
+
+class Misfit(NamedTuple):
+    """The residual of one group at some c, with the best numerators."""
+
+    residual: Float[np.ndarray, "2 E K"]
+    """In units of the error."""
+    jacobian: Float[np.ndarray, "d 2 E K"]
+    """Its derivative with respect to c (without what vanishes with the residual: Kaufman 1975)."""
+    noise: Float[np.ndarray, "d d"]
+    """Part of jacobian^T jacobian that comes from errors of variance 1 in the data, per entry."""
+    leverage: Float[np.ndarray, "2 E"]
+
+
+def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
+    """Return the misfit at c and its derivatives; `Misfit.noise` is zero unless asked for."""
+    d, equations = len(c), len(group.period_delay)
+    q, _ = group.numerator_space(c)
+    below = chi(group.period_delay, c)[:, None]
+    target = group.weighted(c, below * group.data)
+    explained = q @ (q.conj().T @ target)
+
+    def filtered(rows, j):
+        """z^-jN / chi times the rows (up to the phase of chi, which all rows share)."""
+        factor = group.period_delay[:, None] ** j / below
+        if group.real:
+            rows = rows[:equations] + 1j * rows[equations:]
+        rows = group.split(factor * rows)
+        return rows - q @ (q.conj().T @ rows)
+
+    slopes = [group.components(filtered(explained, j)) for j in range(1, d + 1)]
+    by_noise = np.zeros((d, d))
+    if noise:
+        leaks = [filtered(q, j).ravel() for j in range(1, d + 1)]
+        by_noise = np.array([[np.vdot(a, b).real for a in leaks] for b in leaks])
+        by_noise *= 1 if group.real else 2
+    residual = group.components(target - explained)
+    return Misfit(residual, np.reshape(slopes, (d, *residual.shape)), by_noise, group.leverage(q))
+
+
+class DelayedResponses(NamedTuple):
+    """The residuals of $z^{-jN} H$, j = 0, ..., d, less numerators, weighted by $1/|\\chi|$."""
+
+    columns: Float[np.ndarray, "rows d1"]
+    """One for each j, over all entries."""
+    noise_gram: Float[np.ndarray, "d1 d1"]
+    """The part of their Gram matrix that is expected from errors of variance 1."""
+
+    def whitened(self) -> Float[np.ndarray, "d1 r"]:
+        """Return a root of the columns' Gram matrix, in units of that of errors alone.
+
+        (The Gram matrix itself would lose half of the digits.)
+        """
+        triangle = np.linalg.qr(self.columns, mode="r")
+        return np.linalg.solve(np.linalg.cholesky(self.noise_gram), triangle.T)
+
+
+def delayed_responses(groups: list[HTFGroup], c: Coefficients) -> DelayedResponses:
+    """Return those of all groups. The coefficients of chi combine the columns to errors alone."""
+    delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
+    for group in groups:
+        q, _ = group.numerator_space(c)
+        parts = [group.weighted(c, group.period_delay[:, None] ** j * group.data) for j in delays]
+        parts = [group.components(part - q @ (q.conj().T @ part)).ravel() for part in parts]
+        columns.append(np.stack(parts, axis=1))
+        left = (2 - group.leverage(q).sum(axis=0)) / np.abs(chi(group.period_delay, c)) ** 2
+        by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
+        noise_gram = noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
+    return DelayedResponses(np.concatenate(columns), np.asarray(noise_gram))
+
+
+def maximum_likelihood(
+    groups: list[HTFGroup], order: int, max_steps: int, start: Coefficients | None = None
+) -> Minimum:
+    """Return the coefficients with the smallest misfit.
+
+    **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
+    problem.
+    """
+
+    def linearize(c):
+        parts = [misfit_of(group, c) for group in groups]
+        jacobian = np.concatenate([p.jacobian.reshape(order, -1) for p in parts], axis=1)
+        return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
+
+    return least_squares(
+        linearize, _linearized(groups, order) if start is None else start, max_steps
+    )
+
+
+def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
+    """Solve chi H = B by total least squares, weighted by 1/|chi| of the last solution.
+
+    The covariance of the errors is known up to a factor, so that the solution is consistent.
+    """
+    c = np.zeros(order)
+    for _ in range(_MAX_REWEIGHTINGS):
+        responses = delayed_responses(groups, c)
+        vectors, _, _ = np.linalg.svd(responses.whitened())
+        null = np.linalg.solve(np.linalg.cholesky(responses.noise_gram).T, vectors[:, -1])
+        if abs(null[0]) < _NO_LEADING_COEFFICIENT * np.abs(null).max():
+            break
+        c, last = null[1:] / null[0], c
+        if np.abs(c - last).max() < _SETTLED_START * (1 + np.abs(c).max()):
+            break
+    return c
+
+
+class Summary(NamedTuple):
+    """The covariance of the coefficients at the minimum, and how large the misfit is."""
+
+    covariance: Covariance
+    cost: float
+    """Sum of squares of the misfit, in units of the errors supposed."""
+    freedom: int
+    """The real equations that the numerators leave: the expected cost."""
+
+
+def summarize(
+    groups: list[HTFGroup], c: Coefficients, errors: Literal["residuals", "variance"]
+) -> Summary:
+    r"""Return the covariance of the coefficients, and how large the misfit is.
+
+    With the residuals r, their Jacobian J and its part Q that errors make,
+    $\mathrm{Cov}(c) = (J^T J - Q)^{-1} M (J^T J - Q)^{-1}$, where M is the covariance of the
+    gradient $J^T r$: $J^T J$ for errors of the variances supposed, or the sum over frequencies of
+    the squares of their parts of the gradient. Each part is first made as large as it is on average
+    before c takes its share of it (Bell and McCaffrey 2002).
+    """
+    d = len(c)
+    lines = 1 + max(int(group.line.max()) for group in groups)
+    score, shares = np.zeros((lines, d)), np.zeros((lines, d, d))
+    noise, cost, freedom = np.zeros((d, d)), 0.0, 0
+    for group in groups:
+        misfit = misfit_of(group, c, noise=True)
+        noise += misfit.noise * group.size
+        cost += float((misfit.residual**2).sum())
+        freedom += group.freedom * group.size
+        # A residual is smaller than the error, by the share of its equation in the numerators.
+        error = misfit.residual / np.sqrt(1 - misfit.leverage)[..., None]
+        np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
+        products = np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian)
+        np.add.at(shares, group.line, products)
+    square = shares.sum(axis=0)
+    if errors == "variance":
+        return Summary(sandwich(square - noise, square), cost, freedom)
+    try:
+        root = np.linalg.cholesky(square)
+        half = np.linalg.inv(root)
+        left = inverse_of_remainder(half @ shares @ half.T, 0.5)
+        score = np.einsum("lij,lj->li", left, score @ half.T) @ root.T
+    except np.linalg.LinAlgError:  # some combination of coefficients is unknown
+        pass
+    return Summary(sandwich(square - noise, score.T @ score, shares), cost, freedom)
+
+
+def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"]:
+    """Return the best numerators for c, of data that are not scaled."""
+    q, triangle = group.numerator_space(c)
+    target = group.weighted(c, chi(group.period_delay, c)[:, None] * group.data)
+    return group.to_powers @ np.linalg.solve(triangle, q.conj().T @ target) / group.scale
+
+
+def group_htf(htf: HTF, weight: Float[np.ndarray, "M F ny nu"], size: int) -> list[HTFGroup]:
+    """Group all entries of the HTFs, with numerators of `size` coefficients.
+
+    Positive and negative frequencies are used, since H_m(-w) = conj H_{-m}(w); where m and -m
+    are the same harmonic the numerators are real.
+    """
+    row_of = {m % htf.n_sections: row for row, m in enumerate(htf.harmonics)}
+    opposite = {row: row_of.get(-m % htf.n_sections) for m, row in row_of.items()}
+    real = [row for row, other in opposite.items() if other == row]
+    pairs = [(other, row) for row, other in opposite.items() if other is not None and row < other]
+    single = [row for row, other in opposite.items() if other is None]
+    groups = _groups(htf, weight, size, real, None, real=True)
+    groups += _groups(htf, weight, size, [p for p, _ in pairs], [n for _, n in pairs], real=False)
+    return groups + _groups(htf, weight, size, single, None, real=False)
+
+
+def _groups(
+    htf: HTF,
+    weight: Float[np.ndarray, "M F ny nu"],
+    size: int,
+    rows: list[int],
+    mirror: list[int] | None,
+    real: bool,
+) -> list[HTFGroup]:
+    """Return harmonics whose numerators solve the same problem, one group for each weight."""
+    if not rows:
+        return []
+    f = np.asarray(htf.f)
+    F, ny, nu = len(f), len(htf.outputs), len(htf.inputs)
+
+    def both(values, conjugate):  # negative frequencies after the positive ones
+        return values if mirror is None else np.concatenate([values, conjugate])
+
+    def entries(values):  # (M, F, ny, nu) -> (E, K)
+        parts = [values[rows]] + ([] if mirror is None else [values[mirror].conj()])
+        return np.moveaxis(np.concatenate(parts, axis=1), 1, 0).reshape(-1, len(rows) * ny * nu)
+
+    powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
+    powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
+    basis, to_powers = powers_basis(np.concatenate([powers.real, powers.imag]) if real else powers)
+
+    weights, data = entries(weight), entries(np.asarray(htf.H))
+    scale = weights[0]
+    shape = weights / scale
+    _, first, which = np.unique(
+        np.round(shape, _EQUAL_WEIGHTS), axis=1, return_index=True, return_inverse=True
+    )
+    number, i, j = np.unravel_index(np.arange(len(scale)), (len(rows), ny, nu))
+    channel, line = np.stack([i, j], axis=1), both(np.arange(F), np.arange(F))
+    groups = []
+    for k, representative in enumerate(first):
+        same = np.flatnonzero(which.ravel() == k)
+        groups.append(
+            HTFGroup(
+                harmonic=np.array(rows)[number[same]],
+                mirror=None if mirror is None else np.array(mirror)[number[same]],
+                channel=channel[same],
+                real=real,
+                line=line,
+                period_delay=both(delay, delay.conj()),
+                basis=basis,
+                to_powers=to_powers,
+                weight=shape[:, representative],
+                scale=scale[same],
+                data=data[:, same] * scale[same],
+            )
+        )
+    return groups
+
+
+def powers_basis(
+    powers: Inexact[np.ndarray, "rows R"],
+) -> tuple[Inexact[np.ndarray, "rows r"], Inexact[np.ndarray, "R r"]]:
+    """Return an orthonormal basis of the powers of z^-1 on some frequencies.
+
+    Combinations that vanish on these frequencies are left out. The second matrix holds the
+    (smallest) coefficients that make each element.
+    """
+    u, s, vh = np.linalg.svd(powers, full_matrices=False)
+    kept = s > _RANK * s[0]
+    return u[:, kept], vh[kept].conj().T / s[kept]
