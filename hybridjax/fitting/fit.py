@@ -260,7 +260,7 @@ class Guesses:
             "cost": Variable("<f8"),
             **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
         }
-        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names))}
+        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names), {})}
         blocks, about = Blocks((S,), (1,)), self.description
         return self, Layout(("guess",), blocks, variables, constants, ("parameter",), about)
 
