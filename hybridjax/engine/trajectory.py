@@ -72,6 +72,11 @@ class Trajectory(eqx.Module):
     result: Result = eqx.field(static=True)
 
     @property
+    def structure(self) -> Structure:
+        """The system by the indices of its charts and transitions."""
+        return Structure(self.system)
+
+    @property
     def events(self) -> list[Event]:
         """The events in order of time."""
         events, charts, transitions = [], self.system.charts(), self.system.transitions()
@@ -106,7 +111,7 @@ class Trajectory(eqx.Module):
         """
         require_x64()
         t, chart, q = self.dense(per_step)
-        s = Structure(self.system)
+        s = self.structure
         items = tuple(s.resolve_outputs(names).items)
         values = np.full((len(names), t.shape[0]), np.nan)
         for a in np.unique(chart):
