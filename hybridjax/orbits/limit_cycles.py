@@ -22,7 +22,6 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.check import check_system
-from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .batches import FULL, QUICK, Programs, Rounds, Tiles
 from .coincidence import commutes
@@ -188,7 +187,7 @@ def map_for_sweep(
 ) -> ReturnMap:
     """The return map of `guess`, for the search of the cycles of many systems."""
     settings = (Settings() if settings is None else settings).filled(SWEEP)
-    s = Structure(guess.system)
+    s = guess.structure
     known = guess.settings.scale if settings.scale is None else settings.scale
     settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
     return dataclasses.replace(guess.return_map, settings=settings)

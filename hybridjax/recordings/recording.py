@@ -381,7 +381,10 @@ def check_events(
 
 
 def _numbers(where: str, name: str, values: Any) -> Series:
-    values = np.asarray(values)
+    try:
+        values = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
         raise DefinitionError(
             f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "
