@@ -19,7 +19,7 @@ from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refus
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validation.validate import Validation
+from ..identify.validate import Validation
 from .beats.response import PhaseResponse
 from .data import SectionData
 from .inspection.finding import Finding

@@ -70,14 +70,10 @@ def estimates(t):
     yield "missing_frequencies", hj.identify.missing_frequencies, dict(data=t.repeated), {
         "data": alone, "threshold": NONNEGATIVE, "highest": optional([*WHOLE, HUGE]),
     }  # fmt: skip
-    yield "output_levels", hj.identify.output_levels, dict(data=t.repeated), {
-        "data": instance(t.design), "repeats": FEW,
-    }  # fmt: skip
     yield "remove_transient", hj.identify.remove_transient, dict(
         data=t.repeated, order=2, skip=1
     ), {
         "data": instance(t.design), "order": optional(FEW), "skip": [*WHOLE, HUGE],
-        "multipliers": ["x", 3, [NAN], [[0.5]], [], [0.5j], Other()],
     }  # fmt: skip
     htf = instance(t.model, t.data)
     yield "fit_rational", hj.fit_rational, dict(htf=t.estimate, output=0), {
