@@ -70,7 +70,7 @@ class Crossing(Definition):
             s.resolve_outputs(self.function)
 
     def in_chart(self, s: Structure, a: int) -> bool:
-        """Whether it can be crossed in chart a."""
+        """True if it can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
         by_name = isinstance(self.function, str | Output)

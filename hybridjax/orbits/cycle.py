@@ -98,7 +98,7 @@ class LimitCycle(eqx.Module):
 
     @property
     def clocked(self) -> bool:
-        """Whether a clock drives the system."""
+        """True if a clock drives the system."""
         return self.system.period() is not None
 
     @property
@@ -134,8 +134,8 @@ class LimitCycle(eqx.Module):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
             values = np.where(lost, 0.0, values)
             if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
-                rest = np.prod(values[~lost]).real
-                values[lost] = np.exp(log_determinant(self.return_map)) / rest
+                resolved = np.prod(values[~lost]).real
+                values[lost] = np.exp(log_determinant(self.return_map)) / resolved
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
@@ -156,7 +156,7 @@ class LimitCycle(eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """Whether all multipliers lie inside the unit circle, but for those of exactly 1 that
+        """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
@@ -198,7 +198,7 @@ class LimitCycle(eqx.Module):
         if self.result != Result.OK:
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        orbit = orbit_picture(self.trajectory())
+        orbit = orbit_picture(self.structure, self.trajectory())
         return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
 
     def _title(self) -> str:
@@ -255,6 +255,7 @@ def rough(cycle: LimitCycle) -> dict[str, Any]:
 
 
 def orbit_picture(
+    s: Structure,
     orbit: Trajectory,
     sections: tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]]
     | None = None,
@@ -264,7 +265,7 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    s, turn = Structure(orbit.system), orbit.dense()
+    turn = orbit.dense()
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""

@@ -89,7 +89,7 @@ class Turn(NamedTuple):
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
-        """Whether the turn ends at its beginning (also of many turns at once, on the host)."""
+        """True if the turn ends at its beginning (also of many turns at once, on the host)."""
         return self.distance <= _CLOSED
 
 

@@ -145,13 +145,13 @@ def fastest(
 
 
 def is_implicit(s: Structure, a: int) -> bool:
-    """Whether chart a is integrated by an implicit method."""
+    """True if chart a is integrated by an implicit method."""
     method = s.method(a)
     return method is not None and method.implicit
 
 
 def has_implicit(s: Structure) -> bool:
-    """Whether some chart is integrated by an implicit method."""
+    """True if some chart is integrated by an implicit method."""
     return any(is_implicit(s, a) for a in range(len(s.charts)))
 
 
