@@ -25,9 +25,6 @@ DECLARED = 10**7
 TEXT = 2**26
 """Bytes of a header or a manifest."""
 
-PROGRAMS = 2**30
-"""Bytes of compiled programs that are kept on disk; those of one system are about ten million."""
-
 
 def unpacked(size: int) -> int:
     """Bytes that a packed file of `size` bytes may hold. Recorded signals are packed to a half or a

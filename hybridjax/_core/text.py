@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .executor import is_traced
+from .executor import is_traced, is_tracer
 from .signal import unit_of, with_unit
 
 
@@ -42,7 +42,7 @@ def columns(rows: Iterable[tuple[str, ...]]) -> str:
 def value(x: Any) -> str:
     """A number, array, module or whatever else a field holds, on one line: of a module that needs
     more (a network, a system) how many numbers it holds."""
-    if isinstance(x, jax.core.Tracer):
+    if is_tracer(x):
         return f"traced {x.dtype}{list(x.shape)}"
     if isinstance(x, jax.Array | np.ndarray | np.generic):
         return _array(np.asarray(x))

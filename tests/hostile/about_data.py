@@ -178,7 +178,7 @@ def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     shared = {"system": instance(PHASE), "data": data, "free": free, "guess": guess}
     yield "fit_model", hj.fit_model, both, shared | {
-        "guesses": COUNT, "spread": POSITIVE, "seed": SEED, "max_steps": COUNT,
+        "guesses": COUNT, "seed": SEED,
         "store": PATH[1:], "client": ["tcp://here", 3, Other()],
     }  # fmt: skip
     yield "identifiability", hj.fitting.identifiability, both, shared

@@ -19,7 +19,7 @@ from hypothesis.extra.numpy import arrays
 from matplotlib import pyplot
 
 import hybridjax as hj
-from hybridjax._core.boundary import arrays as of_arrays, containers, scalars
+from hybridjax._core.boundary import containers, values as kinds
 
 from . import about_data, about_models, about_plots, about_rhythms
 from .run import Hang, ring
@@ -50,32 +50,32 @@ def allowed(kind, good) -> st.SearchStrategy:
 
 
 @allowed.register
-def _(kind: scalars.Whole, good):
+def _(kind: kinds.Whole, good):
     return st.integers(-2, 40) | st.sampled_from([good, 10**12])
 
 
 @allowed.register
-def _(kind: scalars.Number, good):
+def _(kind: kinds.Number, good):
     return NUMBERS
 
 
 @allowed.register
-def _(kind: scalars.OneOf, good):
+def _(kind: kinds.OneOf, good):
     return st.sampled_from([*kind.words, "nope"])
 
 
 @allowed.register
-def _(kind: scalars.Switch, good):
+def _(kind: kinds.Switch, good):
     return st.booleans()
 
 
 @allowed.register
-def _(kind: scalars.Text, good):
+def _(kind: kinds.Text, good):
     return WORDS
 
 
 @allowed.register
-def _(kind: scalars.Nothing, good):
+def _(kind: kinds.Nothing, good):
     return st.none()
 
 
@@ -105,7 +105,7 @@ def _(kind: containers.Table, good):
 
 
 @allowed.register
-def _(kind: of_arrays.Reals, good):
+def _(kind: kinds.Reals, good):
     """Of some shape, and the good values with one of them replaced, or cut."""
     axes = len(kind.shape) if "..." not in kind.shape else 2
     shape = st.tuples(*(st.integers(0, 4) for _ in range(axes)))

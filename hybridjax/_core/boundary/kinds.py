@@ -105,7 +105,7 @@ _ARRAYS = {"complex128": Complexes, "float64": Reals, "int64": Integers}
 
 
 def kind_of(hint: Any) -> Kind | None:
-    """What a parameter with this annotation may be; None for anything.
+    """Return the kind of a parameter with this annotation; None if it may be anything.
 
     **Raises:** `TypeError` for an annotation that has no kind.
     """
@@ -115,8 +115,8 @@ def kind_of(hint: Any) -> Kind | None:
         return _PLAIN[hint]
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        own = [x for x in hint.__metadata__ if isinstance(x, Kind)]
-        return own[-1] if own else kind_of(arguments[0])
+        declared = [x for x in hint.__metadata__ if isinstance(x, Kind)]
+        return declared[-1] if declared else kind_of(arguments[0])
     if origin is Literal:
         return OneOf(*arguments)
     if origin in (Union, types.UnionType):
@@ -144,16 +144,15 @@ def kind_of(hint: Any) -> Kind | None:
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
     arrays = [kind for kind in kinds if isinstance(kind, Reals)]
-    if (
-        len(arrays) > 1 and arrays[0].form is not None
-    ):  # of NumPy or of JAX: they stay what they are
+    if len(arrays) > 1 and arrays[0].form is not None:  # of NumPy or of JAX: stay what they are
         arrays[0].form = None
         kinds = [kind for kind in kinds if kind not in arrays[1:]]
     if len(kinds) == 1:
         return kinds[0]
-    if None in kinds:
+    narrow = [kind for kind in kinds if kind is not None]
+    if len(narrow) < len(kinds):
         return None
-    return Either(*sorted(kinds, key=lambda kind: isinstance(kind, Nothing)))
+    return Either(*sorted(narrow, key=lambda kind: isinstance(kind, Nothing)))
 
 
 def _of_class(cls: type) -> Kind:
@@ -167,7 +166,7 @@ def _of_class(cls: type) -> Kind:
 
 
 def _array(hint: Any) -> Kind:
-    """Of jaxtyping's annotation: NaN and infinity are left to those who declare more."""
+    """Return the kind of a jaxtyping annotation, which allows NaN and infinity."""
     kind = next((kind for dtype, kind in _ARRAYS.items() if dtype in hint.dtypes), None)
     if kind is None:
         return Instance(hint)

@@ -14,6 +14,7 @@ infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, 
 """
 
 import functools as ft
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -201,7 +202,7 @@ def lu(
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))
 
 
-def _square(n, fill=None):
+def _square(n: int, fill: Any = None) -> list[list[Any]]:
     return [[fill] * n for _ in range(n)]
 
 
