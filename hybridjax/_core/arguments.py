@@ -3,19 +3,22 @@
 import importlib
 from collections.abc import Iterable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy.typing as npt
 
 from ..errors import DefinitionError
 
 
-Numbers = npt.ArrayLike | Sequence | int | float
-"""What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int` and
-`float` to the promotion of static type checkers, which checks at run time do not know.)"""
+if TYPE_CHECKING:
+    Numbers: TypeAlias = Any  # users give what becomes an array, functions get an array
+else:
+    Numbers = npt.ArrayLike | Sequence | int | float
+    """What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int`
+    and `float` to the promotion of static type checkers, which checks at run time do not know.)"""
 
 
-def names(kind: str, given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:
+def names(kind: str, given: Any, count: int) -> tuple[str, ...]:
     """`count` names, with units where these are given; by default `u` or `y` for one, and
     `u0, u1, ...` for several.
 

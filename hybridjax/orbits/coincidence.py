@@ -195,6 +195,7 @@ def _multipliers(cycle, t, a, orders, chart: int, state) -> Iterator[np.ndarray]
     settings = dataclasses.replace(cycle.settings, max_steps=LEGS * cycle.settings.max_steps)
     with at_ease():
         moved, tape = record(s, lanes, u, target, settings, tangents=True)
+        assert tape is not None
         around, _ = chain(s, lanes, target, tape, of_states=True)
     before = moved.lanes.q[:n]
     field = kernels.field(s, a, np.array([last]), before, u)[:, 2 : 2 + n, 0]

@@ -73,8 +73,9 @@ class Crossing(Definition):
         """True if it can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
-        by_name = isinstance(self.function, str | Output)
-        return s.resolve_outputs(self.function).defined(a) if by_name else True
+        if isinstance(self.function, str | Output):
+            return s.resolve_outputs(self.function).defined(a)
+        return True
 
     def level(
         self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]

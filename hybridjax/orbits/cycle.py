@@ -94,7 +94,7 @@ class LimitCycle(eqx.Module):
         """The size of each state on the cycle, by name, unless it was given: errors are judged
         relative to it."""
         _require_values(self, "scale")
-        return sizes_of(self.structure, self.settings.scale)
+        return sizes_of(self.structure, self.return_map.scale)
 
     @property
     def clocked(self) -> bool:
@@ -286,7 +286,8 @@ def orbit_picture(
         k = k[thinned(len(k), len(k) / len(t))]
         curves.append(Curve(x[k], y[k], name, COLORS[a % len(COLORS)]))
     if sections is not None:
-        curves.append(Curve(*axes(*sections), color="currentColor", points=True))
+        x, y = axes(*sections)
+        curves.append(Curve(x, y, color="currentColor", points=True))
     labels = [with_unit(x, unit_of(x)) for x in names]
     if len(names) == 1:
         labels.insert(0, with_unit("t", orbit.system.time_unit))

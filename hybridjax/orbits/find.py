@@ -197,7 +197,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     s, period, rough = (
         map.structure,
         solution.turn.period,
-        sizes_of(map.structure, map.settings.scale),
+        sizes_of(map.structure, map.scale),
     )
     sizes = sizes_on(s, solution.turn.legs, float(period))
     sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given

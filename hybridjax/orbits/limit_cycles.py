@@ -225,7 +225,7 @@ def _multipliers(
     """See `LimitCycles.multipliers`."""
     product = np.where(ok[:, None, None], turn_product(factors), 0.0)
     values = np.linalg.eigvals(product).astype(complex)
-    order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+    order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
     values = np.take_along_axis(values, order, axis=-1)
     values[~ok] = np.nan
     return values

@@ -80,7 +80,7 @@ def linearize(
 
 
 def inputs_of(
-    s: Structure, inputs: tuple[str, ...] | None
+    s: Structure, inputs: SignalNames | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs (Default: all) and their indices."""
     names = s.inputs if inputs is None else inputs

@@ -145,7 +145,9 @@ def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections,
     def next_section(carry, k):
         i = k % N
         time = bound.time[i] + (k // N) * period
-        moved, tape = to(*carry, time, i, bound.event[i], bound.levels)
+        lanes, h, result = carry
+        moved, tape = to(lanes, h, result, time, i, bound.event[i], bound.levels)
+        assert tape is not None
         return (moved.lanes, moved.h, moved.result), _Arrivals(moved.lanes, moved.result, tape)
 
     carry = first.lanes, first.h, first.result

@@ -107,7 +107,7 @@ class Quadratic(NamedTuple):
             y = self.show[:, :, :n] @ x
             y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, first], second)
             both = y.reshape(N, ny, len(first), 2, -1)
-            mean[:, :, first] = np.moveaxis(both.real, 0, 1)[
+            mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[
                 :, :, np.arange(len(first)), 1, np.arange(len(first))
             ]
             size = np.moveaxis(np.mean(np.abs(both) ** 2, axis=0), 2, 0)
