@@ -97,7 +97,8 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
 def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Static fields and arrays; a module among the fields becomes a dictionary of its own static
     fields, and arrays with its name before theirs."""
-    static, arrays = {}, {}
+    static: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if field.metadata.get("static", False):

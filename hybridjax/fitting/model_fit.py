@@ -57,7 +57,7 @@ class Identifiability(eqx.Module):
 
     @property
     def complete(self) -> bool:
-        """Whether every parameter is identified."""
+        """True if every parameter is identified."""
         return self.rank == len(self.names)
 
     def descriptions(self) -> list[str]:
@@ -65,14 +65,14 @@ class Identifiability(eqx.Module):
         return [_describe(self.names, row) for row in self.unseen]
 
     def __repr__(self) -> str:
-        seen = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
+        nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
         lines = [
             f"Identifiability: {self.rank} of {len(self.names)} combinations of "
             f"({', '.join(self.names)}) are seen"
         ]
         lines += [f"  not seen: {text}" for text in self.descriptions()]
-        lines.append(f"  singular values {seen}" + (f"; zero: {lost}" if lost else ""))
+        lines.append(f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else ""))
         return "\n".join(lines)
 
 
@@ -146,7 +146,7 @@ class ParameterGuesses(eqx.Module):
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:
-        """Whether each guess converged."""
+        """True for each guess that converged."""
         return self.result == Result.OK
 
     def __repr__(self) -> str:
@@ -189,7 +189,7 @@ class ModelFit(eqx.Module):
 
     @property
     def weighted(self) -> bool:
-        """Whether all data have standard deviations."""
+        """True if all data have standard deviations."""
         return self.problem.weighted
 
     @property

@@ -30,7 +30,6 @@ from ..sections.families import FamilyLike, as_family
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from ..systems.structure import Structure
 
 
 AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
@@ -60,7 +59,7 @@ class AbstractObservation(eqx.Module):
 
         def residuals(self, cycle):
             polynomial = hj.linearize(cycle, self.sections).characteristic_polynomial()
-            return polynomial[1 : 1 + len(self.seen)] - self.seen
+            return polynomial[1 : 1 + len(self.measured)] - self.measured
     ```
     """
 
@@ -139,7 +138,7 @@ class ObservedHTF(AbstractObservation):
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        Structure(cycle.system).resolve_outputs(self.outputs)
+        cycle.structure.resolve_outputs(self.outputs)
         unknown = [name for name in self.inputs if name not in cycle.system.inputs]
         if unknown:
             raise DefinitionError(
@@ -242,7 +241,7 @@ class ObservedCycle(AbstractObservation):
 
     sections: AbstractSections
     outputs: tuple[str, ...] = eqx.field(static=True)
-    seen: tuple[Float[Array, "..."], ...]
+    measured: tuple[Float[Array, "..."], ...]
     scales: tuple[Float[Array, "..."], ...]
     which: tuple[str, ...] = eqx.field(static=True)
     weighted: Bool[Array, ""]
@@ -285,10 +284,10 @@ class ObservedCycle(AbstractObservation):
                 "give `outputs` with their `values`, `times`, or the `period` of the cycle."
             )
         self.which = tuple(given)
-        self.seen = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
+        self.measured = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
         self.scales = tuple(
             _scale(name, std, x)
-            for x, (name, (_, std, _)) in zip(self.seen, given.items(), strict=True)
+            for x, (name, (_, std, _)) in zip(self.measured, given.items(), strict=True)
         )
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
@@ -305,23 +304,23 @@ class ObservedCycle(AbstractObservation):
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def __repr__(self):
-        seen = (f"{name} {value(x)}" for name, x in zip(self.which, self.seen, strict=True))
+        values = (f"{name} {value(x)}" for name, x in zip(self.which, self.measured, strict=True))
         outputs = f"{listed(self.outputs)}: " if self.outputs else ""
-        return _shown(self, outputs + "; ".join(seen), self.sections)
+        return _shown(self, outputs + "; ".join(values), self.sections)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
         parts = []
-        for name, seen, scale in zip(self.which, self.seen, self.scales, strict=True):
+        for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             if name == "values":
-                error = placed.observe(self.outputs) - seen
+                error = placed.observe(self.outputs) - measured
             elif name == "times":
-                error = _times(placed) - seen
+                error = _times(placed) - measured
                 if cycle.clocked:
                     turns = jnp.round(error / cycle.period)
                     error = error - jax.lax.stop_gradient(turns) * cycle.period
             else:
-                error = cycle.period - seen
+                error = cycle.period - measured
             parts.append((error / scale).ravel())
         return jnp.concatenate(parts)
 

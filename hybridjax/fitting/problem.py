@@ -115,10 +115,10 @@ def _number(system: HybridSystem, name: str) -> float:
     except AttributeError:
         value = None
     if value is None or not eqx.is_inexact_array(value) or value.shape != ():
-        known = [n for n, v in vars(system).items() if eqx.is_inexact_array(v) and v.shape == ()]
+        declared = [n for n, v in vars(system).items() if eqx.is_inexact_array(v) and v.shape == ()]
         raise DefinitionError(
             f"'{name}' is no parameter of {type(system).__name__} (a number declared by "
-            f"hj.parameter); those are {', '.join(known)}."
+            f"hj.parameter); those are {', '.join(declared)}."
         )
     return float(value)
 
@@ -158,7 +158,7 @@ class FitProblem(eqx.Module):
 
     @property
     def weighted(self) -> bool:
-        """Whether all data have standard deviations."""
+        """True if all data have standard deviations."""
         return all(bool(observation.weighted) for observation in self.observations)
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
@@ -194,8 +194,7 @@ def _with_jacobian(problem: FitProblem, x, guess):
 
 
 @eqx.filter_custom_jvp
-def _residuals(*arguments):
-    x, problem, guess, _ = arguments
+def _residuals(x, problem, guess, free):
     r, J = _with_jacobian(problem, x, guess)
     return r, (r, J)
 
@@ -220,7 +219,8 @@ def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
         throw=False,
     )
     done = solution.result == optx.RESULTS.successful
-    return Evaluation(solution.value, *solution.aux, solution.stats["num_steps"], done)
+    residuals, jacobian = solution.aux
+    return Evaluation(solution.value, residuals, jacobian, solution.stats["num_steps"], done)
 
 
 def levenberg_marquardt(

@@ -198,7 +198,7 @@ class LimitCycle(eqx.Module):
         if self.result != Result.OK:
             return card("LimitCycle", self._title(), facts(self._facts()))
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        orbit = orbit_picture(self.structure, self.trajectory())
+        orbit = orbit_picture(self.trajectory())
         return card("LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers)
 
     def _title(self) -> str:
@@ -255,7 +255,6 @@ def rough(cycle: LimitCycle) -> dict[str, Any]:
 
 
 def orbit_picture(
-    s: Structure,
     orbit: Trajectory,
     sections: tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"], Float[np.ndarray, "N d"]]
     | None = None,
@@ -265,7 +264,7 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    turn = orbit.dense()
+    s, turn = orbit.structure, orbit.dense()
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""

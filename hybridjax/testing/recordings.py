@@ -22,7 +22,6 @@ from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording, Trial
 from ..sections.families import ClockPhase
 from ..systems.output import OutputNames
-from ..systems.structure import Structure
 
 
 # Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of
@@ -96,7 +95,7 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    Structure(cycle.system).resolve_outputs(outputs)
+    cycle.structure.resolve_outputs(outputs)
     force = np.asarray(force, float)
     period = float(cycle.period)
     if not 1 <= rate * period * steps <= SECTIONS:
@@ -161,7 +160,7 @@ def spoil(
     rng = np.random.default_rng(seed)
     columns, trials = [recording.column(x) for x in signals], []
     for trial in recording.trials:
-        values, time = trial.values.copy(), trial.time
+        values, time = np.array(trial.values), trial.time
         y = values[:, columns]
         y = y + noise * rng.normal(size=y.shape)
         y = np.round(y / quantum) * quantum if quantum else y

@@ -17,7 +17,7 @@ STD = {"std": 1e-3, "period_std": 1e-3}
 
 def observed(cycle, noise=0.0):
     """Outputs at four phases, and the period."""
-    values, _, period = hj.ObservedCycle.of(cycle, PHASES, ("x", "v")).seen
+    values, _, period = hj.ObservedCycle.of(cycle, PHASES, ("x", "v")).measured
     drawn = noise * np.random.default_rng(0).normal(size=9)
     values = values + drawn[:8].reshape(4, 2)
     return hj.ObservedCycle(PHASES, ("x", "v"), values, period=period + drawn[8], **STD)

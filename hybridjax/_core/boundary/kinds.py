@@ -93,7 +93,7 @@ _PLAIN = {
     type(None): Nothing(),
     typing.SupportsIndex: Whole(),
 }
-_SEQUENCES = {
+_SEQUENCES: dict[Any, dict[str, Any]] = {
     list: {"form": list},
     collections.abc.Sequence: {},
     collections.abc.Iterable: {"iterable": True},
@@ -169,5 +169,5 @@ def _array(hint: Any) -> Kind:
     kind = next((kind for dtype, kind in _ARRAYS.items() if dtype in hint.dtypes), None)
     if kind is None:
         return Instance(hint)
-    form = {np.ndarray: np.asarray, jax.Array: jnp.asarray}.get(hint.array_type)
-    return kind(hint.dim_str, missing=True, infinite=True, form=form)
+    forms: dict[Any, collections.abc.Callable] = {np.ndarray: np.asarray, jax.Array: jnp.asarray}
+    return kind(hint.dim_str, missing=True, infinite=True, form=forms.get(hint.array_type))

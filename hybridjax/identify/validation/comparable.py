@@ -9,7 +9,7 @@ from ..._core.arguments import require_same
 from ...errors import DefinitionError
 from ...experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ...linear.ldtp import LDTP
-from ..joint.prediction.predictor import Predictor
+from ..joint.noise import Predictor
 from ..series.fit import SeriesFit
 from ..series.records import in_groups
 from .residual_tests import sections_of

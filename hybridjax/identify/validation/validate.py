@@ -14,8 +14,8 @@ from ..._core.text import p_value
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.ldtp import LDTP
-from ..joint.ldtp_fit import LDTPFit
-from ..joint.prediction.predictor import Predictor
+from ..joint.fit import LDTPFit
+from ..joint.noise import Predictor
 from ..series.fit import SeriesFit
 from .comparable import Comparable
 from .power import smallest_visible

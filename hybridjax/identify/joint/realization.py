@@ -14,7 +14,7 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from .fit import SeriesFit
+from ..series.fit import SeriesFit
 
 
 # Singular values below this part of the largest one are rounding errors. Doubled: states that are
