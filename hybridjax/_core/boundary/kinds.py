@@ -50,9 +50,9 @@ Index = Annotated[int, Whole(0, limits.COUNT)]
 """Also numbers that may be zero: samples to discard, lags of a lead."""
 SectionCount = Annotated[int, Whole(1, limits.SECTIONS)]
 PeriodCount = Annotated[int, Whole(1, limits.PERIODS)]
-ExperimentCount = Annotated[int, Whole(1, limits.EXPERIMENTS)]
+ExperimentCount = Annotated[int, Whole(1, limits.PERIODS)]
 Order = Annotated[int, Whole(1, limits.ORDER)]
-StepCount = Annotated[int, Whole(1, limits.STEPS)]
+StepCount = Annotated[int, Whole(1, limits.COUNT)]
 WorkerCount = Annotated[int, Whole(1, limits.WORKERS)]
 Seed = Annotated[int, Whole(0)]
 
