@@ -29,12 +29,9 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.denominator import multipliers_of
-from hybridjax.identify.joint.characteristic import characteristic_slopes
-from hybridjax.identify.joint.coordinates import local_coordinates
-from hybridjax.identify.joint.periodic_model import PeriodicModel
-from hybridjax.identify.joint.prediction.predictor import Predictor
-from hybridjax.identify.joint.prediction.problem import SeriesProblem
-from hybridjax.identify.joint.prediction.series_part import SeriesPart
+from hybridjax.identify.joint.model import PeriodicModel, characteristic_slopes, local_coordinates
+from hybridjax.identify.joint.noise import Predictor
+from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.series.records import CycleGrid
 

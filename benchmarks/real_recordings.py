@@ -89,12 +89,7 @@ def neurons(every=2):
             f"the published curve is in the band at {100 * held.mean():.0f} % of the phases; rms "
             f"difference {own:.2f}, of plain regression {plain:.2f}"
         )
-        curves = {"estimated": found, "published": published, "flat": [published.mean()]}
-        for name, curve in curves.items():
-            forecast = hj.recordings.forecast_intervals(
-                recording, phase, input="current", curve=curve
-            )
-            print(f"  {name:9s}", forecast, flush=True)
+        print(f"R2 of intervals left out: {found.left_out:.3f}; flat: {found.left_out_flat:.3f}")
 
 
 def robots():
@@ -126,7 +121,10 @@ def robots():
         n_sections=5,
         bandwidth=np.inf,
     )
-    print(data, *hj.recordings.inspect_cycles(recording, phase, data), sep="\n")
+    looked = hj.recordings.inspect(
+        recording, inputs=data.inputs, outputs=data.outputs, phase=phase, data=data
+    )
+    print(data, looked, sep="\n")
     try:
         hj.recordings.hold_out(data, 1)
     except hj.DefinitionError as error:

@@ -22,7 +22,17 @@ from real_recordings import real  # noqa: F401 (called by its name)
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax.testing import Dirt, spoil
+from hybridjax.testing import spoil
+
+
+sys.path.append(str(Path(__file__).parents[1] / "tests/recordings"))
+from mishaps import (
+    EVENT_MISHAPS,
+    MISHAPS,
+    mishandle,
+    misjudged,
+    signals as change_signals,  # noqa: E402
+)
 
 
 N_SECTIONS = 32
@@ -42,7 +52,7 @@ def hopper(strides, seeds, force=RMS):
 
 def noisy(recording, noise, seed):
     """With white noise, in which the apex of each stride is marked."""
-    dirty = spoil(recording, ("yM", "vM"), Dirt(noise=noise, seed=seed))
+    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
     return dirty.mark("apex", hj.Crossing("vM", "falling"), bandwidth=16)
 
 
@@ -87,9 +97,9 @@ def errors(seeds=10):
             fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
-            plain.append(distance(hj.recordings.plain_regression(data, 2), true))
+            plain.append(distance(hj.recordings.advise(data, fit).plain, true))
             through = at_sections(dirty, name, bandwidth=np.inf)
-            rough.append(distance(hj.recordings.plain_regression(through, 2), true))
+            rough.append(distance(hj.recordings.advise(through, fit).plain, true))
         row = [rms(found), np.median(found), rms(said), rms(plain), rms(rough)]
         row = "  ".join(f"{x:9.1e}" for x in row)
         print(f"{name:5s}  {strides:7d}  {noise:6.0e}  {row}", flush=True)
@@ -179,35 +189,39 @@ def dirt(seeds=5, strides=500, noise=1e-4):
     print(f"\nDirt: hopper, {strides} strides, noise {noise:g}, {seeds} seeds")
     recordings, true = hopper(strides, range(seeds))
     gap = (strides / 2, strides / 2 + 20)
-    cases = {
-        "clean": ("angle", {}, {}),
-        "1 % of samples lost, gap of 20 strides": ("angle", {"missing": 0.01, "gap": gap}, {}),
-        "the same, a third not there": (
-            "angle", {"missing": 0.01, "gap": gap, "irregular": True}, {},
-        ),
-        "the same, rounded to 1e-4": (
-            "angle", {"missing": 0.01, "gap": gap, "irregular": True, "quantum": 1e-4}, {},
-        ),
-        "drift of 5e-3, removed": ("angle", {"drift": 5e-3}, {"drift": 50}),
-        "period that grows by 5 %": ("angle", {"stretch": 0.05}, {}),
-        "cycles from apex to apex, clean": ("apex", {}, {}),
+    poor, third = {"missing": 0.01, "gap": gap}, "a third of the samples not there"
+    sine = change_signals(
+        "y", lambda x, s: x + 5e-3 * np.sin(2 * np.pi * s.trial.time / np.ptp(s.trial.time))
+    )
+    cases = {  # phase, how it is spoiled, mishap, drift
+        "clean": ("angle", {}, None, None),
+        "1 % of samples lost, gap of 20 strides": ("angle", poor, None, None),
+        "the same, a third not there": ("angle", poor, third, None),
+        "the same, rounded to 1e-4": ("angle", poor | {"quantum": 1e-4}, third, None),
+        "drift of 5e-3, removed": ("angle", {}, sine, 50),
+        "period that grows by 5 %": ("angle", {}, "clock slows down", None),
+        "cycles from apex to apex, clean": ("apex", {}, None, None),
         "1 % lost, gap, 5 events lost, 5 doubled": (
-            "apex", {"missing": 0.01, "gap": gap, "lost_events": 5, "doubled_events": 5}, {},
+            "apex", poor, misjudged(lost=0.01, doubled=0.01), None,
         ),
     }  # fmt: skip
-    for label, (name, spoiled, options) in cases.items():
+    for label, (name, spoiled, mishap, drift) in cases.items():
         found, said, hits = [], [], 0
         for seed, recording in enumerate(recordings):
             if name == "apex":
                 dirty = noisy(recording, noise, seed)
-                dirty = spoil(dirty, ("yM", "vM"), Dirt(seed=seed, **spoiled))
+                dirty = spoil(dirty, ("yM", "vM"), seed=seed, **spoiled)
             else:
-                about = Dirt(noise=noise, seed=seed, **spoiled)
-                dirty = spoil(recording, ("yM", "vM"), about)
-            if "drift" in options:
+                dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled)
+            if mishap is not None:
+                names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
+                dirty = mishandle(dirty, mishap, seed=seed, **names)
+            if drift is not None:
                 rough = hj.recordings.estimate_phase(dirty, phase_of(name))
-                dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), options["drift"])
-            fit = hj.fit_series(at_sections(dirty, name, **options).records, 2, check=False)
+                dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), drift)
+            data = at_sections(dirty, name)
+            data = data if drift is None else data.with_drift(drift)
+            fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
             hits += bool(fit.contains(true[:1])[0])
@@ -233,15 +247,15 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
     names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
     verdicts = []
     print("| mishap | rms error | said | verdict | what is said |\n|---|---|---|---|---|")
-    for kind in ["none", *hj.testing.MISHAPS, *hj.testing.EVENT_MISHAPS]:
+    for kind in ["none", *MISHAPS, *EVENT_MISHAPS]:
         found, said, verdict, causes = [], [], [], {}
         for seed in range(seeds):
             own = made.trials[seed * trials : (seed + 1) * trials]
             one = noisy(eqx.tree_at(lambda r: r.trials, made, own), noise, seed)
             try:
                 if kind != "none":
-                    one = hj.testing.mishandle(one, kind, seed=seed, **names)
-                phase = APEX if kind in hj.testing.EVENT_MISHAPS else hj.Crossing("vM", "falling")
+                    one = mishandle(one, kind, seed=seed, **names)
+                phase = APEX if kind in EVENT_MISHAPS else hj.Crossing("vM", "falling")
                 result = hj.identify_recording(
                     one, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections, order=2
                 )
@@ -275,8 +289,8 @@ def spikes(seeds=50, strides=300, noise=1e-4, n_sections=16):
             for share in (0.0, 1e-3, 1e-2):
                 found, said, left_out = [], [], 0
                 for seed, recording in enumerate(recordings):
-                    dirty = spoil(recording, ("yM", "vM"), Dirt(noise=noise, seed=seed))
-                    dirty = spoil(dirty, signals, Dirt(spikes=share, seed=seed))
+                    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
+                    dirty = spoil(dirty, signals, spikes=share, seed=seed)
                     data = hj.recordings.section_data(
                         dirty, phase, inputs="u", outputs=("yM", "vM"), n_sections=n_sections
                     )
@@ -396,7 +410,7 @@ def walks(
             for seed in rng.integers(2**31, size=trials).tolist()
         ]
         made = hj.testing.simulate_recording(cycle, np.stack(force), outputs, rate=rate, steps=1)
-        made = spoil(made, outputs, Dirt(noise=noise, seed=int(rng.integers(2**31))))
+        made = spoil(made, outputs, noise=noise, seed=int(rng.integers(2**31)))
         if mark:
             made = made.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
         data = hj.recordings.section_data(
@@ -505,7 +519,7 @@ def write_trials(files, minutes, rate):
         for k in range(len(files))
     ]
     made = hj.testing.simulate_recording(cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1)
-    made = spoil(made, ("yM", "vM"), Dirt(noise=1e-4))
+    made = spoil(made, ("yM", "vM"), noise=1e-4)
     for file, trial in zip(files, made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
         header = "time (s),force (N),yM (m),vM (m/s)"

@@ -1,7 +1,6 @@
 from . import (
     convert as convert,
     designs as designs,
-    engine as engine,
     errors as errors,
     experiments as experiments,
     fitting as fitting,
@@ -67,6 +66,7 @@ from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
 from .scale.sweep import sweep as sweep
 from .sections.families import (
+    ArcLength as ArcLength,
     ClockPhase as ClockPhase,
     KinematicPhase as KinematicPhase,
     SectionList as SectionList,

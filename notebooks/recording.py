@@ -42,8 +42,8 @@ force = np.stack(
     [hj.testing.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
 )
 clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
-dirt = hj.testing.Dirt(noise=1e-4, quantum=1e-5, missing=0.01, gap=(100.0, 110.0))
-recording = hj.testing.spoil(clean, ("yM", "vM"), dirt)
+dirt = {"noise": 1e-4, "quantum": 1e-5, "missing": 0.01, "gap": (100.0, 110.0)}
+recording = hj.testing.spoil(clean, ("yM", "vM"), **dirt)
 recording
 
 # %% [markdown]

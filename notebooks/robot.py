@@ -68,8 +68,10 @@ strides = hj.recordings.section_data(
     bandwidth=np.inf,
 )
 print(strides)
-findings = hj.recordings.inspect_cycles(recording, phase, strides)
-print(findings[-1])
+looked = hj.recordings.inspect(
+    recording, inputs="voltage", outputs=("hip", "stance"), phase=phase, data=strides
+)
+print(looked.findings[-1])
 figure = hj.plot.section_data(strides)
 
 # %% [markdown]

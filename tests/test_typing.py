@@ -152,11 +152,11 @@ UNCHECKED = {
     },
     "made by this package": {
         "Advice", "Branch", "Constrained", "EventTimes",
-        "Finding", "Identifiability", "Identification", "Impact", "ImpulseResponses",
+        "Finding", "Identification", "Impact", "ImpulseResponses",
         "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
-        "LimitCycles", "ModelFit", "NaturalMultipliers", "ParameterGuesses", "Phase",
+        "LimitCycles", "NaturalMultipliers", "Phase",
         "PhaseResponse", "PlacedSections", "Plan", "Plot",
         "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
         "Stepping", "Trajectory", "Trial", "Winding",

@@ -85,19 +85,20 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
     if set(header["arrays"]) != set(members):
         raise damaged(path, "its arrays are not those that its header lists")
     try:
-        thing = put_together(kind, static, members)
+        module = put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
-    if (wrong := _wrong_field(thing)) is not None:
+    if (wrong := _wrong_field(module)) is not None:
         raise damaged(path, wrong)
-    return thing
+    return module
 
 
 def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Static fields and arrays; a module among the fields becomes a dictionary of its own static
     fields, and arrays with its name before theirs."""
-    static, arrays = {}, {}
+    static: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if field.metadata.get("static", False):
@@ -127,9 +128,9 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> e
             elif field.default is dataclasses.MISSING:
                 raise other
         elif inner is not None and name in static:
-            own = {k: arrays.pop(k) for k in list(arrays) if k.startswith(f"{name}.")}
-            own = {k.removeprefix(f"{name}."): array for k, array in own.items()}
-            values[name] = put_together(inner, static.pop(name), own)
+            parts = [k for k in arrays if k.startswith(f"{name}.")]
+            part = {k.removeprefix(f"{name}."): arrays.pop(k) for k in parts}
+            values[name] = put_together(inner, static.pop(name), part)
         else:
             values[name] = arrays.pop(name, None)
     if static or arrays:
@@ -186,10 +187,10 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
 
 
 def _moderate(value: Any) -> bool:
-    """Whether no whole number in it is larger than a header may declare."""
+    """Return whether no whole number in it is larger than a header may declare."""
     if isinstance(value, tuple):
         return all(map(_moderate, value))
-    return not isinstance(value, int) or abs(value) <= limits.DECLARED
+    return not isinstance(value, int) or abs(value) <= limits.PERIODS
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:

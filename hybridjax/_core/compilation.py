@@ -32,6 +32,7 @@ from .boundary.kinds import Path
 from .executor import (
     OutOfTimeError,
     at_most,
+    default_device,
     from_host,
     is_inside_program,
     is_traced,
@@ -44,13 +45,14 @@ from .vector_math import rewrite
 
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
 # the time. Options that an XLA does not have are left out.
-_QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3.0
-# Seconds in a quick executable after which the optimized one is compiled. Less: threads compile
-# for jobs that are done already. More: repeated calls stay slow for longer.
-_WORTH_OPTIMIZING = 0.5
+# Seconds in a quick executable after which the optimized one is compiled, which takes 10 to 40.
+# Less: a script that is done waits at its end for a thread that compiles for no further job. More:
+# repeated calls stay slow for longer.
+_WORTH_OPTIMIZING = 2.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
@@ -96,7 +98,7 @@ def enable_compilation_cache(folder: Path | None = None) -> pathlib.Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # XLA prints two errors, a page each, for each program that it loads on a processor with
     # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
-    level = jax.config.jax_logging_level
+    level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
     jax.config.update("jax_logging_level", "CRITICAL")
     jax.config.update("jax_logging_level", level)
     return folder
@@ -132,17 +134,17 @@ def enable_loop_kernels() -> None:
 
 
 def _loops_are_kernels() -> bool:
-    """Whether XLA makes one kernel of a loop above its own limit."""
+    """Return whether XLA makes one kernel of a loop above its own limit."""
 
     def loop(x, count):
         return jax.lax.fori_loop(0, count, lambda _, x: x * x[0], x)
 
     program = jax.jit(loop).lower(jnp.ones(1000), 9).compile()
-    return "xla_cpu_small_call" in program.as_text()
+    return "xla_cpu_small_call" in str(program.as_text())
 
 
 @ft.cache
-def compiler_options() -> dict[str, int | bool]:
+def compiler_options() -> dict[str, Any]:
     """Return XLA's options for quick compilation."""
 
     def accepted(options):
@@ -206,11 +208,12 @@ def quick_jit(function: Callable) -> Callable:
         say_compiling(True)
         return function(*arguments)
 
-    plain = eqx.filter_jit(traced)
+    plain: Any = eqx.filter_jit(traced)
 
     @ft.cache
-    def quick():
-        return eqx.filter_jit(traced, compiler_options=compiler_options())
+    def quick() -> Any:
+        options: Any = {"compiler_options": compiler_options()}  # handed on to `jax.jit`
+        return eqx.filter_jit(traced, **options)
 
     @ft.wraps(function)
     def call(*arguments):
@@ -223,7 +226,8 @@ def quick_jit(function: Callable) -> Callable:
             say_compiling(False)
             return result
 
-    call.lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)
+    lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)  # noqa: E731
+    setattr(call, "lower", lower)  # noqa: B010 (that of a function is not declared)
     return call
 
 
@@ -235,7 +239,7 @@ def host_first(function: Callable) -> Callable:
     Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
     """
     compiled = quick_jit(function)
-    spent = collections.defaultdict(float)
+    spent: dict[tuple, float] = collections.defaultdict(float)
 
     @ft.wraps(function)
     def call(*arguments):
@@ -278,7 +282,7 @@ class TwoTiers:
 
     def __init__(self, function: Callable, large: bool):
         self._function, self.large = function, large
-        self._chosen: dict[Hashable, tuple[_Program, jax.stages.Compiled]] = {}
+        self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_traced(arguments) or is_inside_program():
@@ -287,20 +291,25 @@ class TwoTiers:
         arrays, static = eqx.partition(arguments, _is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
         if key not in self._chosen:
-            run = lambda x: self._function(*eqx.combine(structure.unflatten(x), static))  # noqa: E731
+
+            def run(leaves):
+                arrays = jax.tree_util.tree_unflatten(structure, leaves)
+                return self._function(*eqx.combine(arrays, static))
+
             with _choosing, _compiling():
-                program = _lowered(key, run, leaves)
-                self._chosen[key] = program, program.choose(self.large)
+                if key not in self._chosen:  # by another thread in the meantime
+                    program = _lowered(key, run, leaves)
+                    self._chosen[key] = program, program.choose(self.large)
         program, executable = self._chosen[key]
         return program.run(executable, leaves)
 
 
 _choosing = threading.Lock()
-_by_kind: dict[Hashable, "_Program"] = {}
+_by_kind: dict[tuple, "_Program"] = {}
 _by_text: dict[Hashable, "_Program"] = {}
 
 
-def _lowered(key: Hashable, run: Callable, leaves: list) -> "_Program":
+def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
     """The program for arguments of this kind. Objects that hold the same functions written anew
     (an `Output` with a `lambda`) are of other kinds, but have the same text and share executables.
     """
@@ -357,8 +366,8 @@ class _Program:
 
 
 def _is_simple() -> bool:
-    """Whether JAX computes on the first CPU, and runs programs as they are."""
-    device = jax.config.jax_default_device
+    """Return whether JAX computes on the first CPU, and runs programs as they are."""
+    device = default_device()
     first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
     names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
     return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
@@ -382,8 +391,9 @@ def in_turn(alone: bool) -> Iterator[None]:
         yield
 
 
-def is_left_to_lapack(program: Callable, *arguments: Any) -> bool:
-    """Whether a program of `quick_jit` or `equinox.filter_jit` calls LAPACK for such arguments."""
+def is_left_to_lapack(program: Any, *arguments: Any) -> bool:
+    """Return whether a program of `quick_jit` or `equinox.filter_jit` calls LAPACK for arguments of
+    this kind."""
     key = program, kind(arguments)
     if key not in _left_to_lapack:
         _left_to_lapack[key] = _calls_lapack(program.lower(*arguments).lowered.as_text())
@@ -418,8 +428,8 @@ def kernel(
     leaves, structure = jax.tree_util.tree_flatten(trees)
     arrays = jax.device_put([x for x in leaves if _is_array(x)])
     # (1, 1.0 and True are equal, and not the same.)
-    others = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    program = _kernel_program(function, form, static, structure, others, lanes)
+    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
+    program = _kernel_program(function, form, static, structure, static_leaves, lanes)
 
     def call(*arguments, some=None):
         if some is not None:
@@ -440,10 +450,10 @@ def kernel(
 
 
 @ft.lru_cache(_KEPT)
-def _kernel_program(function, form, static, structure, others, lanes):
+def _kernel_program(function, form, static, structure, static_leaves, lanes):
     def run(arrays, *arguments):
         arrays = iter(arrays)
-        leaves = [next(arrays) if x is None else x[1] for x in others]
+        leaves = [next(arrays) if x is None else x[1] for x in static_leaves]
         trees = jax.tree_util.tree_unflatten(structure, leaves)
         return form(ft.partial(function, *static), *trees)(*arguments)
 

@@ -4,20 +4,21 @@ import contextlib
 import ctypes
 import dataclasses
 import functools
-import importlib.util
 import os
 import pathlib
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
+import scipy
 
 from .boundary.checked import checked
 from .boundary.kinds import ExperimentCount, WorkerCount
-from .executor import on_cpu
+from .executor import default_device, on_cpu
 from .precision import require_x64
 
 
@@ -51,7 +52,7 @@ class Execution:
 
 
 def thread_count(workers: int | None) -> int:
-    """How many threads to use: by default all cores on CPU, and one on an accelerator."""
+    """Return the number of threads: by default all cores on CPU, and one on an accelerator."""
     if workers is not None:
         return workers
     return core_count() if on_cpu() else 1
@@ -77,11 +78,11 @@ def on_all_cores(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     alone = bool(libraries()) or os.environ.get("OPENBLAS_NUM_THREADS") == "1"
     with one_blas_thread(), ThreadPoolExecutor(core_count() if alone else 1) as pool:
         running = [pool.submit(copy_context().run, work, item) for item in items]
-        return [one.result() for one in running]
+        return [future.result() for future in running]
 
 
 def _configured(work):
-    device = jax.config.jax_default_device  # which other threads would not know
+    device = default_device()  # which other threads would not know
 
     def configured(*arguments):
         require_x64()
@@ -92,13 +93,16 @@ def _configured(work):
 
 
 def core_count() -> int:
-    """That this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-# What the functions are called, with integers of 64 bits or 32, with and without a prefix.
+# OpenBLAS divides matrices of a hundred columns among threads that wait for each other longer than
+# they compute. Only the libraries in the wheels of NumPy and SciPy are known; others (Accelerate,
+# MKL, those of distributions) are left alone. Their functions have 64-bit or 32-bit integers, and a
+# prefix or none.
 _NAMES = [
     f"{prefix}openblas_{{}}_num_threads{bits}" for prefix in ("scipy_", "") for bits in ("64_", "")
 ]
@@ -107,31 +111,27 @@ _before: list[int] = []
 _inside = 0
 
 
-class Library:
-    """One OpenBLAS."""
+class Library(NamedTuple):
+    """Functions of one OpenBLAS: its number of threads."""
 
-    def __init__(self, get: Any, set: Any):
-        self.get, self.set = get, set
+    get: Callable[[], int]
+    set: Callable[[int], Any]
 
 
 @functools.cache
 def libraries() -> list[Library]:
-    """Those of NumPy and SciPy."""
-    found = []
-    for package in ("numpy", "scipy"):
-        spec = importlib.util.find_spec(package)
-        root = pathlib.Path(spec.origin).parent  # pyright: ignore
-        for folder in (root.with_name(f"{package}.libs"), root / ".dylibs"):
+    """Return the libraries of NumPy and SciPy."""
+    libraries = []
+    for package in (np, scipy):
+        root = pathlib.Path(str(package.__file__)).parent
+        for folder in (root.with_name(f"{package.__name__}.libs"), root / ".dylibs"):
             for file in sorted(folder.glob("*openblas*")):
                 with contextlib.suppress(OSError, StopIteration):
-                    found.append(_library(ctypes.CDLL(str(file))))
-    return found
-
-
-def _library(loaded: ctypes.CDLL) -> Library:
-    """**Raises:** `StopIteration` if its functions have other names."""
-    name = next(name for name in _NAMES if hasattr(loaded, name.format("set")))
-    return Library(getattr(loaded, name.format("get")), getattr(loaded, name.format("set")))
+                    loaded = ctypes.CDLL(str(file))
+                    name = next(x for x in _NAMES if hasattr(loaded, x.format("set")))
+                    functions = (getattr(loaded, name.format(what)) for what in ("get", "set"))
+                    libraries.append(Library(*functions))
+    return libraries
 
 
 @contextlib.contextmanager
@@ -141,7 +141,8 @@ def one_blas_thread() -> Iterator[None]:
     with _lock:
         if _inside == 0:
             _before[:] = [library.get() for library in libraries()]
-            _set([1] * len(_before))
+            for library in libraries():
+                library.set(1)
         _inside += 1
     try:
         yield
@@ -149,9 +150,5 @@ def one_blas_thread() -> Iterator[None]:
         with _lock:
             _inside -= 1
             if _inside == 0:
-                _set(_before)
-
-
-def _set(counts: list[int]) -> None:
-    for library, count in zip(libraries(), counts, strict=True):
-        library.set(count)
+                for library, count in zip(libraries(), _before, strict=True):
+                    library.set(count)

@@ -2,7 +2,7 @@
 
 Code that decides (step sizes, events, Newton's method) is written once, on arrays. Given JAX's, it
 is traced and compiled, which pays for many lanes and below `jit`, `vmap` and `grad`. Given NumPy's,
-it runs at once, and only what users wrote is compiled, in small programs (`compilation/kernel.py`):
+it runs at once, and only what users wrote is compiled, in small programs (`compilation.kernel`):
 for a few lanes that is the quicker way to a first answer. Nothing switches between the two but the
 arrays themselves: functions come from their `namespace`, and those below do for both what differs.
 """
@@ -11,16 +11,17 @@ import contextlib
 import contextvars
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import core
 
 
 if TYPE_CHECKING:
-    Array = jax.Array  # what users get
+    Array: TypeAlias = Any  # of JAX or NumPy: type checkers know no array of both
 else:
     Array = jax.Array | np.ndarray | np.generic
     """An array of either executor."""
@@ -52,7 +53,7 @@ def at_most(seconds: float) -> Iterator[None]:
 
 
 def on_host(x: Any) -> bool:
-    """Whether x is an array of the host."""
+    """Return whether x is an array of the host."""
     return isinstance(x, np.ndarray | np.generic)
 
 
@@ -64,7 +65,9 @@ def namespace(x: Array) -> Any:
 def to_host(tree: Any) -> Any:
     """`tree` with its arrays on the host, but for those of a `Definition`."""
     return jax.tree_util.tree_map(
-        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree, is_leaf=_is_definition
+        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x,
+        tree,
+        is_leaf=lambda x: isinstance(x, Definition),
     )
 
 
@@ -74,7 +77,7 @@ def from_host(tree: Any) -> Any:
     return jax.tree_util.tree_map(lambda x: jax.device_put(np.array(x)) if on_host(x) else x, tree)
 
 
-def cond(some: Array, yes: Callable, no: Callable, *operands: Any) -> Any:
+def cond(some: Any, yes: Callable, no: Callable, *operands: Any) -> Any:
     """`jax.lax.cond`."""
     if on_host(some):
         return yes(*operands) if some else no(*operands)
@@ -105,7 +108,7 @@ def scan(body: Callable, carry: Any, xs: Any) -> tuple[Any, Any]:
     return carry, jax.tree_util.tree_map(lambda *x: np.stack(x), *rows)
 
 
-def for_each_row(function: Callable, rows: Array) -> Array:
+def for_each_row(function: Callable, rows: Any) -> Any:
     """`jax.vmap` of a function of one row."""
     return np.stack([function(x) for x in rows]) if on_host(rows) else jax.vmap(function)(rows)
 
@@ -126,7 +129,7 @@ def lane(x: Array, i: Array) -> Array:
     return jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
-def singular_values(x: Array) -> Array:
+def singular_values(x: Any) -> Any:
     """`jnp.linalg.svd(x, compute_uv=False)`: NaN where x is not finite."""
     if not on_host(x):
         return jnp.linalg.svd(x, compute_uv=False)
@@ -139,17 +142,18 @@ def stop_gradient(x: Array) -> Array:
     return x if on_host(x) else jax.lax.stop_gradient(x)
 
 
-def _is_definition(x: Any) -> bool:
-    return isinstance(x, Definition)
+def is_tracer(x: Any) -> bool:
+    """Return whether JAX traces x."""
+    return isinstance(x, core.Tracer)
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether some leaf of `trees` is a tracer, so that its value cannot be looked at."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(trees))
+    """Return whether JAX traces some leaf of `trees`, so that its value is not known."""
+    return any(map(is_tracer, jax.tree_util.tree_leaves(trees)))
 
 
 def is_inside_program() -> bool:
-    """Whether JAX is tracing a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
+    """Return whether JAX traces a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
     computed then becomes part of it, even a constant."""
     return is_traced(_constant())
 
@@ -159,8 +163,13 @@ def _constant():
     return 0.0
 
 
+def default_device() -> Any:
+    """Return the device of `jax.default_device`: a device, the name of a platform, or None."""
+    return getattr(jax.config, "jax_default_device")  # noqa: B009 (JAX does not declare it)
+
+
 def on_cpu() -> bool:
-    """Whether that is the CPU: as JAX's default, or because `jax.default_device` says so."""
-    device = jax.config.jax_default_device  # a device, the name of a platform, or None
+    """Return whether JAX computes on the CPU, by default or as `jax.default_device` says."""
+    device = default_device()
     platform = getattr(device, "platform", device)
     return (platform or jax.default_backend()) == "cpu"

@@ -28,31 +28,31 @@ class PerLane(eqx.Module):
     """A pytree, some of whose arrays have one entry for each lane, on their last axis."""
 
     tree: Any
-    own: tuple[bool, ...] = eqx.field(static=True)
+    split: tuple[bool, ...] = eqx.field(static=True)
     """Which of the tree's arrays, in the order of its leaves."""
 
     def axes(self) -> Any:
-        """Where the lanes are, in the form that `jax.vmap` takes: -1 or None for each array."""
+        """Return the axes of lanes in the form that `jax.vmap` takes: -1 or None for each array."""
         arrays = eqx.filter(self.tree, eqx.is_array)
         structure = jax.tree_util.tree_structure(arrays)
-        return structure.unflatten([-1 if own else None for own in self.own])
+        return jax.tree_util.tree_unflatten(structure, [-1 if x else None for x in self.split])
 
 
 def shared(tree: Any) -> Any:
-    """The tree itself, of what may be marked as `PerLane`."""
+    """Return the tree itself, of a tree that may be marked as `PerLane`."""
     return tree.tree if isinstance(tree, PerLane) else tree
 
 
 def one_lane(tree: Any) -> Any:
-    """What a single lane has of a tree: shapes in place of its arrays."""
-    arrays, rest = eqx.partition(shared(tree), eqx.is_array)
+    """Return the part of a tree that belongs to a single lane, with shapes in place of arrays."""
+    arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
-    own = tree.own if isinstance(tree, PerLane) else (False,) * len(leaves)
+    split = tree.split if isinstance(tree, PerLane) else (False,) * len(leaves)
     shapes = [
-        jax.ShapeDtypeStruct(x.shape[:-1] if o else x.shape, x.dtype)
-        for x, o in zip(leaves, own, strict=True)
+        jax.ShapeDtypeStruct(x.shape[:-1] if s else x.shape, x.dtype)
+        for x, s in zip(leaves, split, strict=True)
     ]
-    return eqx.combine(structure.unflatten(shapes), rest)
+    return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
 def by_lane(function: Callable, *trees: Any) -> Callable:
@@ -61,16 +61,16 @@ def by_lane(function: Callable, *trees: Any) -> Callable:
     Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
     others have more is the same for all of them, and what depends on nothing else is computed once.
     """
-    arrays, rest = eqx.partition([shared(x) for x in trees], eqx.is_array)
+    arrays, static = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
 
-    def one(arrays, *arguments):
-        return function(*eqx.combine(arrays, rest), *arguments)
+    def on_lane(arrays, *arguments):
+        return function(*eqx.combine(arrays, static), *arguments)
 
     @ft.cache
     def program(common: tuple[bool, ...], many: bool):
         in_axes = (axes, *[None if c else -1 for c in common])
-        work = vectorized(one, trigonometry=many)
+        work = vectorized(on_lane, trigonometry=many)
         # Traced once, however often it is called: a Runge-Kutta step has ten stages.
         return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
 
@@ -91,16 +91,16 @@ def vmap_to_lanes(function: Callable[[tuple, Any], Any]) -> Callable[[tuple, Any
     """
 
     def call(common, lanes):
-        arrays, rest = eqx.partition((common, lanes), eqx.is_array)
+        arrays, static = eqx.partition((common, lanes), eqx.is_array)
 
         @jax.custom_batching.custom_vmap
         def run(arrays):
-            return function(*eqx.combine(arrays, rest))
+            return function(*eqx.combine(arrays, static))
 
         @run.def_vmap
         def rule(size, batched, arrays):
             (batched,) = batched
-            common, lanes = eqx.combine(arrays, rest)
+            common, lanes = eqx.combine(arrays, static)
             L = jax.tree_util.tree_leaves(lanes)[0].shape[-1]
             joined = tuple(
                 _join_common(tree, mapped, size, L)
@@ -117,24 +117,27 @@ def vmap_to_lanes(function: Callable[[tuple, Any], Any]) -> Callable[[tuple, Any
     return call
 
 
-def _join(x, mapped: bool, own: bool, size: int, L: int):
+def _join(x, mapped: bool, by_lane: bool, size: int, L: int):
     """Join a mapped axis (the first, if there is one) with the lanes' (the last, if there)."""
-    x = jnp.moveaxis(x, 0, -2 if own else -1) if mapped else (x[..., None, :] if own else x)
-    x = x if own else x[..., None]
+    if mapped:
+        x = jnp.moveaxis(x, 0, -2 if by_lane else -1)
+    elif by_lane:
+        x = x[..., None, :]
+    x = x if by_lane else x[..., None]
     return jnp.broadcast_to(x, (*x.shape[:-2], size, L)).reshape(*x.shape[:-2], size * L)
 
 
 def _join_common(tree, mapped, size: int, L: int):
     mapped = jax.tree_util.tree_leaves(mapped)
-    own = tree.own if isinstance(tree, PerLane) else (False,) * len(mapped)
-    if not any(own) and not any(mapped):
+    split = tree.split if isinstance(tree, PerLane) else (False,) * len(mapped)
+    if not any(split) and not any(mapped):
         return tree
-    arrays, rest = eqx.partition(shared(tree), eqx.is_array)
+    arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
-    flags = zip(leaves, mapped, own, strict=True)
-    joined = [_join(x, m, o, size, L) if m or o else x for x, m, o in flags]
-    own = tuple(m or o for m, o in zip(mapped, own, strict=True))
-    return PerLane(eqx.combine(structure.unflatten(joined), rest), own)
+    flags = zip(leaves, mapped, split, strict=True)
+    joined = [_join(x, m, s, size, L) if m or s else x for x, m, s in flags]
+    either = tuple(m or s for m, s in zip(mapped, split, strict=True))
+    return PerLane(eqx.combine(jax.tree_util.tree_unflatten(structure, joined), static), either)
 
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
@@ -153,40 +156,41 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     function itself would store and read again all that happens in it. And where JAX asks for
     several tangents, they all use one Jacobian.
     """
-    moving = eqx.is_inexact_array
+    has_tangent = lambda x, t: t is not None and eqx.is_inexact_array(x)  # noqa: E731
     has = [
-        jax.tree_util.tree_map(lambda x, t: t is not None and moving(x), x, t, is_leaf=_none)
+        jax.tree_util.tree_map(has_tangent, x, t, is_leaf=lambda x: x is None)
         for x, t in (lane, shared)
     ]
-    own, fixed_lane = eqx.partition(lane[0], has[0])
+    moving, fixed_lane = eqx.partition(lane[0], has[0])
     common, fixed_shared = eqx.partition(shared[0], has[1])
-    t_own, t_common = (eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1])))
+    t_moving, t_common = (eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1])))
 
-    def of(own, common):
-        return function(eqx.combine(own, fixed_lane), eqx.combine(common, fixed_shared))
+    def of(moving, common):
+        return function(eqx.combine(moving, fixed_lane), eqx.combine(common, fixed_shared))
 
     leaves = jax.tree_util.tree_leaves
-    sizes = [math.prod(x.shape[:-1]) for x in leaves(own)] + [x.size for x in leaves(common)]
+    sizes = [math.prod(x.shape[:-1]) for x in leaves(moving)] + [x.size for x in leaves(common)]
     if not sizes or sum(sizes) > _JACOBIAN_COLUMNS:
-        return jax.jvp(of, (own, common), (t_own, t_common))
+        return jax.jvp(of, (moving, common), (t_moving, t_common))
 
-    basis, start = [], 0
+    basis: list[jax.Array] = []
+    start = 0
     total = sum(sizes)
-    for x, size in zip([*leaves(own), *leaves(common)], sizes, strict=True):
+    for x, size in zip([*leaves(moving), *leaves(common)], sizes, strict=True):
         directions = jnp.zeros((total, size)).at[start : start + size].set(jnp.eye(size))
-        by_lane = len(basis) < len(leaves(own))
-        shape = x.shape[:-1] if by_lane else x.shape
+        is_by_lane = len(basis) < len(leaves(moving))
+        shape = x.shape[:-1] if is_by_lane else x.shape
         directions = directions.reshape(total, *shape)
-        if by_lane:
+        if is_by_lane:
             directions = jnp.broadcast_to(directions[..., None], (total, *x.shape))
         basis.append(directions.astype(x.dtype))
         start += size
-    basis = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure((own, common)), basis)
-    push = jax.vmap(lambda tangent: jax.jvp(of, (own, common), tangent), out_axes=(None, 0))
-    end, columns = push(basis)
+    structure = jax.tree_util.tree_structure((moving, common))
+    push = jax.vmap(lambda tangent: jax.jvp(of, (moving, common), tangent), out_axes=(None, 0))
+    end, columns = push(jax.tree_util.tree_unflatten(structure, basis))
 
     # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
-    rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_own)]
+    rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]
     rows += [jnp.broadcast_to(t.reshape(-1, 1), (t.size, 1)) for t in leaves(t_common)]
     lanes = max(x.shape[-1] for x in leaves(columns))
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
@@ -196,10 +200,6 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
         return jnp.sum(column * w, axis=0)
 
     return end, jax.tree_util.tree_map(contract, columns)
-
-
-def _none(x):
-    return x is None
 
 
 # Up to so many rows are selected one by one. Twice as many: programs of eight contacts compile for

@@ -4,7 +4,7 @@ import functools
 import threading
 import weakref
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar, cast, overload
 
 
 Owner = TypeVar("Owner")
@@ -42,18 +42,18 @@ class Memory:
     def _of(self, owner: Any) -> dict[Hashable, Any]:
         name = id(owner)
         with self._lock:
-            known = self._values.get(name)
+            entry = self._values.get(name)
             # (An object that died may have left its id to this one.)
-            if known is None or known[0]() is not owner:
-                known = weakref.ref(owner, functools.partial(self._forget, name)), {}
-                self._values[name] = known
-            return known[1]
+            if entry is None or entry[0]() is not owner:
+                entry = weakref.ref(owner, functools.partial(self._forget, name)), {}
+                self._values[name] = entry
+            return entry[1]
 
     def _forget(self, name: int, dead: weakref.ref) -> None:
         # No lock: this may be called anywhere, also inside of `_of`. Single operations of a
         # dictionary are whole; what has been replaced by an heir of the id stays.
-        known = self._values.get(name)
-        if known is not None and known[0] is dead:
+        entry = self._values.get(name)
+        if entry is not None and entry[0] is dead:
             self._values.pop(name, None)
 
 
@@ -62,7 +62,7 @@ class remembered(Generic[Owner, Value]):  # noqa: N801 (a decorator, as `propert
 
     def __init__(self, function: Callable[[Owner], Value]):
         self._function, self.memory = function, Memory()
-        functools.update_wrapper(self, function)
+        functools.update_wrapper(cast(Callable, self), function)
 
     @overload
     def __get__(self, instance: None, owner: Any = None) -> "remembered[Owner, Value]": ...
@@ -70,7 +70,7 @@ class remembered(Generic[Owner, Value]):  # noqa: N801 (a decorator, as `propert
     @overload
     def __get__(self, instance: Owner, owner: Any = None) -> Value: ...
 
-    def __get__(self, instance, owner=None):
+    def __get__(self, instance: Owner | None, owner: Any = None) -> Any:
         if instance is None:
             return self
         return self.memory.recall(instance, None, lambda: self._function(instance))

@@ -21,7 +21,8 @@ from .boundary.checked import checked
 
 Item = TypeVar("Item")
 
-# Seconds until the line appears, and from one look at what to show to the next.
+# Seconds until the line appears (less: it flickers in short calls), and between updates (less: takes
+# time of the call; more of either: it says nothing for long).
 _DELAY, _PERIOD = 1.0, 0.25
 _LINE = "{desc}, {elapsed}"
 _COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"
@@ -38,7 +39,7 @@ class Call:
     compiling: bool = False
 
     def __str__(self) -> str:
-        """What it does at the moment."""
+        """The current step."""
         step = self.step if self.total is None else f"{self.done} of {self.total} {self.name}"
         return " ".join(filter(None, (step, "(compiling)" if self.compiling else "")))
 
@@ -83,13 +84,13 @@ def counted(items: Iterable[Item], name: str, total: int | None) -> Iterator[Ite
 
 
 def say(step: str) -> None:
-    """What the innermost call does now."""
+    """Set the step of the innermost call."""
     if _running:
         _running[-1].step = step
 
 
 def say_compiling(compiling: bool) -> None:
-    """Whether the innermost call waits for a program."""
+    """Set whether the innermost call waits for a program to be compiled."""
     if _running:
         _running[-1].compiling = compiling
 
@@ -101,7 +102,7 @@ def _is_watched() -> bool:
 
 
 def _display() -> Callable[..., Any] | None:
-    """What shows something in a cell of a notebook; `None` outside of Jupyter."""
+    """IPython's `display`; `None` outside of Jupyter."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return None if ipython is None or not hasattr(shell, "kernel") else ipython.display.display

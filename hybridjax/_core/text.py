@@ -9,13 +9,15 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .executor import is_traced
+from .executor import is_traced, is_tracer
 from .signal import unit_of, with_unit
 
 
-# A module stands on one line if it is no wider than that, else each field on a line of its own.
+# Characters up to which a module stands on one line. More: lines wrap in a notebook. Fewer: short
+# modules take a screen.
 _WIDTH = 88
-# So many numbers of an array are printed; of more, only shape and range.
+# Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
+# module no longer stand on one line.
 _FEW = 4
 
 
@@ -42,7 +44,7 @@ def columns(rows: Iterable[tuple[str, ...]]) -> str:
 def value(x: Any) -> str:
     """A number, array, module or whatever else a field holds, on one line: of a module that needs
     more (a network, a system) how many numbers it holds."""
-    if isinstance(x, jax.core.Tracer):
+    if is_tracer(x):
         return f"traced {x.dtype}{list(x.shape)}"
     if isinstance(x, jax.Array | np.ndarray | np.generic):
         return _array(np.asarray(x))

@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -43,12 +43,12 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
-    """The folder exists and can be written. If it was made for this, and something is raised while
-    it is empty, it goes again, as do those above it that were made with it.
+    """A context in which the folder exists and can be written. If it was made for this, and an
+    error is raised while it is empty, it is removed, as are those above that were made with it.
 
     **Raises:** `DefinitionError` if it cannot be made or written.
     """
-    new = [one for one in (folder, *folder.parents) if not os.path.lexists(one)]
+    new = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
     try:
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -60,8 +60,8 @@ def made_folder(folder: Path) -> Iterator[None]:
         yield
     except BaseException:
         with contextlib.suppress(OSError):
-            for one in new:
-                one.rmdir()
+            for path in new:
+                path.rmdir()
         raise
 
 
@@ -73,12 +73,12 @@ Format = Literal["png", "pdf", "svg"]
 
 
 Digests = dict[str, list[str]]
-"""By name, which contents a file may have if it is one of ours."""
+"""Digests by name that a file has if nobody has changed it."""
 
 
 @contextlib.contextmanager
 def results_folder(folder: Path, kind: str, names: Iterable[str] = ()) -> Iterator[Path]:
-    """A new folder for results of this kind, which are put into `folder` when all are there.
+    """A new folder for results of this kind, which are moved to `folder` when all are there.
 
     Results of the same kind that are there already are replaced or removed. After an error `folder`
     is as it was before.
@@ -108,83 +108,66 @@ def _put(new: Path, folder: Path, kind: str) -> None:
     digests = {path.relative_to(new).as_posix(): [_digest(path)] for path in files}
     before = _listed(folder, kind)
     _refuse_others(folder, digests, before)
-    # First a list of both, so that whoever is interrupted finds all of them on it.
+    # First a list of both, so that all of them are on it after an interruption.
     either = {name: before.get(name, []) + digests.get(name, []) for name in before | digests}
     _write_list(folder, kind, either)
     for name in digests:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(new / name, folder / name)
     for name in before.keys() - digests.keys():
-        if _is_own(folder, name, before):
+        if _is_listed(folder, name, before):
             (folder / name).unlink()
     _write_list(folder, kind, digests)
 
 
-def _refuse_others(folder: Path, names: Iterable[str], own: Digests) -> None:
+def _refuse_others(folder: Path, names: Iterable[str], listed: Digests) -> None:
     for name in names:
-        for above in list(PurePosixPath(name).parents)[:-1]:
-            if os.path.lexists(folder / above) and not _is_folder(folder / above):
-                raise _other(folder / above)
-        if os.path.lexists(folder / name) and not _is_own(folder, name, own):
-            raise _other(folder / name)
+        path = folder / name
+        for above in _between(path, folder):
+            if os.path.lexists(above) and (above.is_symlink() or not above.is_dir()):
+                raise _in_the_way(above)
+        if os.path.lexists(path) and not _is_listed(folder, name, listed):
+            raise _in_the_way(path)
 
 
-def _other(path: Path) -> DefinitionError:
+def _in_the_way(path: Path) -> DefinitionError:
     return DefinitionError(
         f"'{path}' is in the way, and was not written by hybridjax or was changed since: choose "
         "another folder, or take it away."
     )
 
 
-def _is_own(folder: Path, name: str, own: Digests) -> bool:
+def _is_listed(folder: Path, name: str, listed: Digests) -> bool:
+    """Return whether a file is on the list, and no link leads to it."""
     path = folder / name
-    above = list(PurePosixPath(name).parents)[:-1]
-    return (
-        all(_is_folder(folder / one) for one in above)
-        and path.is_file()
-        and not path.is_symlink()
-        and _digest(path) in own.get(name, ())
-    )
+    links = any(x.is_symlink() for x in (path, *_between(path, folder)))
+    return path.is_file() and not links and _digest(path) in listed.get(name, ())
 
 
-def _is_folder(path: Path) -> bool:
-    return path.is_dir() and not path.is_symlink()
+def _between(path: Path, folder: Path) -> list[Path]:
+    """Return the folders above a path, up to `folder`."""
+    return [x for x in path.parents if folder in x.parents]
 
 
 def _listed(folder: Path, kind: str) -> Digests:
-    path = _list(folder, kind)
+    path = folder / f".hybridjax-{kind}.json"
     if not os.path.lexists(path):
         return {}
     try:
         if path.is_symlink() or path.stat().st_size > limits.TEXT:
             raise ValueError
-        return {_name(name): list(map(str, digests)) for name, digests in _items(path)}
-    except (OSError, ValueError, TypeError, RecursionError):
-        raise _other(path) from None
-
-
-def _items(path: Path):
-    listed = json.loads(path.read_text())
-    if not isinstance(listed, Mapping):
-        raise ValueError
-    return listed.items()
-
-
-def _name(text: str) -> str:
-    """A name inside of the folder."""
-    name = PurePosixPath(text)
-    if name.is_absolute() or ".." in name.parts or not name.parts:
-        raise ValueError
-    return text
+        listed = json.loads(path.read_text())
+        for name in map(PurePosixPath, dict(listed)):
+            if name.is_absolute() or ".." in name.parts or not name.parts:
+                raise ValueError
+        return {name: list(map(str, digests)) for name, digests in listed.items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        raise _in_the_way(path) from None
 
 
 def _write_list(folder: Path, kind: str, digests: Digests) -> None:
-    with replacing(_list(folder, kind)) as path:
+    with replacing(folder / f".hybridjax-{kind}.json") as path:
         path.write_text(json.dumps(digests, indent=1))
-
-
-def _list(folder: Path, kind: str) -> Path:
-    return folder / f".hybridjax-{kind}.json"
 
 
 def _digest(path: Path) -> str:

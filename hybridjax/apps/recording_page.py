@@ -131,7 +131,7 @@ def _summary(found: Identification) -> list[str]:
         f"{_safe(names[1])}, {data.n_sections} sections per cycle.</p>",
         *_multipliers(found),
         f"<dl>{listed}</dl>",
-        *(f'<p class="warn">{_sentence(w)}</p>' for w in found.advice.warnings),
+        *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in found.advice.warnings),
         *([] if found.advice.warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
         f"<p>Left out, and assumed:</p><ul>{left}</ul>" if left else "<p>Nothing was left out.</p>",
         "<p>A multiplier says what is left of a deviation from the average cycle one cycle later. "

@@ -116,7 +116,7 @@ def summarize(found: Identification) -> dict[str, Any]:
         "multipliers_of_held_out_fit": [[z.real, z.imag] for z in held.fit.multipliers],
         "held_out_fit_percent": held.validation.fit.tolist(),
         "input_band": list(found.advice.band),
-        "warnings": list(found.advice.warnings),
+        "warnings": list(map(repr, found.advice.warnings)),
     }
 
 

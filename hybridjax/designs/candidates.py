@@ -13,7 +13,7 @@ from .._core.text import listed
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
 from ..experiments.design.partition import is_half_integer
-from ..identify.joint.ldtp_fit import LDTPFit
+from ..identify.joint.fit import LDTPFit
 from ..identify.joint.noise import noise_spectrum
 from ..identify.multipliers import StructuredFit
 from ..linear.frequency_response import Harmonics

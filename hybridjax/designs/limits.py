@@ -177,8 +177,8 @@ def power_limits(
         unknown = [n for n in limits.rms if n not in squares[0] or n in rates]
         if unknown or not (limits.rms or limits.rate or limits.peak or limits.distortion):
             problem = f"has '{unknown[0]}'" if unknown else "limits nothing"
-            known = ", ".join(n for n in squares[0] if n not in rates)
-            raise DefinitionError(f"`limit` {problem}; rms values can be limited of {known}.")
+            allowed = ", ".join(n for n in squares[0] if n not in rates)
+            raise DefinitionError(f"`limit` {problem}; rms values can be limited of {allowed}.")
         levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
     limits.require_inputs(inputs)
     for level in levels:

@@ -12,11 +12,14 @@ from jaxtyping import Bool, Float, Int
 
 from ..errors import DefinitionError
 from ..identify.htf_errors import check_values, error_weights
-from ..identify.joint.characteristic import characteristic_slopes
-from ..identify.joint.coordinates import LocalCoordinates, local_coordinates
 from ..identify.joint.frequency import transfer, transfer_slopes
-from ..identify.joint.periodic_model import PeriodicModel
-from ..identify.series.realization import realize
+from ..identify.joint.model import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
+from ..identify.joint.realization import realize
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs

@@ -188,7 +188,7 @@ class OrderCriterion(Criterion):
 
 def order_criterion(goal: Order, model: Model, cosines: Candidates, noise: Noise) -> OrderCriterion:
     """**Raises:** `DefinitionError` for a rival with as many multipliers."""
-    multipliers, rival = np.asarray(model.multipliers), goal.fewer
+    multipliers, rival = np.asarray(model.multipliers, complex), goal.fewer
     if rival >= len(multipliers):
         raise DefinitionError(
             f"`goal`: {rival} multipliers are not fewer than the model's {len(multipliers)}."
@@ -198,7 +198,7 @@ def order_criterion(goal: Order, model: Model, cosines: Candidates, noise: Noise
     for htf, cosine, _ in measured_htfs(model, cosines, goal.harmonics, noise):
         require_frequencies(htf, rival, size)
         channels += _channels(htf, cosine, np.zeros(rival), size, range(rival + 1))
-    largest = multipliers[:rival].real
+    largest = np.real(multipliers[:rival])
     starts = tuple(np.atleast_1d(np.poly(part * largest))[1:] for part in _STARTS)
     name = f"misfit with {rival} multiplier{'s' * (rival != 1)}"
     delay = np.exp(-2j * np.pi * cosines.f)

@@ -175,7 +175,7 @@ class Study(eqx.Module):
 
     @property
     def done(self) -> bool:
-        """Whether the requested precision is reached."""
+        """True if the requested precision is reached."""
         if self.fit is None or not np.isfinite(self.standard_errors[-1]).all():
             return False
         return bool(self.standard_errors[-1].max() * _student(self.fit) <= self.standard_error)
@@ -277,9 +277,9 @@ class Study(eqx.Module):
     def _rows(self) -> list[tuple[str, str]]:
         rows = []
         for n, errors in zip(self.strides, self.standard_errors, strict=True):
-            known = ", ".join(f"{x:.2e}" for x in errors)
+            numbers = ", ".join(f"{x:.2e}" for x in errors)
             lost = "too few data for so many multipliers"
-            rows.append((f"{n:.0f}", known if np.isfinite(errors).all() else lost))
+            rows.append((f"{n:.0f}", numbers if np.isfinite(errors).all() else lost))
         return rows
 
     def _outlook(self, fit: StructuredFit) -> str:

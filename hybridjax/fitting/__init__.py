@@ -1,4 +1,4 @@
-"""What a fit of physical parameters is made of, and what it gives back."""
+"""Physical parameters from data."""
 
 import lazy_loader
 

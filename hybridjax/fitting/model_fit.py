@@ -1,7 +1,9 @@
-"""What a fit of physical parameters gives back."""
+"""The result of a fit of physical parameters, and the combinations that data identify."""
 
+import itertools
 import operator
 from collections.abc import Mapping
+from fractions import Fraction
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,14 +19,120 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem, unit_of_parameter
 from .problem import FitProblem, evaluate
-from .sensitivity import Identifiability
+
+
+# Singular values of the sensitivities below this part of the largest one are zero. Larger: badly
+# identified combinations count as unidentifiable. Smaller: rounding identifies them.
+_RANK = 1e-9
+# Entries of a direction this close to zero, or to ratios of integers with denominators up to the
+# largest one, are replaced by these (they have no unit); a basis is solved for entries whose
+# smallest singular value is above it. Larger: exponents that are none are printed as integers.
+# Smaller: rounding of derivatives is printed.
+_CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
+
+
+class Identifiability(eqx.Module):
+    r"""The combinations of parameters that the data identify, near given values.
+
+    With the sensitivities $S_{ij} = p_j\,\partial r_i/\partial p_j$ of the weighted residuals to
+    relative changes, changes in the null space of S do not change the data (to first order): for a
+    row w of `unseen`, $p_j \to p_j\, c^{w_j}$ for all j leaves them as they are (for a parameter
+    that is zero, or has bounds on both sides or none: $p_j \to p_j + s_j w_j \log c$).
+
+    **Fields:**
+
+    - `names` (p,) of the parameters. `rank`: number of identified combinations.
+    - `singular_values` (p,) of S, the largest first. Where residuals are in units of standard
+        deviations, one over a singular value is the relative standard error of its combination.
+    - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible, and small
+        integers where it has such.
+    - `sensitivity` (r, p): S.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    rank: int = eqx.field(static=True)
+    singular_values: Float[np.ndarray, " p"]
+    unseen: Float[np.ndarray, "k p"]
+    sensitivity: Float[np.ndarray, "r p"]
+
+    @property
+    def complete(self) -> bool:
+        """True if every parameter is identified."""
+        return self.rank == len(self.names)
+
+    def descriptions(self) -> list[str]:
+        """Return the unidentifiable combinations, in words."""
+        return [_describe(self.names, row) for row in self.unseen]
+
+    def __repr__(self) -> str:
+        nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
+        lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
+        lines = [
+            f"Identifiability: {self.rank} of {len(self.names)} combinations of "
+            f"({', '.join(self.names)}) are seen"
+        ]
+        lines += [f"  not seen: {text}" for text in self.descriptions()]
+        lines.append(f"  singular values {nonzero}" + (f"; zero: {lost}" if lost else ""))
+        return "\n".join(lines)
+
+
+def diagnose(names: tuple[str, ...], sensitivity: Float[np.ndarray, "r p"]) -> Identifiability:
+    """Return the identifiability from the sensitivities S of weighted residuals to relative changes
+    of the parameters."""
+    _, values, rows = np.linalg.svd(sensitivity, full_matrices=True)
+    values = np.concatenate([values, np.zeros(len(names) - len(values))])
+    rank = int(np.sum(values > _RANK * values[0]))
+    return Identifiability(names, rank, values, _readable(rows[rank:]), sensitivity)
+
+
+def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
+    """Return the basis of the same space with the most zeros among those in echelon form."""
+    k, p = basis.shape
+    if k == 0:
+        return basis
+
+    def echelon(pivots):
+        block = basis[:, pivots]
+        if np.linalg.svd(block, compute_uv=False)[-1] < _CLOSE:
+            return None
+        return _rounded(np.linalg.solve(block, basis))
+
+    forms = (echelon(list(pivots)) for pivots in itertools.combinations(range(p), k))
+    forms = [form for form in forms if form is not None]
+    return min(forms, key=lambda form: (np.count_nonzero(form), np.sum(form < 0)))
+
+
+def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
+    """Return rows scaled to small integers where they are multiples of such."""
+    out = []
+    for row in rows:
+        nearest = [Fraction(x).limit_denominator(_LARGEST_DENOMINATOR) for x in row]
+        if max(abs(float(n) - x) for n, x in zip(nearest, row, strict=True)) < _CLOSE:
+            common = np.lcm.reduce([n.denominator for n in nearest])
+            row = np.array([float(n * int(common)) for n in nearest])
+        out.append(np.where(np.abs(row) < _CLOSE, 0.0, row))
+    return np.array(out)
+
+
+def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
+    parts = [(name, w) for name, w in zip(names, row, strict=True) if w]
+    if len(parts) == 1:
+        return parts[0][0]
+    together = ", ".join(name for name, _ in parts)
+    if all(w == parts[0][1] for _, w in parts):
+        only = f", only {parts[0][0]}/{parts[1][0]}" if len(parts) == 2 else ""
+        return f"a common factor of ({together}){only}"
+    if len(parts) == 2 and parts[0][1] == -parts[1][1]:
+        return f"{parts[0][0]} and {parts[1][0]} apart, only their product"
+    powers = ", ".join(name if w == 1 else f"{name}^{w:.3g}" for name, w in parts)
+    return f"a common factor, with these powers, of ({powers})"
 
 
 class ParameterGuesses(eqx.Module):
-    """What became of the S guesses of a fit, in the order in which they were tried.
+    """The S guesses of a fit, in the order in which they were tried.
 
-    **Fields:** `values` (S, p), the guesses, and `fitted` (S, p), where they led; `cost`
-    (S,) there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,), codes.
+    **Fields:** `values` (S, p), the guesses, and `fitted` (S, p), the fitted values; `cost` (S,)
+    there; `steps` (S,), evaluations of the model with its derivatives; `result` (S,), codes.
     """
 
     values: Float[np.ndarray, "S p"]
@@ -38,7 +146,7 @@ class ParameterGuesses(eqx.Module):
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:
-        """Which of them converged."""
+        """True for each guess that converged."""
         return self.result == Result.OK
 
     def __repr__(self) -> str:
@@ -56,14 +164,14 @@ class ModelFit(eqx.Module):
     - `system`: with the fitted parameters. `cycle`: its limit cycle.
     - `names`, `values` (p,): the free parameters.
     - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
-        of their standard deviations (where the data have none, what the misfit says); zero along
-        combinations that the data do not see.
+        of their standard deviations (estimated from the residuals where the data have none); zero
+        along combinations that the data do not identify.
     - `residuals` (r,): weighted, those of all observations one after the other.
-    - `cost`: sum of their squares. `freedom`: r less the number of combinations that are seen; the
-        cost to be expected where all data came with their standard deviations.
-    - `identifiability`: which combinations of parameters the data see.
-    - `guesses`: what became of each guess. `result`: code of the best one.
-    - `problem`: what was made small.
+    - `cost`: sum of their squares. `freedom`: r less the number of identified combinations; the
+        expected cost where all data have standard deviations.
+    - `identifiability`: the combinations of parameters that the data identify.
+    - `guesses`: the result of each guess. `result`: code of the best one.
+    - `problem`: the minimized function.
     """
 
     system: HybridSystem
@@ -81,23 +189,23 @@ class ModelFit(eqx.Module):
 
     @property
     def weighted(self) -> bool:
-        """Whether all data came with their standard deviations."""
+        """True if all data have standard deviations."""
         return self.problem.weighted
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " p"]:
-        """Of each value; infinite for a parameter that the data do not see by itself."""
+        """Standard error of each value; infinite for a parameter that is not identified alone."""
         lost = np.any(self.identifiability.unseen != 0, axis=0)
         return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
 
     @checked
     def chi_square(self, true: HybridSystem | Mapping[str, float]) -> float:
-        r"""How much worse other values explain the data: their cost less that of the fit.
+        r"""Return the cost of other values less that of the fit.
 
-        That of the truth has a chi square distribution with `identifiability.rank` degrees of
+        For the true values it has a chi square distribution with `identifiability.rank` degrees of
         freedom (Wilks 1938). Unlike $e^T J^T J e$ with the errors e of the values, it does not
-        depend on how the parameters are written, and follows curved regions. Where the data have no
-        standard deviations the unit is what the misfit says.
+        depend on the parametrization, and follows curved regions. Where the data have no standard
+        deviations it is in units of the variance estimated from the residuals.
 
         **Arguments:** `true`: a system, or values by name.
 
@@ -116,7 +224,7 @@ class ModelFit(eqx.Module):
 
     @checked
     def contains(self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95) -> bool:
-        """Whether other values lie in the joint confidence region of all that the data see."""
+        """Test whether other values lie in the joint confidence region."""
         rank = self.identifiability.rank
         if self.weighted:
             return bool(self.chi_square(true) <= stats.chi2(rank).ppf(level))
@@ -124,27 +232,27 @@ class ModelFit(eqx.Module):
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
-        expected = f", expected {self.freedom}" if self.weighted else ""
-        converged = int(np.sum(self.guesses.ok))
-        lines = [
-            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
-            f"  cost {self.cost:.6g}{expected}; {converged} of {len(self.guesses)} guesses "
-            f"converged, {int(np.sum(self.guesses.steps))} evaluations",
-        ]
+        lines = [f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"]
+        lines.append(f"  {self._cost()}")
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
             shown = f"+- {error:.2g}" if np.isfinite(error) else "not seen by itself"
             lines.append(f"  {name:{width}}  {value:<14.9g} {shown}")
         lines += [f"  not seen: {text}" for text in self.identifiability.descriptions()]
         return "\n".join(lines)
 
+    def _cost(self) -> str:
+        expected = f", expected {self.freedom}" if self.weighted else ""
+        return (
+            f"cost {self.cost:.6g}{expected}; {int(np.sum(self.guesses.ok))} of "
+            f"{len(self.guesses)} guesses converged, {int(np.sum(self.guesses.steps))} evaluations"
+        )
+
     def _repr_html_(self) -> str:
         rows = []
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            unit, seen = unit_of_parameter(self.system, name), np.isfinite(error)
-            known = f"{1.96 * error:.2g}" if seen else "not seen by itself"
-            rows.append((name, f"{value:.9g}", known, unit))
-        head, cost, *_ = repr(self).splitlines()
-        unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
-        of = head.removeprefix("ModelFit(").removesuffix(")")
+            shown = f"{1.96 * error:.2g}" if np.isfinite(error) else "not seen by itself"
+            rows.append((name, f"{value:.9g}", shown, unit_of_parameter(self.system, name)))
         parameters = table(("parameter", "value", "± 95 %", "unit"), rows)
-        return card("ModelFit", f"of {of}", parameters, text("\n".join([cost.strip(), *unseen])))
+        unseen = [f"not seen: {x}" for x in self.identifiability.descriptions()]
+        of = f"of {type(self.system).__name__}: {Result(self.result).message}"
+        return card("ModelFit", of, parameters, text("\n".join([self._cost(), *unseen])))

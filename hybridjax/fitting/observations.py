@@ -1,4 +1,4 @@
-"""What a system is fitted to: each kind of data turns a limit cycle into weighted residuals."""
+"""Data to which systems are fitted: each type converts a limit cycle to weighted residuals."""
 
 import abc
 from collections.abc import Sequence
@@ -30,7 +30,6 @@ from ..sections.families import FamilyLike, as_family
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from ..systems.structure import Structure
 
 
 AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
@@ -38,18 +37,18 @@ Deviations = Annotated[Numbers, Reals("...", sign="positive")]
 
 
 class AbstractObservation(eqx.Module):
-    """Something that was measured, as `fit_model` takes it. Subclass it for data of other kinds.
+    """A measurement, for `fit_model`. Subclass it for data of other types.
 
     **Fields:** `weighted`: whether residuals are in units of their standard deviations (an array,
-    like all that may change without another compilation). Residuals should have no units either
-    way: where there are no standard deviations, divide by the size of what was measured.
+    as all fields that may change without another compilation). Residuals should be dimensionless:
+    where there are no standard deviations, divide by the size of the measured values.
 
     **Class variable:** `uses_factors`: whether residuals depend on the cycle's own `factors` or
     `legs`. If no observation of a fit does, these are not computed, and the fit compiles in a
-    third of the time.
+    third of the time. Default: True.
 
-    For example, multipliers, by the coefficients of their polynomial (they themselves have no
-    derivative where two meet):
+    For example, multipliers, by the coefficients of their polynomial (the multipliers themselves
+    have no derivative where two meet):
 
     ```python
     class ObservedMultipliers(hj.fitting.AbstractObservation):
@@ -60,7 +59,7 @@ class AbstractObservation(eqx.Module):
 
         def residuals(self, cycle):
             polynomial = hj.linearize(cycle, self.sections).characteristic_polynomial()
-            return polynomial[1 : 1 + len(self.seen)] - self.seen
+            return polynomial[1 : 1 + len(self.measured)] - self.measured
     ```
     """
 
@@ -69,22 +68,24 @@ class AbstractObservation(eqx.Module):
 
     @abc.abstractmethod
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
-        """What a system with this limit cycle would give minus what was measured, weighted.
+        """Return the prediction from this limit cycle minus the measurement, weighted.
 
-        Called under JAX transformations and differentiated in forward mode, once. Of the `cycle`,
-        the parameters of its `system`, `period`, `anchor` and, if `uses_factors` (NaN otherwise),
-        `legs` and `factors` have derivatives by the free parameters; all that is computed from it
-        by `linearize` or `place_sections` has, too. What needs values has no place here, such as
-        `cycle.multipliers`: use `linearize(...).monodromy()`, `characteristic_polynomial()`, or
+        The method is called under JAX transformations and differentiated in forward mode, once. The
+        parameters of `cycle.system`, `period`, `anchor` and, if `uses_factors` (NaN otherwise),
+        `legs` and `factors` have derivatives by the free parameters, and so have results of
+        `linearize` and `place_sections`. Functions that need concrete values raise an error, such
+        as `cycle.multipliers`: use `linearize(...).monodromy()`, `characteristic_polynomial()`, or
         `hj.fitting.spectral_radius`.
 
-        A residual that is NaN or infinite says that the system cannot give what was measured. The
-        fit then takes a shorter step; a guess at which that happens is given up.
+        Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
+        shorter step, or gives up a guess at which this happens.
         """
 
     def prepare(self, cycle: LimitCycle) -> "AbstractObservation":
-        """Called once, before the fit, with the limit cycle from which it starts: for checks and
-        for what is computed outside of JAX transformations."""
+        """Return the observation for a fit that starts from this limit cycle.
+
+        Called once, for checks and for computations outside of JAX transformations.
+        """
         return self
 
     def __repr__(self):
@@ -111,8 +112,8 @@ class ObservedHTF(AbstractObservation):
     uses_factors: ClassVar[bool] = False
 
     def __init__(self, htf: HTF, sections: FamilyLike):
-        """**Arguments:** `htf`, of outputs and inputs that the system knows by name; `sections`,
-        the family of sections that it was measured at.
+        """**Arguments:** `htf`: of outputs and inputs of the system, by name. `sections`: the
+        family of sections at which it was measured.
 
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
@@ -137,7 +138,7 @@ class ObservedHTF(AbstractObservation):
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        Structure(cycle.system).resolve_outputs(self.outputs)
+        cycle.structure.resolve_outputs(self.outputs)
         unknown = [name for name in self.inputs if name not in cycle.system.inputs]
         if unknown:
             raise DefinitionError(
@@ -152,7 +153,7 @@ class ObservedHTF(AbstractObservation):
 class ObservedSeries(AbstractObservation):
     """Outputs at the sections in experiments that begin on the limit cycle.
 
-    Residuals are differences of the outputs themselves where the data know their values on the
+    Residuals are differences of the outputs themselves where the data have their values on the
     cycle (`ExperimentData.cycle_outputs`), else of deviations from the cycle; in units of `std`, or
     relative to the rms of each output's deviations. Experiments that failed are left out.
     """
@@ -169,8 +170,8 @@ class ObservedSeries(AbstractObservation):
     uses_factors: ClassVar[bool] = False
 
     def __init__(self, data: ExperimentData, sections: FamilyLike, std: Deviations | None = None):
-        """**Arguments:** `data` of experiments with `start="cycle"`; `sections`, their family;
-        `std`, the standard deviation of the measurement noise, one number or one for each output.
+        """**Arguments:** `data`: from experiments with `start="cycle"`. `sections`: their family.
+        `std`: standard deviation of the measurement noise, one number or one for each output.
 
         **Raises:** `DefinitionError` if no experiment ran well, for another number of sections, or
         an `std` that is not one for each output.
@@ -196,7 +197,7 @@ class ObservedSeries(AbstractObservation):
         self.scale = jnp.broadcast_to(scale, (ny,))
         self.weighted = jnp.asarray(std is not None)
         self.absolute = data.cycle_outputs is not None
-        if self.absolute:
+        if data.cycle_outputs is not None:
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
         self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
         self.flow = None
@@ -209,6 +210,7 @@ class ObservedSeries(AbstractObservation):
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
         start = jnp.tile(placed.section_zero[:, None], len(self.u))
+        assert self.flow is not None, "`prepare` was not called"
         plan, settings = self.flow
         y = flow_batch(course(placed, self.outputs), plan, start, self.u, settings).y
         if not self.absolute:
@@ -220,18 +222,14 @@ class ObservedSeries(AbstractObservation):
             raise DefinitionError(
                 f"the data have the inputs {self.inputs}, the system {cycle.system.inputs}."
             )
-        response = response_function(cycle, self.sections, self.outputs)
-        return eqx.tree_at(
-            lambda o: o.flow,
-            self,
-            (response.stepping.plan, response.stepping.settings),
-            is_leaf=lambda x: x is None,
-        )
+        stepping = response_function(cycle, self.sections, self.outputs).stepping
+        flow = stepping.plan, stepping.settings
+        return eqx.tree_at(lambda o: o.flow, self, flow, is_leaf=lambda x: x is None)
 
 
 @checked
 class ObservedCycle(AbstractObservation):
-    """What was seen of the limit cycle itself: outputs at sections, times, the period.
+    """Measurements of the limit cycle itself: outputs at sections, times, the period.
 
     Times of events are times of their sections: `ObservedCycle([hj.AtEvent("liftoff"),
     hj.AtEvent("touchdown")], times=(0.5163, 1.3510))`. Times of a clocked system are its clock's,
@@ -243,7 +241,7 @@ class ObservedCycle(AbstractObservation):
 
     sections: AbstractSections
     outputs: tuple[str, ...] = eqx.field(static=True)
-    seen: tuple[Float[Array, "..."], ...]
+    measured: tuple[Float[Array, "..."], ...]
     scales: tuple[Float[Array, "..."], ...]
     which: tuple[str, ...] = eqx.field(static=True)
     weighted: Bool[Array, ""]
@@ -264,11 +262,12 @@ class ObservedCycle(AbstractObservation):
         """**Arguments:**
 
         - `sections`: a family of N sections, or a list of `Crossing` and `AtEvent`.
-        - `outputs`, names, and `values` (N, ny), what they are at the sections.
-        - `times` (N,), when the cycle meets the sections. `period`.
-        - `std` of the values, one number or one for each output; `times_std`; `period_std`.
+        - `outputs`: names. `values` (N, ny): their values at the sections.
+        - `times` (N,) at which the cycle crosses the sections. `period`.
+        - `std`: standard deviation of the values, one number or one for each output; `times_std`;
+          `period_std`.
 
-        **Raises:** `DefinitionError` if nothing was observed, for shapes that do not fit, NaN,
+        **Raises:** `DefinitionError` without any measurement, for shapes that do not fit, NaN,
         standard deviations that are not positive, or none for something that is zero throughout.
         """
         self.sections = as_family(sections)
@@ -285,16 +284,16 @@ class ObservedCycle(AbstractObservation):
                 "give `outputs` with their `values`, `times`, or the `period` of the cycle."
             )
         self.which = tuple(given)
-        self.seen = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
+        self.measured = tuple(_shaped(name, x, shape) for name, (x, _, shape) in given.items())
         self.scales = tuple(
             _scale(name, std, x)
-            for x, (name, (_, std, _)) in zip(self.seen, given.items(), strict=True)
+            for x, (name, (_, std, _)) in zip(self.measured, given.items(), strict=True)
         )
         self.weighted = jnp.asarray(all(std is not None for _, std, _ in given.values()))
 
     @classmethod
     def of(cls, cycle: LimitCycle, sections: FamilyLike, outputs: AnyNames = ()) -> "ObservedCycle":
-        """All that can be seen of a known cycle: what an error-free measurement would give.
+        """Return the error-free measurement of a given cycle.
 
         **Raises:** as `place_sections`; `DefinitionError` for an output that is zero throughout.
         """
@@ -305,23 +304,23 @@ class ObservedCycle(AbstractObservation):
         return cls(placed.family, outputs, values, times=times, period=cycle.period)
 
     def __repr__(self):
-        seen = (f"{name} {value(x)}" for name, x in zip(self.which, self.seen, strict=True))
+        values = (f"{name} {value(x)}" for name, x in zip(self.which, self.measured, strict=True))
         outputs = f"{listed(self.outputs)}: " if self.outputs else ""
-        return _shown(self, outputs + "; ".join(seen), self.sections)
+        return _shown(self, outputs + "; ".join(values), self.sections)
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         placed = place_sections(cycle, self.sections)
         parts = []
-        for name, seen, scale in zip(self.which, self.seen, self.scales, strict=True):
+        for name, measured, scale in zip(self.which, self.measured, self.scales, strict=True):
             if name == "values":
-                error = placed.observe(self.outputs) - seen
+                error = placed.observe(self.outputs) - measured
             elif name == "times":
-                error = _times(placed) - seen
+                error = _times(placed) - measured
                 if cycle.clocked:
                     turns = jnp.round(error / cycle.period)
                     error = error - jax.lax.stop_gradient(turns) * cycle.period
             else:
-                error = cycle.period - seen
+                error = cycle.period - measured
             parts.append((error / scale).ravel())
         return jnp.concatenate(parts)
 
@@ -348,7 +347,6 @@ def _shaped(name: str, x: Numbers, shape: tuple[int, ...]) -> Float[Array, "..."
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
-    """Standard deviations that were given, or sizes."""
     if std is None:
         size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))  # of the shape seen.shape[1:]
         if not jnp.all(size > 0):

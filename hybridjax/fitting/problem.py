@@ -1,5 +1,8 @@
-"""Residuals of data as a function of parameters, and the iteration that makes them small."""
+"""Weighted residuals of data as a function of free parameters, and their minimization."""
 
+import dataclasses
+import operator
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,21 +14,140 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.compilation import quick_jit
 from .._core.results import Result
+from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from .candidate import candidate_cycle
+from ..orbits.find import find_limit_cycle
+from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root
+from ..systems.system import HybridSystem
 from .observations import AbstractObservation
-from .parameters import Parameters
 
 
 # The iteration ends when a step changes no coordinate by more than this, in sum and relative to it
-# (coordinates have no unit), and the cost by no more than this part and as much. Doubled, a fit
-# sometimes ends one step earlier.
+# (coordinates have no unit), and the cost by no more than this part and as much. Larger: parameters
+# without the digits that the data have. Smaller: steps that only change rounding errors.
 _TOLERANCE = 1e-9
-# Evaluations of the model from one guess. Doubled, fits that do not converge take twice as long.
+# Evaluations of the model from one guess. Fewer: distant guesses do not converge. More: hopeless
+# ones take longer.
 MAX_STEPS = 64
-# No step is taken along directions whose sensitivity is below this part of the largest one.
-# Doubled, directions that the data see twice as well are left alone.
+# No step is taken along directions whose sensitivity is below this part of the largest one. Larger:
+# badly identified parameters keep their initial values. Smaller: unidentifiable ones wander off.
 _RCOND = 1e-8
+
+Bounds = tuple[float | int, float | int]
+Free = str | Sequence[str] | Mapping[str, Bounds | None]
+
+
+class Parameters(eqx.Module):
+    r"""The free parameters of a system, and coordinates x for them that have no bounds.
+
+    With a bound on one side $v = l + e^x$ or $v = h - e^x$; with two $v = l + (h - l)/(1 +
+    e^{-x})$; without any $v = s x$, with the size s of the first guess (1 if that is zero: then
+    the parameter's unit matters, unless it has bounds). A parameter that only keeps its sign is
+    therefore changed by factors.
+
+    **Fields:** `names`; `low`, `high` (p,), infinite where there is no bound; `size` (p,).
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    low: Float[Array, " p"]
+    high: Float[Array, " p"]
+    size: Float[Array, " p"]
+
+    def read(self, system: HybridSystem) -> Float[Array, " p"]:
+        """Return the values of a system."""
+        return jnp.stack([operator.attrgetter(name)(system) for name in self.names])
+
+    def insert(self, system: HybridSystem, values: Float[Array, " p"]) -> HybridSystem:
+        """Return the system with other values."""
+        where = lambda s: [operator.attrgetter(name)(s) for name in self.names]  # noqa: E731
+        return eqx.tree_at(where, system, list(values))
+
+    def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
+        """Return coordinates of values, NaN for those outside of their bounds."""
+        low, high, cases = self._bounds()
+        up, down = values - low, high - values
+        logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]
+        return jnp.select(cases, logarithms, values / self.size)
+
+    def decode(self, x: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
+        """Return values at coordinates x."""
+        low, high, cases = self._bounds()
+        inside = low + (high - low) * jax.nn.sigmoid(x)
+        return jnp.select(cases, [inside, low + jnp.exp(x), high - jnp.exp(x)], x * self.size)
+
+    def _bounds(self) -> tuple[Array, Array, list[Array]]:
+        """Return bounds with zero for infinity; the cases of both, a lower one, an upper one."""
+        low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        finite = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
+        return *finite, [low & high, low, high]
+
+
+def free_parameters(system: HybridSystem, free: Free) -> Parameters:
+    """Return the free parameters of a system, given as in `fit_model`.
+
+    **Raises:** `DefinitionError` for names that are no numbers of the system, or bounds that do not
+    enclose the values that it has.
+    """
+    free = (free,) if isinstance(free, str) else free
+    names = tuple(free)
+    if not names or len(set(names)) < len(names):
+        raise DefinitionError(f"`free` names parameters, each once, and at least one: {names}.")
+    low, high, size = [], [], []
+    for name in names:
+        value = _number(system, name)
+        bounds = free[name] if isinstance(free, Mapping) else None
+        if bounds is None:  # it keeps its sign
+            bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
+        if len(bounds) != 2 or not bounds[0] < value < bounds[1]:
+            raise DefinitionError(
+                f"the bounds of '{name}', {bounds}, must be two numbers that enclose the value at "
+                f"which the fit starts, {value:g}."
+            )
+        low.append(float(bounds[0]))
+        high.append(float(bounds[1]))
+        size.append(abs(value) if value else 1.0)
+    return Parameters(names, jnp.array(low), jnp.array(high), jnp.array(size))
+
+
+def _number(system: HybridSystem, name: str) -> float:
+    try:
+        value = operator.attrgetter(name)(system)
+    except AttributeError:
+        value = None
+    if value is None or not eqx.is_inexact_array(value) or value.shape != ():
+        declared = [n for n, v in vars(system).items() if eqx.is_inexact_array(v) and v.shape == ()]
+        raise DefinitionError(
+            f"'{name}' is no parameter of {type(system).__name__} (a number declared by "
+            f"hj.parameter); those are {', '.join(declared)}."
+        )
+    return float(value)
+
+
+def candidate_cycle(
+    system: HybridSystem, guess: LimitCycle, with_factors: bool = True
+) -> LimitCycle:
+    """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation.
+
+    Derivatives of a cycle's factors are second derivatives of the flow. Without them it is traced
+    and compiled in a third of the time: `factors` and `legs` are NaN then.
+    """
+    if with_factors:
+        return find_limit_cycle(system, guess)
+    map = guess.return_map.at_phase_of(system)
+    q, turn, steps = root(map, False, NEWTON_STEPS)
+    period = map.expected if map.base is None else map.turn(q).period
+    code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
+    return dataclasses.replace(
+        guess,
+        system=system,
+        period=period,
+        anchor=map.departure(q),
+        legs=guess.legs._replace(q=jnp.full_like(guess.legs.q, jnp.nan)),
+        factors=jnp.full_like(guess.factors, jnp.nan),
+        residual=turn.distance,
+        iterations=steps,
+        result=jnp.where(turn.result == Result.OK, code, turn.result),
+    )
 
 
 class FitProblem(eqx.Module):
@@ -36,25 +158,25 @@ class FitProblem(eqx.Module):
 
     @property
     def weighted(self) -> bool:
-        """Whether all data came with their standard deviations."""
-        return all(bool(one.weighted) for one in self.observations)
+        """True if all data have standard deviations."""
+        return all(bool(observation.weighted) for observation in self.observations)
 
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
-        """Infinite where there is no limit cycle, or nothing to be observed on it."""
+        """Return the residuals, infinite where there is no limit cycle, or no observation on it."""
         system = self.parameters.insert(guess.system, self.parameters.decode(x))
-        with_factors = any(one.uses_factors for one in self.observations)
+        with_factors = any(observation.uses_factors for observation in self.observations)
         cycle = candidate_cycle(system, guess, with_factors)
-        r = jnp.concatenate([one.residuals(cycle) for one in self.observations])
+        r = jnp.concatenate([observation.residuals(cycle) for observation in self.observations])
         return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 
 
 class Evaluation(NamedTuple):
-    """Where an iteration ended."""
+    """The end of an iteration."""
 
     x: Float[Array, " p"]
     """Coordinates of the parameters."""
     residuals: Float[Array, " r"]
-    """There; infinite where there is no limit cycle, or nothing to be observed on it."""
+    """Infinite where there is no limit cycle, or no observation on it."""
     jacobian: Float[Array, "r p"]
     """Derivatives of the residuals by the coordinates."""
     steps: Int[Array, ""]
@@ -64,7 +186,7 @@ class Evaluation(NamedTuple):
 
 @quick_jit
 def _with_jacobian(problem: FitProblem, x, guess):
-    """Residuals (r,) and Jacobian (r, p): all columns in one pass, forwards."""
+    """Return residuals (r,) and Jacobian (r, p): all columns in one pass, in forward mode."""
     push = jax.vmap(
         lambda t: jax.jvp(lambda x: problem.residuals(x, guess), (x,), (t,)), out_axes=(None, -1)
     )
@@ -86,28 +208,29 @@ def _residuals_jvp(primals, tangents):
 
 
 @quick_jit
-def _iterate(problem: FitProblem, x, guess, free, max_steps: int) -> Evaluation:
+def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
     solution = optx.least_squares(
         lambda x, args: _residuals(x, *args),
         optx.LevenbergMarquardt(_TOLERANCE, _TOLERANCE, linear_solver=lx.SVD(rcond=_RCOND)),
         x,
         (problem, guess, free),
         has_aux=True,
-        max_steps=max_steps,
+        max_steps=MAX_STEPS,
         throw=False,
     )
     done = solution.result == optx.RESULTS.successful
-    return Evaluation(solution.value, *solution.aux, solution.stats["num_steps"], done)
+    residuals, jacobian = solution.aux
+    return Evaluation(solution.value, residuals, jacobian, solution.stats["num_steps"], done)
 
 
 def levenberg_marquardt(
-    problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle, max_steps: int
+    problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle
 ) -> Evaluation:
-    """Parameters that make the residuals small, from one guess of theirs."""
-    return _iterate(problem, x, guess, jnp.asarray(1.0), max_steps)
+    """Return parameters that minimize the residuals, from one guess."""
+    return _iterate(problem, x, guess, jnp.asarray(1.0))
 
 
 def evaluate(problem: FitProblem, x: Float[Array, " p"], guess: LimitCycle) -> Evaluation:
-    """Residuals and Jacobian at x. By the program of the iteration, since another would compile for
-    as long: a derivative that is zero moves nothing."""
-    return _iterate(problem, x, guess, jnp.asarray(0.0), MAX_STEPS)
+    """Return residuals and Jacobian at x. This is the compiled function of the iteration, since
+    another would compile for as long: derivatives of zero move nothing."""
+    return _iterate(problem, x, guess, jnp.asarray(0.0))

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..experiments.record import Record
 from ..linear.ldtp import LDTP
-from .joint.prediction.predictor import Predictor
+from .joint.noise import Predictor
 from .series.fit import SeriesFit
 from .series.records import (
     count_cycles,

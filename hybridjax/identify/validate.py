@@ -16,8 +16,8 @@ from .._core.text import p_value
 from ..errors import DefinitionError
 from ..experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
 from ..linear.ldtp import LDTP
-from .joint.ldtp_fit import LDTPFit
-from .joint.prediction.predictor import Predictor
+from .joint.fit import LDTPFit
+from .joint.noise import Predictor
 from .record_simulation import can_be_compared, simulate_record
 from .residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
 from .series.fit import SeriesFit

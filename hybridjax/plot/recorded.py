@@ -8,10 +8,9 @@ from .._core.boundary.checked import checked
 from .._core.signal import Signal, ratio, square, unit_of, with_unit
 from ..errors import DefinitionError
 from ..recordings.beats.response import PhaseResponse, curve_unit
-from ..recordings.data import SectionData
+from ..recordings.data import SectionData, input_spectrum
 from ..recordings.impulse import ImpulseResponses
-from ..recordings.phase.winding import Phase
-from ..recordings.spectra import input_spectrum
+from ..recordings.phase import Phase
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, axis_of, label_of, letters, panels
 
 

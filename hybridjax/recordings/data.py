@@ -1,21 +1,27 @@
 """Data at the sections of a recorded cycle."""
 
 import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy import signal
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, facts, picture, table
 from .._core.signal import unit_of, with_unit
 from ..experiments.data import ExperimentData
-from ..experiments.record import Record
+from ..experiments.record import Record, uninterrupted_records
 
 
-# Signals that a notebook draws. Doubled: twice the size.
-_DRAWN = 4
+# Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
+# where transfer functions are still identified. Smaller: rounding counts as power.
+_LEAST_POWER = 0.01
+# Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
+# Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
+WHOLE_BAND = 0.9
 
 
 class SectionData(eqx.Module):
@@ -23,13 +29,13 @@ class SectionData(eqx.Module):
 
     **Fields:**
 
-    - `records`: `Record`s for `fit_series`, `validate`, ...: one for each stretch that is not
-      interrupted. Samples in gaps are NaN, so that no equation reaches across one.
-    - `times`: for each record, when it crossed its sections. `trials`: the index of its trial.
+    - `records`: `Record`s for `fit_series`, `validate`, ...: one for each uninterrupted stretch.
+      Samples in gaps are NaN, so that no equation reaches across one.
+    - `times`: for each record, the times at its sections. `trials`: for each, the index of its
+      trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
-    - `period`: the median. `bandwidth`: of the splines through the outputs, in Hz.
-    - `n_sections`, `inputs`, `outputs`; `units` (of inputs, then outputs).
-    - `spikes`: how many samples of each signal (inputs, then outputs) were left out as spikes.
+    - `period`: the median. `bandwidth`: bandwidth of the splines through the outputs, in Hz.
+    - `spikes`: for each signal (inputs, then outputs), the number of samples left out as spikes.
     """
 
     records: tuple[Record, ...]
@@ -40,10 +46,6 @@ class SectionData(eqx.Module):
     period: float = eqx.field(static=True)
     bandwidth: float = eqx.field(static=True)
     spikes: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return tuple(map(unit_of, self.inputs + self.outputs))
 
     @property
     def n_sections(self) -> int:
@@ -59,28 +61,44 @@ class SectionData(eqx.Module):
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Inputs, then outputs."""
+        """Names of inputs, then outputs."""
         return self.inputs + self.outputs
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Units of inputs, then outputs."""
+        return tuple(map(unit_of, self.signals))
+
+    @property
     def cycles(self) -> float:
-        """How many cycles of samples there are."""
+        """Number of cycles of samples."""
         return sum(len(r.u) for r in self.records) / self.n_sections
 
     @property
     def missing(self) -> float:
-        """The share of samples with a missing input or output."""
-        lost = [(np.isnan(r.y).any(axis=1) | np.isnan(r.u).any(axis=1)).sum() for r in self.records]
-        return float(sum(lost)) / sum(len(r.u) for r in self.records)
+        """Fraction of samples with a missing input or output."""
+        u, y = self._deviations()
+        return float(np.isnan(np.concatenate([u, y], axis=1)).any(axis=1).mean())
 
     def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
-        """Root mean squares of the deviations of inputs and outputs."""
-        u, y = (np.concatenate([getattr(r, x) for r in self.records]) for x in "uy")
+        """Return root mean squares of the deviations of inputs and outputs."""
+        u, y = self._deviations()
         return np.sqrt(np.nanmean(u**2, axis=0)), np.sqrt(np.nanmean(y**2, axis=0))
+
+    def _deviations(self) -> tuple[Float[np.ndarray, "n nu"], Float[np.ndarray, "n ny"]]:
+        return (
+            np.concatenate([r.u for r in self.records]),
+            np.concatenate([r.y for r in self.records]),
+        )
+
+    def with_drift(self, cycles: int | float) -> "SectionData":
+        """Let fits allow for changes of the outputs that take longer than so many cycles."""
+        records = tuple(replace(r, drift=float(cycles)) for r in self.records)
+        return replace(self, records=records)
 
     @checked
     def experiments(self, periods: PeriodCount) -> ExperimentData:
-        """The records as experiments with periodic inputs, for `estimate_htf` and its like.
+        """Return the records as experiments with periodic inputs, for `estimate_htf` and others.
 
         Every record is cut to whole cycles from section 0, and all to the same length.
 
@@ -88,16 +106,13 @@ class SectionData(eqx.Module):
 
         **Raises:** `DefinitionError` for records that are shorter than P, or have gaps.
         """
-        N, parts = self.n_sections, []
-        for r in self.records:
-            first = -r.first_section % N
-            parts.append((r.u[first:], r.y[first:]))
-        cycles = min(len(u) for u, _ in parts) // N
-        u = np.stack([u[: cycles * N] for u, _ in parts])
-        y = np.stack([y[: cycles * N] for _, y in parts])
+        N = self.n_sections
+        first = [-r.first_section % N for r in self.records]
+        cycles = min(len(r.u) - k for r, k in zip(self.records, first, strict=True)) // N
+        parts = [r.part(k, k + cycles * N) for r, k in zip(self.records, first, strict=True)]
         return ExperimentData(
-            u,
-            y,
+            np.stack([r.u for r in parts]),
+            np.stack([r.y for r in parts]),
             n_sections=N,
             periods=periods,
             inputs=self.inputs,
@@ -105,7 +120,7 @@ class SectionData(eqx.Module):
         )
 
     def _repr_html_(self) -> str:
-        known = {
+        about = {
             "cycles": f"{self.cycles:.5g} of {self.n_sections} sections",
             "records": str(len(self.records)),
             "period": f"{self.period:.6g} s",
@@ -117,24 +132,42 @@ class SectionData(eqx.Module):
         phase = np.arange(self.n_sections) / self.n_sections
         cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
         drawn = [
-            picture(
-                [Curve(phase, own, "average cycle", color)], "phase (cycles)", with_unit(x, unit)
+            picture([Curve(phase, x, "average cycle", color)], "phase (cycles)", with_unit(*name))
+            for *name, x, color in zip(
+                self.signals[:4], self.units, cycles.T, itertools.cycle(COLORS), strict=False
             )
-            for x, unit, own, color in list(
-                zip(self.signals, self.units, cycles.T, itertools.cycle(COLORS), strict=False)
-            )[:_DRAWN]
         ]
-        return card("SectionData", "", facts(known), table(head, rows), *drawn)
+        return card("SectionData", "", facts(about), table(head, rows), *drawn)
 
     def __repr__(self) -> str:
-        u, y = self.rms()
-        values = zip(self.signals, (*u, *y), self.units, strict=True)
-        shown = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
+        values = zip(self.signals, np.concatenate(self.rms()), self.units, strict=True)
+        sizes = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
         struck = [f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k]
         spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
         return (
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
             f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
-            f"{shown}{spikes})"
+            f"{sizes}{spikes})"
         )
+
+
+def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
+    """Return frequencies in cycles per period, and power spectral densities of the inputs (Welch
+    1967) from windows of up to 16 cycles."""
+    records, N = uninterrupted_records(data), data.n_sections
+    length = N * max(1, min(16, max(len(r.u) for r in records) // (2 * N)))
+    f = np.fft.rfftfreq(length, 1 / N)
+    total, weight = np.zeros((len(f), len(data.inputs))), 0
+    for r in records:
+        if len(r.u) >= length:
+            _, power = signal.welch(r.u, N, nperseg=length, axis=0)
+            total, weight = total + len(r.u) * power, weight + len(r.u)
+    return f, total / max(weight, 1)
+
+
+def input_band(data: SectionData) -> list[float]:
+    """Return the frequency (cycles per period) above which an input has next to no power."""
+    f, power = input_spectrum(data)
+    strong = power > _LEAST_POWER * power.max(axis=0)
+    return [float(f[np.flatnonzero(s)[-1]]) if s.any() else 0.0 for s in strong.T]

@@ -1,4 +1,4 @@
-"""What a fit predicts that it was not fitted to, and the order that predicts best."""
+"""Fits that are tried on strides to which they were not fitted."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Denominator
 from ..identify.record_simulation import can_be_compared, simulate_record
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import SeriesFit, assemble, fit_series
+from ..identify.series.fit import SeriesFit, assemble, fit_records
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import PreparedRecords
@@ -19,86 +19,99 @@ from ..identify.validate import Validation, validate
 from .data import SectionData
 
 
-# Cycles to choose an order from, and to try it on. Doubled: both take twice as long, and weaker
-# multipliers are seen.
-CYCLES_LOOKED_AT = 1000
-# Cycles at the end of a record that tell anything beyond how they begin. Doubled: more records are
-# fitted, or held out, whole.
+# Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
+# multipliers are missed.
+_ENOUGH = 1000
+# Fewest cycles at the end of a record that are held out; shorter records are fitted, or held out,
+# whole. More: few records are split. Fewer: ends that say no more than their initial condition.
 _SHORTEST_END = 12
-# Relative difference of two misfits that are as good as equal. Doubled: smaller orders are chosen.
+# Relative difference of misfits that count as equal. Larger: orders are too small. Smaller: noise
+# decides.
 _AS_GOOD = 0.02
 
 
-@checked
-def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
-    """The number of multipliers that predicts best what it was not fitted to.
-
-    For each number a first, consistent estimate (total least squares) is made from all but what is
-    held out (see `hold_out`), and simulated on that. The smallest number counts whose misfit is
-    within 2 % of the best one. Of long recordings the first 1000 cycles are looked at.
-
-    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
-    """
-    early, late = _split(data, share)
-    parts = PreparedRecords(early)
-    rest = uninterrupted_records(late)
-    fits = []
-    for d in range(1, most + 1):
-        problem = OutputErrorProblem.from_data(parts, d, parts.n_sections, free_start=True)
-        c = total_least_squares(delayed_outputs(problem, d))
-        found = linearize(problem, c)
-        if (found.freedom <= 2 * d).any():
-            break
-        fit = assemble(problem, found, Denominator.of_unknown_accuracy(c))
-        long = [r for r in rest if can_be_compared(fit, r, free_start=True)]
-        if not long:
-            break
-        fits, rest = [*fits, fit], long
-    if not fits:
-        raise DefinitionError(
-            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
-            "sections: record more, or take fewer sections."
-        )
-    misfits = []
-    for fit in fits:
-        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in rest])
-        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
-    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
-
-
 class HeldOut(NamedTuple):
-    """A fit to the first part of each record, tried on the rest."""
+    """A fit to the first part of each record, tried on the last."""
 
     fit: SeriesFit
     validation: Validation
 
 
+class Split(NamedTuple):
+    """Records to be fitted, prepared once for all fits, and records that are held out."""
+
+    early: PreparedRecords
+    late: list[Record]
+
+    def best_order(self, most: int = 4) -> int:
+        """Choose an order; see `choose_order`."""
+        ends, fits = uninterrupted_records(self.late), []
+        N = self.early.n_sections
+        for d in range(1, most + 1):
+            problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
+            c = total_least_squares(delayed_outputs(problem, d))
+            solution = linearize(problem, c)
+            if (solution.freedom <= 2 * d).any():
+                break
+            fit = assemble(problem, solution, Denominator.of_unknown_accuracy(c))
+            long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
+            if not long:
+                break
+            fits, ends = [*fits, fit], long
+        if not fits:
+            raise DefinitionError(
+                f"{self.early.cycles} cycles are too few for one multiplier with {N} sections: "
+                "record more, or take fewer sections."
+            )
+        misfits = []
+        for fit in fits:
+            error = [simulate_record(fit, r, free_start=True) - r.y for r in ends]
+            square = np.nanmean(np.concatenate(error) ** 2, axis=0)
+            misfits.append(float(np.log(square).mean()) / 2)
+        return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+
+    def fit(self, order: int) -> HeldOut:
+        """Fit the early part and validate the fit on the late part."""
+        fit = fit_records(self.early, order, check=False)
+        return HeldOut(fit, validate(fit, self.late))
+
+
+@checked
+def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
+    """Return the number of multipliers that predicts best what it was not fitted to.
+
+    For each number a first, consistent estimate (total least squares) is made without the held-out
+    strides (see `hold_out`), which it then simulates. The result is the smallest number whose
+    misfit is within 2 % of the best. Of long recordings the first 1000 cycles are used.
+
+    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
+    """
+    return split(data, share).best_order(most)
+
+
 @checked
 def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> HeldOut:
-    """Fit all but the last `share` of every record, and simulate that.
+    """Fit all but the last `share` of every record, and validate the fit on that.
 
     Of records whose end would be shorter than twelve cycles, a `share` is held out whole. Of long
-    recordings the first 1000 cycles are looked at.
+    recordings the first 1000 cycles are used.
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
-    early, late = _split(data, share)
-    fit = fit_series(early, order, check=False)
-    return HeldOut(fit, validate(fit, late))
+    return split(data, share).fit(order)
 
 
-def _split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
-    enough = min(1.0, CYCLES_LOOKED_AT / data.cycles)
+def split(data: SectionData, share: float = 0.25) -> Split:
+    """Split the records into a part to be fitted, and a part to be held out."""
+    enough = min(1.0, _ENOUGH / data.cycles)
     ends = [round(len(r.u) * enough) for r in data.records]
     short = [k for k, n in enumerate(ends) if n * share < _SHORTEST_END * data.n_sections]
     every = round(1 / share)
-    whole = short[every - 1 :: every]
-    fitted_whole = short if whole or len(short) < len(ends) else []
+    held_out = short[every - 1 :: every]
+    fitted = short if held_out or len(short) < len(ends) else []
     early, late = [], []
     for k, (r, end) in enumerate(zip(data.records, ends, strict=True)):
-        cut = 0 if k in whole else end if k in fitted_whole else round(end * (1 - share))
-        if cut:
-            early.append(r.part(0, cut))
-        if cut < end:
-            late.append(r.part(cut, end))
-    return early, late
+        cut = 0 if k in held_out else end if k in fitted else round(end * (1 - share))
+        early += [r.part(0, cut)] if cut else []
+        late += [r.part(cut, end)] if cut < end else []
+    return Split(PreparedRecords(early), late)

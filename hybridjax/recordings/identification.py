@@ -9,29 +9,29 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import SeriesFit, fit_series
-from .advice import Advice, advise
+from ..identify.series.fit import SeriesFit, fit_records
+from ..identify.series.records import PreparedRecords
+from .advice import Advice, collect_advice
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
-from .drift import DriftCycles, without_drift
-from .held_out import HeldOut, choose_order, hold_out
+from .findings import Finding
+from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
-from .inspection.finding import Finding
-from .inspection.look import inspect, inspect_cycles, refuse
-from .phase.estimation import PhaseDefinition, estimate_phase, signals_of
-from .phase.winding import Phase
+from .inspection.inspect import inspect, inspect_cycles, refuse
+from .phase import Phase
+from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording
-from .sampling import section_data
+from .sampling import DriftCycles, section_data, without_drift
 from .smoothing import Bandwidth
 
 
 class Identification(eqx.Module):
-    """What was found in a recording, step by step.
+    """The results of `identify_recording`, step by step.
 
-    **Fields:** `recording`, without what `inspect` leaves out; `findings` of the inspection;
-    `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the first three
-    quarters, tried on the last; `responses` to pushes; `curve`, the phase response curve of events
-    alone under one input (else None); `advice`.
+    **Fields:** `recording`, without the samples that `inspect` leaves out; `findings` of the
+    inspection; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the
+    first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
+    curve of events alone under one input (else None); `advice`.
     """
 
     recording: Recording
@@ -65,19 +65,18 @@ def identify_recording(
     order: Order | None = None,
     n_sections: SectionCount | None = None,
     bandwidth: Bandwidth | None = None,
-    sampled: Literal["mean", "middle"] = "mean",
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
 ) -> Identification:
-    """From a recording to multipliers, transfer functions, impulse responses and what to think of
-    them. First it is inspected (`hj.recordings.inspect`).
+    """Identify multipliers, transfer functions and impulse responses from a recording, and list the
+    reasons to doubt them. The recording is inspected first (`hj.recordings.inspect`).
 
-    **Arguments:** as for `section_data`, of which `max_gap` keeps its default, and
+    **Arguments:** those of `section_data`, and
 
-    - `order`: the number of multipliers; None lets `choose_order` find it.
+    - `order`: the number of multipliers. Default: the result of `choose_order`.
     - `drift`: changes that take longer than so many cycles are no response to the inputs: they are
-      taken out of the outputs, and of the signals that define the phase, before the phase is found;
-      the fit allows for what is left.
+      removed from the outputs, and from the signals that define the phase, before the phase is
+      estimated; the fit allows for the rest. Default: None.
 
     **Raises:** `DefinitionError` for what the inspection refuses, and as `estimate_phase`,
     `section_data` and `fit_series`; `PrecisionError` in single precision.
@@ -89,50 +88,43 @@ def identify_recording(
     recording = inspection.recording
     say("phase")
     definition = None if isinstance(phase, Phase) else phase
-    found = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
+    phase = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
     if drift is not None:
-        moved = {outputs} if isinstance(outputs, str) else set(outputs)
-        moved |= set() if definition is None else signals_of(definition)
-        recording = without_drift(recording, found, sorted(moved), drift)
-        found = found if definition is None else estimate_phase(recording, definition)
+        drifting = set(outputs) | (set() if definition is None else signals_of(definition))
+        recording = without_drift(recording, phase, sorted(drifting), drift)
+        phase = phase if definition is None else estimate_phase(recording, definition)
     say("data at the sections")
     data = section_data(
         recording,
-        found,
+        phase,
         inputs=inputs,
         outputs=outputs,
         n_sections=n_sections,
         bandwidth=bandwidth,
-        sampled=sampled,
         timing=timing,
-        drift=drift,
     )
-    seen = inspect_cycles(recording, found, data)
-    refuse(seen)
-    findings = (*inspection.findings, *seen)
+    data = data if drift is None else data.with_drift(drift)
+    findings = (*inspection.findings, *inspect_cycles(recording, phase, data))
+    refuse(findings)
     say("order")
-    order = choose_order(data) if order is None else order
+    parts, records = split(data), PreparedRecords(data)
+    order = parts.best_order() if order is None else order
     say("fit to the first three quarters")
-    held = hold_out(data, order)
+    held = parts.fit(order)
     say("fit to all")
-    fit = fit_series(data, order, check=False)
-    curve = _curve(recording, found, data)
+    fit = fit_records(records, order, check=False)
+    curve = None
+    of_events = all(w.linear for parts in phase.stretches for w in parts)
+    if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
+        curve = phase_response(recording, phase, input=data.inputs[0])
     return Identification(
         recording=recording,
         findings=findings,
-        phase=found,
+        phase=phase,
         data=data,
         fit=fit,
         held_out=held,
         responses=impulse_responses(fit, data),
         curve=curve,
-        advice=advise(data, fit, held.validation, findings, curve),
+        advice=collect_advice(data, records, fit, held.validation, findings, curve),
     )
-
-
-def _curve(recording: Recording, phase: Phase, data: SectionData) -> PhaseResponse | None:
-    """Of events alone under one input."""
-    of_events = all(w.linear for parts in phase.stretches for w in parts)
-    if data.outputs != ("duration",) or len(data.inputs) != 1 or not of_events:
-        return None
-    return phase_response(recording, phase, input=data.inputs[0])

@@ -1,4 +1,4 @@
-"""Phase-dependent impulse responses: what a brief push at each phase does, and for how long."""
+"""Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
 
 from typing import Annotated, NamedTuple
 
@@ -13,20 +13,15 @@ from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit
-from .data import SectionData
-from .spectra import input_band
+from .data import WHOLE_BAND, SectionData, input_band
 
 
-# Of the Nyquist frequency: an input that reaches so far needs no smoothing of the push. Doubled: no
-# input does.
-_WHOLE_BAND = 0.9
 # Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
-# Doubled: pushes are twice as wide, and have no power at all beyond the band.
+# More: wide pushes. Fewer: power beyond the band.
 _SPECTRUM_REACH = 2.5
-# Standard deviations after which the push is cut off. Doubled: nothing changes but a part in 1000.
+# Standard deviations at which the push is cut off, where 1 % of its peak is left. More: time.
+# Fewer: the push has edges.
 _PUSH_REACH = 3
-# Cycles for which responses are followed unless the call says it. Doubled: for twice as long.
-_CYCLES = 3.0
 
 
 class ImpulseResponses(eqx.Module):
@@ -38,10 +33,10 @@ class ImpulseResponses(eqx.Module):
     **Fields:**
 
     - `values` (N, lags, ny, nu): `[m, r]` is the response r sections after section m, at which the
-      push acts, divided by its area: input times time.
+      push acts, divided by its area (input times time).
     - `errors`: their standard errors.
-    - `phase` (N,), of the push, and `lag` (lags,), since then, both in cycles.
-    - `width`: standard deviation of the push, in cycles; 0 for one that lasts for one section.
+    - `phase` (N,): phase of the push. `lag` (lags,): time since then. Both in cycles.
+    - `width`: standard deviation of the push, in cycles; 0 for a push that lasts for one section.
     - `period`, `inputs`, `outputs`.
     """
 
@@ -72,16 +67,16 @@ def impulse_responses(
     *,
     width: Positive | None = None,
 ) -> ImpulseResponses:
-    """The responses of a fit to a push at each phase, with standard errors.
+    """Return the responses of a fit to a push at each phase, with standard errors.
 
     **Arguments:**
 
-    - `fit` of the `data`, whose period gives the area of an input that is held for one section.
-    - `cycles`: how long responses are followed: by default three, or for wider pushes twice as long
-      as it takes until half of one has acted.
-    - `width`: standard deviation of the push (Gaussian), in cycles. By default so wide that it has
-      no frequencies beyond the band in which the inputs had power, since what the system
-      does with these cannot be known. 0: the push is held for one section.
+    - `fit`: fit to the `data`, whose period gives the area of an input held for one section.
+    - `cycles`: duration of the responses. Default: 3, or for wide pushes twice the time until half
+      of one has acted.
+    - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one
+      section. Default: so wide that the push has no frequencies beyond the band in which the inputs
+      had power, where the response of the system is unknown.
 
     **Raises:** `DefinitionError` if fit and data have different sections or names.
     """
@@ -89,9 +84,9 @@ def impulse_responses(
     N, R = fit.numerators.shape[:2]
     if width is None:
         edge = min(input_band(data))
-        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
+        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < WHOLE_BAND * N / 2 else 0.0
     if cycles is None:
-        cycles = max(_CYCLES, 2 * _PUSH_REACH * width)
+        cycles = max(3.0, 2 * _PUSH_REACH * width)
     lags = round(cycles * N) + 1
     if lags < 2:
         raise DefinitionError(f"`cycles` must hold one section or more, but is {cycles:g}.")
@@ -127,13 +122,13 @@ class _Responses(NamedTuple):
 
     h: Float[np.ndarray, "r N ny nu"]
     slope: Float[np.ndarray, "r d N ny nu"]
-    """Derivatives of h by each coefficient of the denominator."""
+    """Derivatives of h with respect to each coefficient of the denominator."""
     root: Float[np.ndarray, "r N ny nu k"]
-    """A square root of the covariance of h that comes from the numerators."""
+    """Square root of the covariance of h that comes from the numerators."""
 
 
 def _responses(fit: SeriesFit, longest: int) -> _Responses:
-    """Up to lag `longest`, which all three reach by the same recursion from cycle to cycle."""
+    """Continue the responses up to lag `longest` by the recursion from cycle to cycle."""
     N, R, ny, nu = fit.numerators.shape
     h = np.zeros((longest, N, ny, nu))
     h[:R] = fit.numerators.swapaxes(0, 1)
@@ -154,8 +149,8 @@ def _responses(fit: SeriesFit, longest: int) -> _Responses:
 def _pushed(
     x: Float[np.ndarray, "r ..."], weights: Float[np.ndarray, " k"], lags: int, lead: int
 ) -> Float[np.ndarray, "lags ..."]:
-    """The response to a push, from those to inputs of one section: the push begins some sections
-    before its middle, and ends as many later."""
+    """Return the response to a push from those to inputs of one section: the push begins some
+    sections before its middle, and ends as many later."""
     out, reach = np.zeros((lags, *x.shape[1:])), len(weights) // 2
     for k, weight in zip(range(-reach, reach + 1), weights, strict=True):
         first = max(0, k - lead)

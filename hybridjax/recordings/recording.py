@@ -1,6 +1,7 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -11,23 +12,15 @@ from .._core import limits
 from .._core.boundary.checked import checked
 from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import with_unit
-from ..errors import DefinitionError
+from ..errors import DefinitionError, HybridJaxError
 from ..orbits.crossing import Crossing
-from .headers import seconds, split_header, time_unit
-from .smoothing import Bandwidth, bridgeable, spline
-from .spikes import without_spikes
+from .formats.columns import seconds, split_header, time_unit
+from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
-# Times of crossings are known to the time between two samples divided by 2 to this. Doubled:
-# nothing changes, this is rounding.
-_BISECTIONS = 50
-
-
-# Times between samples are irregular if those at this part from either end differ by more than that
-# part of their median. Doubled: fewer recordings are said to be irregular.
-_TAIL, _IRREGULAR = 0.05, 0.1
-# What a notebook draws: samples, of so many signals. Doubled: twice the size, or time.
-_LOOKED_AT, _DRAWN = 600, 4
+# Relative difference of sampling steps (or rates) that is reported as irregular. Larger: jitter of
+# clocks passes unseen. Smaller: rounded time stamps are called irregular.
+_IRREGULAR = 0.1
 
 
 class Trial(eqx.Module):
@@ -35,13 +28,13 @@ class Trial(eqx.Module):
 
     **Fields**, on the host:
 
-    - `time` (n,): of the samples, strictly increasing, not necessarily regular.
+    - `time` (n,): times of the samples, strictly increasing, not necessarily regular.
     - `values` (n, k): the signals; NaN where a sample is missing.
     - `events`: times of events by name, ascending; none need lie on a sample.
-    - `name`: for messages and figures.
+    - `name`: name for messages and figures.
     """
 
-    time: Float[np.ndarray, " n"]
+    time: Series
     values: Float[np.ndarray, "n k"]
     events: dict[str, Float[np.ndarray, " _"]]
     name: str = eqx.field(static=True)
@@ -58,8 +51,8 @@ class Recording(eqx.Module):
     **Fields:**
 
     - `trials`: one or several `Trial`s with the same signals.
-    - `signals`: their names. `units`: a unit for each, "" where none was given.
-    - `notes`: what was assumed where files were read.
+    - `signals`: names of the signals. `units`: a unit for each, "" where none was given.
+    - `notes`: assumptions made while files were read.
     """
 
     trials: tuple[Trial, ...]
@@ -77,19 +70,19 @@ class Recording(eqx.Module):
         name: str = "trial",
         notes: Sequence[str] = (),
     ):
-        """A recording of one trial; `join` puts several together.
+        """Make a recording of one trial; `join` combines several.
 
         **Arguments:**
 
-        - `time` (n,): of the samples, in seconds; strictly increasing.
+        - `time` (n,): times of the samples, in seconds; strictly increasing.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing.
         - `events`: times of events by name, such as foot strikes.
-        - `units`: by name. `name`: of the trial. `notes`: what to tell readers of results.
+        - `units`: units by name. `name`: name of the trial. `notes`: remarks on the data.
 
         **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
-        backwards, and infinite values; it names the sample.
+        backwards, and infinite values, with the sample.
         """
-        where = f"trial '{name}'"
+        where, units = f"trial '{name}'", dict(units or {})
         time = _numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
@@ -111,29 +104,27 @@ class Recording(eqx.Module):
             raise DefinitionError(f"{where}: time is not a finite number at sample {bad}.")
         if (np.diff(time) <= 0).any():
             bad = int(np.argmax(np.diff(time) <= 0)) + 1
-            repeats = time[bad] == time[bad - 1]
-            how = "repeats" if repeats else "runs backwards"
-            remedy = "export it with more digits, or leave doubled samples out"
+            how, remedy = "runs backwards", "sort the samples, or make a trial of each part"
+            if time[bad] == time[bad - 1]:
+                how, remedy = "repeats", "export it with more digits, or leave doubled samples out"
             raise DefinitionError(
                 f"{where}: time {how} at sample {bad} ({time[bad - 1]:.10g}, then "
-                f"{time[bad]:.10g}); "
-                f"{remedy if repeats else 'sort the samples, or make a trial of each part'}."
+                f"{time[bad]:.10g}); {remedy}."
             )
-        found = {}
+        happened = {}
         for key, values in (events or {}).items():
             values = _numbers(where, key, values)
             if np.isinf(values).any():
                 raise DefinitionError(f"{where}: the event {key} has an infinite time.")
-            found[key] = np.sort(values[~np.isnan(values)])
-        unknown = set(units or {}) - set(columns)
-        if unknown:
+            happened[key] = np.sort(values[~np.isnan(values)])
+        if unknown := set(units) - set(columns):
             raise DefinitionError(
-                f"{where}: there is a unit for '{sorted(unknown)[0]}', but the signals are "
+                f"{where}: there is a unit for '{min(unknown)}', but the signals are "
                 f"{', '.join(columns)}."
             )
-        self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), found, name),)
+        self.trials = (Trial(time, np.stack(list(columns.values()), axis=1), happened, name),)
         self.signals = tuple(columns)
-        self.units = tuple((units or {}).get(key, "") for key in columns)
+        self.units = tuple(units.get(key, "") for key in columns)
         self.notes = tuple(notes)
 
     @classmethod
@@ -146,10 +137,10 @@ class Recording(eqx.Module):
         units: Mapping[str, str] | None = None,
         name: str = "trial",
     ) -> "Recording":
-        """A trial from a table with named columns: of pandas, polars, pyarrow, or a dictionary.
+        """Make a trial from a table with named columns (pandas, polars, pyarrow, a dictionary).
 
         **Arguments:** `time`: the column with the times; all others are signals. Units may stand in
-        the names, `time (ms)` and `force (N)`. The rest as for `Recording`.
+        the names, `time (ms)` and `force (N)`. The other arguments are those of `Recording`.
 
         **Raises:** `DefinitionError` if there is no such column, for an unknown unit of time, and
         as `Recording`.
@@ -166,14 +157,14 @@ class Recording(eqx.Module):
             )
         scale = seconds(f"trial '{name}'", time, time_unit(time))
         t = scale * _numbers(f"trial '{name}'", time, frame[time])
-        found = {key: split_header(key) for key in names if key != time}
-        signals = {plain: np.asarray(frame[key]) for key, (plain, _) in found.items()}
-        own = {plain: unit for plain, unit in found.values() if unit}
-        return cls(t, signals, events=events, units=own | dict(units or {}), name=name)
+        headers = {key: split_header(key) for key in names if key != time}
+        signals = {plain: np.asarray(frame[key]) for key, (plain, _) in headers.items()}
+        given = {plain: unit for plain, unit in headers.values() if unit} | dict(units or {})
+        return cls(t, signals, events=events, units=given, name=name)
 
     @staticmethod
     def join(recordings: Iterable["Recording"]) -> "Recording":
-        """All trials of several recordings, as one.
+        """Combine the trials of several recordings.
 
         **Raises:** `DefinitionError` if there is none, or signals or units differ.
         """
@@ -197,22 +188,22 @@ class Recording(eqx.Module):
                     )
             if order == sorted(order):
                 trials += other.trials
-                continue
-            trials += [eqx.tree_at(lambda t: t.values, t, t.values[:, order]) for t in other.trials]
+            else:
+                trials += [replace(t, values=t.values[:, order]) for t in other.trials]
         notes = tuple(dict.fromkeys(note for other in recordings for note in other.notes))
-        signals = dict(zip(first.signals, first.trials[0].values.T, strict=True))
+        signals = dict(zip(first.signals, trials[0].values.T, strict=True))
         units = dict(zip(first.signals, first.units, strict=True))
-        joined = Recording(first.trials[0].time, signals, units=units, notes=notes)
-        return eqx.tree_at(lambda r: r.trials, joined, tuple(trials))
+        return Recording(trials[0].time, signals, units=units, notes=notes).with_trials(trials)
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
-        """Signals that were recorded side by side, with times of their own, as one recording.
+        """Combine signals that were recorded side by side, each with times of its own.
 
-        All share one axis of time, on which each is missing (NaN) where it was not sampled: nothing
-        is interpolated. Trials of the same place belong together; times must count from one zero.
+        All share one time axis, on which a signal is missing (NaN) where it was not sampled:
+        nothing is interpolated. Trials of the same position belong together; their times must count
+        from the same zero.
 
-        **Raises:** `DefinitionError` if there is none, numbers of trials differ, a signal is there
+        **Raises:** `DefinitionError` if there is none, numbers of trials differ, a signal exists
         twice, or the common axis is too long.
         """
         recordings = list(recordings)
@@ -251,19 +242,20 @@ class Recording(eqx.Module):
         return Recording.join(joined)
 
     def mark(self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf) -> "Recording":
-        """The same with one more event: a signal crosses a level.
+        """Add an event: a signal crosses a level.
 
-        Jumps against the direction (an angle that begins anew) are no events, jumps along it are.
-        What crosses a level several times within a cycle, in noise, makes doubled events, which
-        `estimate_phase` leaves out. Crossings in gaps that are longer than three samples, and than
-        half a wavelength at the bandwidth, are not known, and make no events. Isolated spikes
+        Jumps against the direction (an angle that wraps) are no events, jumps along it are. A
+        signal that crosses the level several times within a cycle, in noise, makes doubled events,
+        which `estimate_phase` leaves out. Crossings in gaps that are longer than three samples, and
+        than half a wavelength at the bandwidth, are unknown, and make no events. Isolated spikes
         cross nothing (see `section_data`).
 
-        **Arguments:** `event`: its name. `crossing`: of a signal, by name. `bandwidth`: in Hz, of
-        the smoothing spline whose crossings are taken; by default it interpolates.
+        **Arguments:** `event`: its name. `crossing`: crossing of a signal, given by name.
+        `bandwidth`: bandwidth in Hz of the smoothing spline whose crossings are taken. Default:
+        infinite (the spline interpolates).
 
-        **Raises:** `DefinitionError` for a signal that is not there or never seen to cross the
-        level, and a crossing of a function or in charts, which recordings do not have.
+        **Raises:** `DefinitionError` for an unknown signal, one that never crosses the level, and a
+        crossing of a function or in charts, which recordings do not have.
         """
         signal, level = signal_of(crossing), float(crossing.value)
         column, trials = self.column(signal), []
@@ -279,16 +271,19 @@ class Recording(eqx.Module):
                     f"{crossing.direction}."
                 )
             low, high = t[at], t[at + 1]
-            for _ in range(_BISECTIONS):
+            for _ in range(50):  # bisections: to rounding
                 middle = (low + high) / 2
                 below = sign * (curve(middle) - level) < 0
                 low, high = np.where(below, middle, low), np.where(below, high, middle)
-            events = trial.events | {event: (low + high) / 2}
-            trials.append(Trial(trial.time, trial.values, events, trial.name))
+            trials.append(replace(trial, events=trial.events | {event: (low + high) / 2}))
+        return self.with_trials(trials)
+
+    def with_trials(self, trials: Iterable[Trial]) -> "Recording":
+        """Replace the trials."""
         return eqx.tree_at(lambda r: r.trials, self, tuple(trials))
 
     def column(self, name: str) -> int:
-        """The place of a signal.
+        """Return the column of a signal in `Trial.values`.
 
         **Raises:** `DefinitionError` if there is none of that name.
         """
@@ -299,32 +294,29 @@ class Recording(eqx.Module):
         return self.signals.index(name)
 
     def unit(self, name: str) -> str:
-        """The unit of a signal, "" where none was given."""
+        """Return the unit of a signal, "" where none was given."""
         return self.units[self.column(name)]
 
     def __repr__(self) -> str:
-        parts = []
+        names = ", ".join(map(with_unit, self.signals, self.units))
+        lines = [f"Recording({len(self.trials)} trials: {names})"]
         for t in self.trials:
             step = np.diff(t.time)
             middle = float(np.median(step))
-            low, high = np.quantile(step, [_TAIL, 1 - _TAIL])
+            low, high = np.quantile(step, [0.05, 0.95])
             how = "irregular; " if high - low > _IRREGULAR * middle else ""
             missing = int(np.isnan(t.values).any(axis=1).sum())
-            events = "".join(f", {len(v)} {k}" for k, v in t.events.items())
-            parts.append(
+            lines.append(
                 f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
                 f"{middle:.4g} s ({1 / middle:.4g} Hz; {how}longest {step.max():.4g} s)"
                 + (f", {missing} with gaps" if missing else "")
-                + events
+                + "".join(f", {len(at)} {name}" for name, at in t.events.items())
             )
-        pairs = zip(self.signals, self.units, strict=True)
-        names = ", ".join(f"{key} ({unit})" if unit else key for key, unit in pairs)
         rates = _rates(self.trials[0])
-        if len(rates) and max(rates) > (1 + _IRREGULAR) * min(rates):
-            own = (f"{key} {rate:.4g} Hz" for key, rate in zip(self.signals, rates, strict=True))
-            parts.append(f"  sampled at {', '.join(own)}")
-        parts += [f"  ({note})" for note in self.notes]
-        return f"Recording({len(self.trials)} trials: {names})\n" + "\n".join(parts)
+        if max(rates, default=0) > (1 + _IRREGULAR) * min(rates, default=0):
+            each = (f"{key} {rate:.4g} Hz" for key, rate in zip(self.signals, rates, strict=True))
+            lines.append(f"  sampled at {', '.join(each)}")
+        return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
 
     def _repr_html_(self) -> str:
         trials = [
@@ -332,18 +324,14 @@ class Recording(eqx.Module):
              ", ".join(f"{len(at)} {name}" for name, at in t.events.items()))
             for t in self.trials
         ]  # fmt: skip
-        first = self.trials[0]
-        signals = [
-            (name, unit, f"{rate:.4g} Hz")
-            for name, unit, rate in zip(self.signals, self.units, _rates(first), strict=True)
-        ]
-        k = slice(0, _LOOKED_AT)
-        drawn = []
-        for x, color, unit, values in zip(
-            self.signals[:_DRAWN], COLORS, self.units, first.values[k].T, strict=False
-        ):
-            there = np.isfinite(values)
-            curve = Curve(first.time[k][there], values[there], color=color)
+        first, drawn = self.trials[0], []
+        rates = (f"{rate:.4g} Hz" for rate in _rates(first))
+        signals = list(zip(self.signals, self.units, rates, strict=True))
+        for x, color, unit, values in list(
+            zip(self.signals, COLORS, self.units, first.values.T, strict=False)
+        )[:4]:
+            rows = np.flatnonzero(np.isfinite(values[:600]))
+            curve = Curve(first.time[rows], values[rows], color=color)
             drawn.append(picture([curve], "time (s)", with_unit(x, unit)))
         return card(
             "Recording",
@@ -356,17 +344,14 @@ class Recording(eqx.Module):
 
 
 def _rates(trial: Trial) -> list[float]:
-    """How often each signal was sampled, in Hz: by the median time between its samples; 0 where
-    there are none."""
-    rates = []
-    for values in trial.values.T:
-        step = np.diff(trial.time[np.isfinite(values)])
-        rates.append(1 / float(np.median(step)) if len(step) else 0.0)
-    return rates
+    """Return the sampling rate of each signal in Hz, from the median time between its samples; 0
+    without samples."""
+    steps = [np.diff(trial.time[np.isfinite(x)]) for x in trial.values.T]
+    return [1 / float(np.median(step)) if len(step) else 0.0 for step in steps]
 
 
 def signal_of(crossing: Crossing) -> str:
-    """The name of the signal that crosses a level.
+    """Return the name of the signal that crosses a level.
 
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
@@ -377,8 +362,29 @@ def signal_of(crossing: Crossing) -> str:
     return crossing.function
 
 
-def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
-    values = np.asarray(values)
+def check_events(
+    where: str,
+    name: str,
+    at: Series,
+    time: Float[np.ndarray, " m"],
+    margin: float = 0.0,
+    error: type[HybridJaxError] = DefinitionError,
+) -> None:
+    """**Raises:** `error` if all events lie further than `margin` outside of the recording."""
+    at = at[np.isfinite(at)]
+    if len(at) and not ((at >= time[0] - margin) & (at <= time[-1] + margin)).any():
+        raise error(
+            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording, "
+            f"which is from {time[0]:.6g} to {time[-1]:.6g} s: their times have another zero or "
+            "unit."
+        )
+
+
+def _numbers(where: str, name: str, values: Any) -> Series:
+    try:
+        values = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        values = np.empty((0, 0), object)
     if values.dtype.kind not in "fiub" or values.ndim != 1:
         raise DefinitionError(
             f"{where}: {name} must be real numbers on one axis, not {values.dtype} of shape "

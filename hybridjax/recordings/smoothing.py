@@ -1,32 +1,59 @@
-"""Splines through samples, smoothing ones with a stated bandwidth, and gaps between samples."""
+"""Splines through samples with a stated bandwidth, gaps between samples, and isolated spikes."""
 
 from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.linalg import solveh_banded
 
 from .._core.boundary.values import Number
 from ..errors import DefinitionError
 
 
+Series = Float[np.ndarray, " n"]
+"""Samples of one signal, or their times."""
 Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
 """In Hz; infinite: nothing is smoothed."""
 
-# Samples that a spline is drawn through, at least. Doubled: shorter stretches are left out.
+# Fewest samples of a spline. More: short stretches are left out. Fewer than 3: the band matrix is
+# empty.
 FEWEST = 5
-# Times between samples that are no gap yet: three, and rounding. Doubled: splines bridge gaps that
-# are twice as long where samples are scarce.
-_GAP_SAMPLES = 3.001
+# Longest spike in samples. Longer: short pulses are taken for spikes. Shorter: neighbors that are
+# hit together (where 1 % of the samples are hit) stay in.
+_LONGEST = 3
+# Number of neighboring samples with which a spike is compared. More: spikes where a signal is steep
+# are missed. Fewer: their median is a spike itself.
+_NEIGHBORHOOD = 9
+# Least height of a spike in ranges of the closest half of its neighbors, and in standard deviations
+# of the noise (or smallest steps of the signal). Larger: spikes stay in. Smaller: steep parts,
+# noise and rounding are left out.
+_RANGES, _NOISES = 3.0, 6.0
+# Spikes are isolated if there are at most `_CROWD` of them within `_NEAR` samples on either side.
+# More: ringing after an impact is taken for spikes. Fewer: independent spikes nearby stay in.
+_NEAR, _CROWD = 10, 6
+# Cubic prediction of a sample from two neighbors on either side.
+_PREDICTION = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
+# Transients within this many cycles and this factor in height are alike, and part of the motion if
+# they occur in half of the cycles. Larger: spikes that are near each other by chance stay in.
+# Smaller: impacts in a jittering rhythm are left out.
+_SAME_PHASE, _SAME_HEIGHT = 0.01, 3.0
+# How far a spike of an input lies beyond the middle 98 % of it, in half their range. Larger: spikes
+# stay in. Smaller: the perturbation itself is cut.
+_BEYOND_INPUT = 3.0
+# Fraction of an input's standard deviation that is noise from sample to sample, up to which it
+# counts as smooth. Larger: single samples of white inputs are taken for spikes. Smaller: spikes of
+# noisy inputs stay in.
+_SMOOTH_INPUT = 0.3
 
 
 class Spline(eqx.Module):
     """A natural cubic spline: its values and second derivatives at the knots."""
 
-    time: Float[np.ndarray, " n"]
-    values: Float[np.ndarray, " n"]
-    curvature: Float[np.ndarray, " n"]
+    time: Series
+    values: Series
+    curvature: Series
 
     def __call__(self, t: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
@@ -37,10 +64,8 @@ class Spline(eqx.Module):
         return line - before * after * bend / 6
 
 
-def spline(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], bandwidth: int | float
-) -> Spline:
-    r"""A natural cubic spline through samples; NaN are left out.
+def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
+    r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
     *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): the minimizer of
@@ -48,10 +73,10 @@ def spline(
     $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
     this is one half at b.
     """
-    seen = np.isfinite(values)
-    if seen.sum() < FEWEST:
-        raise DefinitionError(f"{int(seen.sum())} samples are too few for a spline.")
-    time, values = time[seen], values[seen]
+    finite = np.isfinite(values)
+    if finite.sum() < FEWEST:
+        raise DefinitionError(f"{int(finite.sum())} samples are too few for a spline.")
+    time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step
     weight = (2 * np.pi * bandwidth * step) ** -4.0
@@ -69,41 +94,34 @@ def spline(
     return Spline(time, smooth, np.pad(curvature, 1) / step**2)
 
 
-def bridgeable(
-    time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: int | float = 0.0
-) -> float:
-    """The longest time without a sample that a spline bridges: `longest`, but not less than three
-    samples."""
-    return max(longest, _GAP_SAMPLES * float(np.median(np.diff(time[seen]))))
+def bridgeable(time: Series, finite: Bool[np.ndarray, " n"], longest: int | float = 0.0) -> float:
+    """Return the longest gap that a spline bridges: `longest`, but not less than three samples."""
+    return max(longest, 3.001 * float(np.median(np.diff(time[finite]))))
 
 
 def gaps(
-    time: Float[np.ndarray, " n"], seen: Bool[np.ndarray, " n"], longest: int | float
+    time: Series, finite: Bool[np.ndarray, " n"], longest: int | float
 ) -> Float[np.ndarray, "g 2"]:
-    """First and last times of the stretches without a sample that are longer than `longest`: first
-    the time before all samples, which begins at -inf, last that after them."""
-    there = np.concatenate([[-np.inf], time[seen], [np.inf]])
-    wide = np.flatnonzero(np.diff(there) > longest)
-    return np.stack([there[wide], there[wide + 1]], axis=1)
+    """Return the intervals without samples that are longer than `longest`, from the one before all
+    samples, which starts at -inf, to the one after them."""
+    edges = np.concatenate([[-np.inf], time[finite], [np.inf]])
+    wide = np.flatnonzero(np.diff(edges) > longest)
+    return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
 
 def inside(
-    intervals: Float[np.ndarray, "g 2"],
-    start: Float[np.ndarray, " n"],
-    end: Float[np.ndarray, " n"],
+    intervals: Float[np.ndarray, "g 2"], start: Series, end: Series
 ) -> Bool[np.ndarray, " n"]:
-    """Which of the intervals from start to end touch any of the (disjoint, sorted) ones given."""
+    """Return which intervals from start to end touch any of the given ones (disjoint, sorted)."""
     before: Int[np.ndarray, " n"] = np.searchsorted(intervals[:, 0], end, side="left")
     over: Int[np.ndarray, " n"] = np.searchsorted(intervals[:, 1], start, side="right")
     return before > over
 
 
-def means(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m1"]
-) -> Float[np.ndarray, " m"]:
-    """Means of a signal between successive edges; it is linear between its samples."""
-    seen = np.isfinite(values)
-    time, values = time[seen], values[seen]
+def means(time: Series, values: Series, edges: Float[np.ndarray, " m1"]) -> Float[np.ndarray, " m"]:
+    """Return means of a signal between successive edges; it is linear between its samples."""
+    finite = np.isfinite(values)
+    time, values = time[finite], values[finite]
     area = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
     at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
     since = edges - time[at]
@@ -112,10 +130,79 @@ def means(
     return np.diff(whole) / np.diff(edges)
 
 
-def nearest(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], t: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, " m"]:
-    """The samples next to some times."""
-    seen = np.isfinite(values)
-    time, values = time[seen], values[seen]
-    return values[np.searchsorted((time[:-1] + time[1:]) / 2, t)]
+def without_spikes(values: Series) -> Series:
+    """Return a signal in which the samples of isolated spikes are missing (NaN)."""
+    return np.where(spike_heights(values) != 0, np.nan, values)
+
+
+def spike_heights(values: Series) -> Series:
+    r"""Return the signed height of each sample of an isolated spike, and zero elsewhere.
+
+    Spikes of up to three samples are what an opening (or closing) of a signal removes: the largest
+    of the least values of four successive samples (top hat: Serra, *Image Analysis and Mathematical
+    Morphology*, 1982). Steps, kinks and pulses of four samples or more pass. A candidate is a spike
+    if its distance from the median of its neighbors (Hampel 1974) exceeds three times the range of
+    the closest half of them, six standard deviations of the noise, and six of the smallest steps of
+    the signal, and if few others are nearby, as they are where a signal rings.
+
+    **Arguments:** `values`: the signal; NaN where a sample is missing.
+    """
+    heights = np.zeros(len(values))
+    finite = np.isfinite(values)
+    x = values[finite]
+    if len(x) <= _NEIGHBORHOOD:
+        return heights
+    top = x - ndimage.grey_opening(x, _LONGEST + 1)
+    bottom = ndimage.grey_closing(x, _LONGEST + 1) - x
+    off = x - ndimage.median_filter(x, _NEIGHBORHOOD)
+    out = np.sign(off) * np.minimum(np.abs(off), np.where(off > 0, top, bottom))
+    steps = np.abs(np.diff(x))
+    least = steps[steps > 0].min(initial=np.inf)
+    large = np.flatnonzero(np.abs(out) > _NOISES * max(noise_of(x), least))
+    half = _NEIGHBORHOOD // 2
+    first = np.clip(large - half, 0, len(x) - _NEIGHBORHOOD)
+    around = np.sort(x[first[:, None] + np.arange(_NEIGHBORHOOD)], axis=1)
+    closest_half = (around[:, half:] - around[:, : half + 1]).min(axis=1)
+    large = large[np.abs(out[large]) > _RANGES * closest_half]
+    near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(large, large - _NEAR)
+    large = large[near <= _CROWD]
+    heights[np.flatnonzero(finite)[large]] = out[large]
+    return heights
+
+
+def noise_of(x: Series) -> float:
+    """Return the standard deviation of what changes from sample to sample, without few spikes."""
+    missed = np.abs(np.convolve(x, _PREDICTION, "valid"))
+    normal = 0.6745  # median of the modulus of a standard normal variable
+    return float(np.median(missed)) / (normal * float(np.linalg.norm(_PREDICTION)))
+
+
+def recurring(
+    heights: Float[np.ndarray, " k"], phase: Float[np.ndarray, " k"], cycles: int | float
+) -> Bool[np.ndarray, " k"]:
+    """Return which spikes are transients of the motion: similar ones at this phase of most cycles.
+
+    **Arguments:** `phase` of each, in cycles, which increases from stretch to stretch. `cycles`:
+    number of cycles.
+    """
+    recurs = np.zeros(len(heights), bool)
+    for k in range(len(heights)):
+        ratio, away = heights / heights[k], phase - phase[k]
+        alike = (ratio > 1 / _SAME_HEIGHT) & (ratio < _SAME_HEIGHT)
+        alike &= np.abs((away + 0.5) % 1 - 0.5) < _SAME_PHASE
+        recurs[k] = len(np.unique(np.round(away[alike]))) > 0.5 * cycles
+    return recurs
+
+
+def input_spikes(values: Series) -> Series:
+    """Return `spike_heights` of an input, only where it is smooth otherwise and a spike lies far
+    beyond its usual range: the perturbation itself must stay."""
+    heights = spike_heights(values)
+    if not heights.any():
+        return heights
+    usual = values[np.isfinite(values) & (heights == 0)]
+    low, high = np.quantile(usual, [0.01, 0.99])
+    if high == low or noise_of(usual) > _SMOOTH_INPUT * usual.std():
+        return np.zeros(len(values))
+    beyond = np.abs(values - (low + high) / 2) > _BEYOND_INPUT * (high - low) / 2
+    return np.where(beyond, heights, 0.0)

@@ -1,40 +1,37 @@
-"""What every family of Poincaré sections gives (paper Secs. III and VI-B)."""
+"""The interface of a family of Poincaré sections (paper Secs. III and VI-B)."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Scalar, SectionCount
+from .._core.boundary.kinds import SectionCount
 from .._core.executor import Array, Definition
-from .._core.precision import real
-
-# Subclasses of `AbstractSections` meet these two, which other layers define.
 from .._core.text import fields
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..orbits.crossing import Crossing
-from ..systems.structure import Structure as Structure
+from ..systems.structure import Structure
 
 
-class CyclePoint(NamedTuple):
-    """A point of a limit cycle: what a family is told of the cycle on which it is placed."""
+class Orbit(NamedTuple):
+    """A limit cycle at M equal times in one period from its anchor, row 0."""
 
     period: Float[Array, ""]
-    chart: Int[Array, ""]
-    t: Float[Array, ""]
-    q: Float[Array, " d"]
-    """Its state, padded with zeros to the largest chart's dimension."""
-    velocity: Float[Array, " d"]
+    t: Float[Array, " M"]
+    chart: Int[Array, " M"]
+    q: Float[Array, "M d"]
+    """States, padded with zeros to the largest chart's dimension."""
+    velocity: Float[Array, "M d"]
     """The chart's field there, padded likewise."""
 
 
 @checked
 class BoundSections(eqx.Module):
-    """A family of N sections with its numbers filled in: section i ends a piece of flow at a time,
-    at the zero of a level function, or at an event."""
+    """A family of N sections, evaluated on a cycle: section i ends a piece of flow at a time, at
+    the zero of a level function, or at an event."""
 
     time: Float[Array, " N"]
     """Times of clock sections in one period; infinity for the others."""
@@ -50,29 +47,38 @@ class BoundSections(eqx.Module):
 
     @classmethod
     def at_levels(cls, levels: AbstractLevels, n_sections: SectionCount) -> "BoundSections":
-        """Sections where level functions fall through zero."""
+        """Sections at which level functions fall through zero."""
         never = jnp.full(n_sections, jnp.inf)
         return cls(never, jnp.full(n_sections, -1, jnp.int32), levels)
 
 
 class AbstractSections(Definition):
-    """A family of N Poincaré sections, in the order in which a limit cycle meets them.
+    """A family of N Poincaré sections, in the order in which a limit cycle crosses them.
 
     A family is a definition: it holds functions and numbers, and belongs to no cycle.
-    `place_sections` finds out where its sections lie on one. To add a family, subclass this and
-    give the fields and methods below; `ClockPhase` is the shortest example.
+    `place_sections` locates its sections on a cycle. To add a family, subclass this and define the
+    fields and methods below; `ClockPhase` is the shortest example, and `ArcLength` one that
+    depends on the whole orbit.
 
     **Fields of a subclass:**
 
-    - `label`: what data taken at these sections are labeled with, a class variable.
+    - `label`: the label of data taken at these sections, a class variable.
     - `n_sections`: the number N.
-    - `anchor`: where section 0 lies. A `Crossing`: at the point where the cycle crosses it, which
-      `bind` is then given. Anything else is the family's own business.
+    - `anchor`: the position of section 0. A `Crossing`: the point where the cycle crosses it, which
+      is then the first point of the `orbit`. Other values are used by `bind` only.
+    - `points`: the number M of points of the orbit that `bind` needs, a class variable. Default: 1.
 
-    **Methods of a subclass:** `check`, `bind` and `describe`.
+    **Methods of a subclass:**
+
+    - `check(structure)` raises `DefinitionError` if the family does not fit the system.
+    - `bind(structure, orbit)` returns `BoundSections`. The orbit has the fields `period`, `t` (M,),
+      `chart` (M,), `q` (M, d) and `velocity` (M, d), at M equal times in one period from the
+      anchor, or from any point of the cycle if `anchor` is no `Crossing`. JAX traces this method.
+    - `describe(i)` returns a name of section i for errors.
     """
 
     label: eqx.AbstractClassVar[str]
+    points: ClassVar[int] = 1
     n_sections: eqx.AbstractVar[int]
     anchor: eqx.AbstractVar[Crossing | Float[Array, ""] | None]
 
@@ -81,24 +87,12 @@ class AbstractSections(Definition):
         """**Raises:** `DefinitionError` if the family does not fit the system."""
 
     @abc.abstractmethod
-    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
-        """The sections on a cycle of which `point` is known: its anchor if `anchor` is a
-        `Crossing`, any point otherwise. It is traced by JAX."""
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
+        """The sections on a cycle."""
 
     @abc.abstractmethod
     def describe(self, i: int) -> str:
-        """Section i in a few words, for errors."""
+        """A name of section i for errors."""
 
     def __repr__(self):
         return fields(self)
-
-
-def as_anchor(x: Crossing | Scalar) -> Crossing | Array:
-    """A crossing as it is, a number as an array."""
-    return x if isinstance(x, Crossing) else real(x)
-
-
-def check_anchor(anchor: Crossing | Array | None, s: Structure) -> None:
-    """**Raises:** `DefinitionError` for a crossing that the system does not have."""
-    if isinstance(anchor, Crossing):
-        anchor.check(s)

@@ -1,6 +1,6 @@
-"""Sections one by one, and what else may stand for a family."""
+"""Families of sections: at equal times, equal arc lengths or equal angles, and one by one."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, ClassVar
 
 import equinox as eqx
@@ -9,25 +9,218 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Numbers, Scalar, SectionCount
+from .._core.boundary.kinds import Numbers, Scalar, SectionCount, SignalNames
 from .._core.boundary.values import Reals
 from .._core.precision import real
 from ..engine.target import AbstractLevels
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing, ListLevels
-from ..systems.structure import Structure
-from .abstract import (
-    AbstractSections,
-    BoundSections,
-    CyclePoint,
-    as_anchor,
-    check_anchor,
-)
+from ..systems.structure import Outputs, Structure
+from .abstract import AbstractSections, BoundSections, Orbit
+
+
+class _Anchored(AbstractSections):
+    """N sections, the first of which lies at an anchor."""
+
+    n_sections: eqx.AbstractVar[int]
+    anchor: eqx.AbstractVar[Crossing | Float[Array, ""]]
+
+    def check(self, s: Structure) -> None:
+        if isinstance(self.anchor, Crossing):
+            self.anchor.check(s)
+
+    def _first(self, at_crossing: Array, unit: Array | float = 1.0) -> Array:
+        """The phase of section 0: that of the orbit's first point at a crossing, or the anchor
+        itself, in some unit."""
+        return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
+
+    def describe(self, i: int) -> str:
+        return f"section {i} ({self.label} {i}/{self.n_sections} after section 0)"
+
+
+def _as_anchor(x: Crossing | Scalar) -> Crossing | Array:
+    return x if isinstance(x, Crossing) else real(x)
+
+
+@checked
+class ClockPhase(_Anchored):
+    """N equally spaced phases of time: the isochrons of a clocked system (paper Sec. VI-B).
+
+    On an autonomous cycle these are equal steps of time from section 0; time has no natural
+    origin there, so one multiplier is 1.
+
+    **Fields:** `n_sections`, the number N; `anchor`, the position of section 0: a `Crossing` on the
+    cycle, or a phase of the clock in periods. Default: 0.
+    """
+
+    label: ClassVar[str] = "isochron"
+    n_sections: int = eqx.field(static=True)
+    anchor: Crossing | Float[Array, ""]
+
+    def __init__(self, n_sections: SectionCount, anchor: Crossing | Scalar = 0.0):
+        self.n_sections, self.anchor = n_sections, _as_anchor(anchor)
+
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
+        first = self._first(orbit.t[0], orbit.period)
+        steps = jnp.arange(self.n_sections) * (orbit.period / self.n_sections)
+        return BoundSections.at_times(first + steps)
+
+    def describe(self, i: int) -> str:
+        return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
+
+
+@checked
+class ArcLength(_Anchored):
+    """N sections at times that cut the orbit into N pieces of equal arc length.
+
+    The arc length is that of the curve of some signals on the limit cycle, without the jumps of
+    events, by the trapezoidal rule at 128 times. Where the signals move fast, sections are dense.
+    As at those of a `ClockPhase`, one multiplier of an autonomous cycle is 1.
+
+    **Fields:**
+
+    - `n_sections`: the number N.
+    - `signals`: names of states or outputs that every chart defines.
+    - `scale`: one positive number for each signal, in its unit; lengths are of the signals divided
+      by them. Default: 1.
+    - `anchor`: a `Crossing` on the cycle at which section 0 lies.
+    """
+
+    label: ClassVar[str] = "arc length"
+    points: ClassVar[int] = 128
+    n_sections: int = eqx.field(static=True)
+    signals: tuple[str, ...] = eqx.field(static=True)
+    anchor: Crossing
+    scale: Float[Array, " n"]
+
+    def __init__(
+        self,
+        n_sections: SectionCount,
+        signals: SignalNames,
+        anchor: Crossing,
+        scale: Annotated[Numbers, Reals("n", sign="positive")] | None = None,
+    ):
+        self.n_sections, self.signals, self.anchor = n_sections, tuple(signals), anchor
+        self.scale = real([1.0] * len(self.signals) if scale is None else scale)
+        if self.scale.shape != (len(self.signals),):
+            raise DefinitionError(f"`scale` must have one number for each of {self.signals}.")
+
+    def check(self, s: Structure) -> None:
+        super().check(s)
+        for a in range(len(s.charts)):
+            s.resolve_outputs(self.signals).require(a)
+
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
+        signals = s.resolve_outputs(self.signals)
+        rates = jax.vmap(lambda *point: _along(s, signals, *point)[1])(*orbit[1:])
+        speed = jnp.linalg.norm(rates / self.scale, axis=1)
+        length = jnp.cumsum(jnp.append(0.0, (speed + jnp.roll(speed, -1)) / 2))
+        times = orbit.t[0] + orbit.period * jnp.linspace(0.0, 1.0, self.points + 1)
+        equal = length[-1] * jnp.arange(self.n_sections) / self.n_sections
+        return BoundSections.at_times(jnp.interp(equal, length, times))
+
+
+@checked
+class KinematicPhase(_Anchored):
+    """N equally spaced angles of (position - o_p) / s_p + i (velocity - o_v) / s_v (Sec. VI-B).
+
+    The sections follow the sense in which the cycle turns: if the angle decreases in time, section
+    i is at the angle of section 0 minus 2 pi i / N.
+
+    The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). At its
+    sections the two signals are functions of one number: as outputs they carry less information
+    than at those of a phase that goes from one `Crossing` to the next.
+
+    **Fields:**
+
+    - `n_sections`: the number N.
+    - `position`, `velocity`: names of states, outputs or recorded signals.
+    - `center` (o_p, o_v) and `scale` (s_p, s_v), in the units of the two. Default: the origin and 1
+      on a model; the middle of each signal's range and half its width in a recording.
+    - `anchor`: the position of section 0: a `Crossing` on the cycle, or an angle in radians. At 0
+      the velocity is that of the center, and the position is beyond it. Default: 0.
+    """
+
+    label: ClassVar[str] = "kinematic"
+    n_sections: int = eqx.field(static=True)
+    position: str = eqx.field(static=True)
+    velocity: str = eqx.field(static=True)
+    center: Float[Array, "2"] | None
+    scale: Float[Array, "2"] | None
+    anchor: Crossing | Float[Array, ""]
+
+    def __init__(
+        self,
+        n_sections: SectionCount,
+        position: str,
+        velocity: str,
+        center: Annotated[Numbers, Reals("2")] | None = None,
+        scale: Annotated[Numbers, Reals("2", sign="positive")] | None = None,
+        anchor: Crossing | Scalar = 0.0,
+    ):
+        self.n_sections, self.position, self.velocity = n_sections, position, velocity
+        self.center = None if center is None else real(center)
+        self.scale = None if scale is None else real(scale)
+        self.anchor = _as_anchor(anchor)
+
+    def check(self, s: Structure) -> None:
+        s.resolve_outputs((self.position, self.velocity))
+        super().check(s)
+
+    def _scaled(self, z: Float[Array, "2"]) -> Float[Array, "2"]:
+        """The coordinates (r_p, r_v) in the scaled plane."""
+        z = z if self.center is None else z - self.center
+        return z if self.scale is None else z / self.scale
+
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
+        signals = s.resolve_outputs((self.position, self.velocity))
+
+        def angle(a, t, q, u):
+            position, velocity = self._scaled(signals(a, t, q, u))
+            return jnp.arctan2(velocity, position)
+
+        phase, rate = _along(s, angle, *(x[0] for x in orbit[1:]))
+        sense = jax.lax.stop_gradient(jnp.sign(rate))
+        steps = 2 * jnp.pi * jnp.arange(self.n_sections) / self.n_sections
+        angles = self._first(phase) + sense * steps
+        across = sense * jnp.stack([jnp.sin(angles), -jnp.cos(angles)])
+        return BoundSections.at_levels(_AngleLevels(self, across), self.n_sections)
+
+    def describe(self, i: int) -> str:
+        return f"section {i} (kinematic phase {i}/{self.n_sections} after section 0)"
+
+
+def _along(s: Structure, function: Callable, t, chart, q, velocity) -> tuple[Array, Array]:
+    """A function (a, t, q, u) at a point of an orbit, and its rate along the orbit."""
+
+    def in_chart(a):
+        value = lambda t, q: function(a, t, q[: s.dims[a]], jnp.zeros(s.nu))  # noqa: E731
+        rates = jnp.where(jnp.arange(s.d) < s.dims[a], velocity, 0.0)
+        return jax.jvp(value, (t, q), (jnp.ones_like(t), rates))
+
+    return jax.lax.switch(chart, [lambda a=a: in_chart(a) for a in range(len(s.charts))])
+
+
+class _AngleLevels(AbstractLevels):
+    phase: KinematicPhase
+    across: Float[Array, "2 N"]
+    """Factors of (r_p, r_v) in the level: it falls in the sense in which the cycle turns."""
+
+    def _signals(self, s: Structure) -> Outputs:
+        return s.resolve_outputs((self.phase.position, self.phase.velocity))
+
+    def present(self, s, a):
+        return self._signals(s).defined(a)
+
+    def level(self, s, a, i, t, q):
+        position, velocity = self.phase._scaled(self._signals(s)(a, t, q, jnp.zeros(s.nu)))
+        across = self.across[:, i]
+        return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)
 
 
 @checked
 class SectionList(AbstractSections):
-    """Sections one by one, in the order in which the cycle meets them.
+    """Sections one by one, in the order in which the cycle crosses them.
 
     **Fields:** `items`: a list of `Crossing` and `AtEvent`.
     """
@@ -55,11 +248,11 @@ class SectionList(AbstractSections):
         for item in self.items:
             item.check(s)
 
-    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
+    def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         event = [s.transition_index(x.name) if isinstance(x, AtEvent) else -1 for x in self.items]
-        some = any(isinstance(x, Crossing) for x in self.items)
+        crossed = any(isinstance(x, Crossing) for x in self.items)
         never = jnp.full(self.n_sections, jnp.inf)
-        levels = ListLevels(self.items) if some else None
+        levels = ListLevels(self.items) if crossed else None
         return BoundSections(never, jnp.array(event, jnp.int32), levels)
 
     def describe(self, i: int) -> str:
@@ -75,125 +268,3 @@ def as_family(sections: FamilyLike) -> AbstractSections:
     if isinstance(sections, Crossing | AtEvent):
         return SectionList([sections])
     return sections if isinstance(sections, AbstractSections) else SectionList(sections)
-
-
-@checked
-class ClockPhase(AbstractSections):
-    """N equally spaced phases of time: the isochrons of a clocked system (paper Sec. VI-B).
-
-    On an autonomous cycle these are equal steps of time from section 0; time has no natural
-    origin there, so one multiplier is 1.
-
-    **Fields:** `n_sections`, the number N; `anchor`, where section 0 lies: a `Crossing` on the
-    cycle, or a phase of the clock in periods.
-    """
-
-    label: ClassVar[str] = "isochron"
-    n_sections: int = eqx.field(static=True)
-    anchor: Crossing | Float[Array, ""]
-
-    def __init__(self, n_sections: SectionCount, anchor: Crossing | Scalar = 0.0):
-        self.n_sections, self.anchor = n_sections, as_anchor(anchor)
-
-    def check(self, s: Structure) -> None:
-        check_anchor(self.anchor, s)
-
-    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
-        first = point.t if isinstance(self.anchor, Crossing) else self.anchor * point.period
-        return BoundSections.at_times(
-            first + jnp.arange(self.n_sections) * (point.period / self.n_sections)
-        )
-
-    def describe(self, i: int) -> str:
-        return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
-
-
-@checked
-class KinematicPhase(AbstractSections):
-    """N equally spaced angles of (position - o_p) / s_p + i (velocity - o_v) / s_v (Sec. VI-B).
-
-    The sections follow the sense in which the cycle turns: where the angle decreases in time,
-    section i is at the angle of section 0 minus 2 pi i / N.
-
-    The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). At its
-    sections the two signals are two sides of one number: as outputs they tell less than at those
-    of a phase that goes from one `Crossing` to the next.
-
-    **Fields:**
-
-    - `n_sections`: the number N.
-    - `position`, `velocity`: names of states, outputs or recorded signals.
-    - `center` (o_p, o_v) and `scale` (s_p, s_v), in the units of the two. By default the origin
-      and 1 on a model; the middle of each signal's range and half its width in a recording.
-    - `anchor`: where section 0 lies: a `Crossing` on the cycle, or an angle in radians. At 0 the
-      velocity is that of the center, and the position is beyond it.
-    """
-
-    label: ClassVar[str] = "kinematic"
-    n_sections: int = eqx.field(static=True)
-    position: str = eqx.field(static=True)
-    velocity: str = eqx.field(static=True)
-    center: Float[Array, "2"] | None
-    scale: Float[Array, "2"] | None
-    anchor: Crossing | Float[Array, ""]
-
-    def __init__(
-        self,
-        n_sections: SectionCount,
-        position: str,
-        velocity: str,
-        center: Annotated[Numbers, Reals("2")] | None = None,
-        scale: Annotated[Numbers, Reals("2", sign="positive")] | None = None,
-        anchor: Crossing | Scalar = 0.0,
-    ):
-        self.n_sections, self.position, self.velocity = n_sections, position, velocity
-        self.center = None if center is None else real(center)
-        self.scale = None if scale is None else real(scale)
-        self.anchor = as_anchor(anchor)
-
-    def check(self, s: Structure) -> None:
-        s.resolve_outputs((self.position, self.velocity))
-        check_anchor(self.anchor, s)
-
-    def plane(
-        self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
-    ) -> Float[Array, "2"]:
-        """The coordinates (r_p, r_v) of one state of chart a in the scaled plane."""
-        z = s.resolve_outputs((self.position, self.velocity))(a, t, q, jnp.zeros(s.nu))
-        z = z if self.center is None else z - self.center
-        return z if self.scale is None else z / self.scale
-
-    def bind(self, s: Structure, point: CyclePoint) -> BoundSections:
-        def angle_and_rate(a):
-            def angle(t, q):
-                position, velocity = self.plane(s, a, t, q[: s.dims[a]])
-                return jnp.arctan2(velocity, position)
-
-            velocity = jnp.where(jnp.arange(s.d) < s.dims[a], point.velocity, 0.0)
-            return jax.jvp(angle, (point.t, point.q), (jnp.ones_like(point.t), velocity))
-
-        charts = [lambda a=a: angle_and_rate(a) for a in range(len(s.charts))]
-        angle, rate = jax.lax.switch(point.chart, charts)
-        sense = jax.lax.stop_gradient(jnp.sign(rate))
-        first = angle if isinstance(self.anchor, Crossing) else self.anchor
-        steps = 2 * jnp.pi * jnp.arange(self.n_sections) / self.n_sections
-        angles = first + sense * steps
-        across = sense * jnp.stack([jnp.sin(angles), -jnp.cos(angles)])
-        return BoundSections.at_levels(_AngleLevels(self, across), self.n_sections)
-
-    def describe(self, i: int) -> str:
-        return f"section {i} (kinematic phase {i}/{self.n_sections} after section 0)"
-
-
-class _AngleLevels(AbstractLevels):
-    phase: KinematicPhase
-    across: Float[Array, "2 N"]
-    """What multiplies (r_p, r_v) in the level: it falls in the sense in which the cycle turns."""
-
-    def present(self, s, a):
-        return s.resolve_outputs((self.phase.position, self.phase.velocity)).defined(a)
-
-    def level(self, s, a, i, t, q):
-        position, velocity = self.phase.plane(s, a, t, q)
-        across = self.across[:, i]
-        return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)

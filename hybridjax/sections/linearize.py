@@ -19,7 +19,7 @@ from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..systems.output import Output, OutputNames
-from ..systems.structure import Outputs, Structure
+from ..systems.structure import Structure
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
 
@@ -32,26 +32,34 @@ def linearize(
     outputs: OutputNames | None = None,
     inputs: SignalNames | None = None,
 ) -> LDTP:
-    """The linear discrete-time periodic system between consecutive sections, eqs. (5) and (6).
+    """Linearize the flow between consecutive sections, eqs. (5) and (6).
 
-    A[n] and B[n] map deviations at section n, and the input held until section n+1, to deviations
-    at section n+1; exact, through all events in between, also where the interval's end depends
-    on the state. C[n] and D[n] give the outputs' deviations at section n.
+    A[n] (d', d) and B[n] (d', nu) map deviations at section n, and the input held until section
+    n+1, to deviations at section n+1: exactly, through all events in between, also if the
+    interval's end depends on the state. C[n] (ny, d) and D[n] (ny, nu) give the deviations of the
+    outputs at section n.
 
     The coordinates on a section are deviations of the chart's states; on a state-based section of
     a clocked system the time of crossing comes first. On a section given by a level function, the
-    coordinate that the flow changes fastest across it is left out. `ldtp.coordinates` names them.
+    coordinate is left out that changes fastest along the flow, relative to the level.
+    `ldtp.coordinates` lists them.
 
-    **Arguments:** `sections`, a family or `PlacedSections`; `outputs`, names or `Output`s, by
-    default all states that every chart defines; `inputs`, by default all.
+    **Arguments:**
+
+    - `sections`: a family or `PlacedSections`.
+    - `outputs`: names or `Output`s. Default: all states that every chart defines.
+    - `inputs`: names. Default: all.
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or an input that does not exist; `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
-    s, traced = placed.structure(), is_traced(placed)
-    z = s.resolve_outputs(_states_everywhere(s) if outputs is None else outputs)
-    for a in range(len(s.charts)) if traced else np.unique(placed.lanes.chart):
+    s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
+    if outputs is None:
+        states = s.state_names()
+        outputs = [x for x in states if all(s.state_function(x, a) is not None for a in charts)]
+    z = s.resolve_outputs(outputs)
+    for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
     names, columns = inputs_of(s, inputs)
     if traced or is_inside_program():
@@ -71,31 +79,24 @@ def linearize(
     )  # fmt: skip
 
 
-def _states_everywhere(s: Structure) -> list[str]:
-    """The states that every chart defines."""
-    charts = range(len(s.charts))
-    return [n for n in s.state_names() if all(s.state_function(n, a) is not None for a in charts)]
-
-
 def inputs_of(
-    s: Structure, inputs: tuple[str, ...] | None
+    s: Structure, inputs: SignalNames | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
-    """Names of inputs, all by default, and their indices."""
-    known = s.inputs
-    names = known if inputs is None else inputs
+    """Names of inputs (Default: all) and their indices."""
+    names = s.inputs if inputs is None else inputs
     for name in names:
-        if name not in known:
-            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
-    columns = np.array([known.index(n) for n in names], int)
-    return tuple(known[k] for k in columns), columns
+        if name not in s.inputs:
+            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(s.inputs)}.")
+    columns = np.array([s.inputs.index(n) for n in names], int)
+    return tuple(s.inputs[k] for k in columns), columns
 
 
 def _section_jacobians(
     placed: PlacedSections,
 ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
-    """A and B, padded; NaN where the flow failed.
+    """A and B, padded; NaN if the flow failed.
 
-    (On the host, the direction of an autonomous flow does not drown what contracts strongly.)
+    (On the host, the direction of an autonomous flow does not drown strong contraction.)
     """
     n = 1 + placed.lanes.q.shape[0]
     following, _, target = placed.onwards()
@@ -116,34 +117,28 @@ def _section_jacobians(
 def _output_jacobians(
     placed: PlacedSections, outputs: tuple[str | Output, ...]
 ) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
-    """C and D, padded."""
-    s, lanes, xp = placed.structure(), placed.lanes, namespace(placed.lanes.t)
-    z = s.resolve_outputs(outputs)
-    n, ny = 1 + s.d, len(outputs)
+    """C and D, padded: derivatives of the outputs with respect to (t, q, u), at u = 0."""
+    s, lanes, xp, N = placed.structure(), placed.lanes, namespace(placed.lanes.t), placed.n_sections
+    z, n, ny = s.resolve_outputs(outputs), 1 + s.d, len(outputs)
 
-    def work(a, here, out):
+    def work(a, mask, out):
         if not z.defined(a):
             return out
         d = s.dims[a]
-        J = _jacobians(s, a, z, only(here, lanes.t), only(here, lanes.q[:d]))
-        blank = xp.zeros((ny, s.d - d, placed.n_sections))
-        J = xp.concatenate([J[:, : 1 + d], blank, J[:, 1 + d :]], axis=1)
-        return xp.where(here, J, out)
+        t, q = only(mask, lanes.t), only(mask, lanes.q[:d])
 
-    everywhere = xp.ones(placed.n_sections, bool)
-    nothing = xp.zeros((ny, n + s.nu, placed.n_sections))
-    J = xp.moveaxis(for_each_chart(s, lanes.chart, everywhere, work, nothing), -1, 0)
+        def jacobian(t, q):
+            J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
+            t, q, u = J(t, q, jnp.zeros(s.nu))
+            return jnp.concatenate([t[:, None], q, u], axis=1)
+
+        if on_host(t):
+            J = kernels.outputs(s, a, tuple(z.items), t, q, np.zeros((s.nu, 1)))[:, 1:]
+        else:
+            J = by_lane(jacobian)(t, q)
+        J = xp.concatenate([J[:, : 1 + d], xp.zeros((ny, s.d - d, N)), J[:, 1 + d :]], axis=1)
+        return xp.where(mask, J, out)
+
+    zeros = xp.zeros((ny, n + s.nu, N))
+    J = xp.moveaxis(for_each_chart(s, lanes.chart, xp.ones(N, bool), work, zeros), -1, 0)
     return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]
-
-
-def _jacobians(s: Structure, a: int, z: Outputs, t, q) -> Float[Array, "ny m N"]:
-    """Derivatives of outputs in chart a by (t, q, u), at u = 0."""
-    if on_host(t):
-        return kernels.outputs(s, a, tuple(z.items), t, q, np.zeros((s.nu, 1)))[:, 1:]
-
-    def jacobian(t, q):
-        J = jax.jacfwd(lambda t, q, u: z(a, t, q, u), argnums=(0, 1, 2))
-        t, q, u = J(t, q, jnp.zeros(s.nu))
-        return jnp.concatenate([t[:, None], q, u], axis=1)
-
-    return by_lane(jacobian)(t, q)

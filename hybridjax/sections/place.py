@@ -1,4 +1,4 @@
-"""Where the sections of a family lie on a limit cycle."""
+"""The position of the sections of a family on a limit cycle: located, and checked."""
 
 import collections
 import dataclasses
@@ -20,56 +20,65 @@ from ..engine import kernels
 from ..engine.cubic import interpolate
 from ..engine.lanes import Lanes, for_each_chart, only
 from ..engine.move import record
-from ..engine.search.search import Moved
 from ..engine.tape import IDLE, Tape
-from ..engine.target import AbstractLevels, Target
+from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
-from ..orbits.crossing import Crossing, ListLevels
+from ..orbits.crossing import Crossing, to_section
 from ..orbits.cycle import LimitCycle
 from ..systems.structure import Structure
-from .abstract import AbstractSections, BoundSections, CyclePoint
+from ..systems.system import HybridSystem
+from .abstract import AbstractSections, BoundSections, Orbit
 from .families import FamilyLike, as_family
 from .placed import PlacedSections, SectionsLike
 
 
-# Steps that the flow from one section to the next may take, unless the cycle's settings allow more.
-# Doubled: cycles with more events between two sections are placed; nothing else changes.
+# Least bound on the steps of the flow from one section to the next. Smaller: cycles with many
+# events between two sections fail. Larger: failures last longer.
 PATIENCE = 1024
-# The flow to a section gives up after so many periods. Doubled: a section that is missed is noticed
-# later.
+# Periods after which the flow to a section gives up. Less than 1: sections are missed. Larger: a
+# section that does not exist takes longer to notice.
 _LONGEST_WAY = 1.5
-# Rounding of the clock's phase, in periods: a clock section that lies this close before the anchor
-# is on it. Doubled: so is one twice as far.
-_SAME_PHASE = 1e-9
+# Rounding errors of the clock's phase, and the least distance of two sections, in periods. Smaller:
+# rounding moves a section into the next period. Larger: sections that are distinct are rejected.
+_SAME = 1e-9
+# Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
+# crossings that are close are missed. More: the check takes longer.
+_PARTS_OF_A_STEP = 16
+# A section is tangent to the cycle if its level changes there at less than this fraction of its
+# fastest rate on the cycle. Smaller: crossings that are lost by a perturbation are accepted.
+# Larger: sections at a small angle are rejected.
+_LEAST_STEEPNESS = 1e-4
+# Part of the period by which the durations between sections may miss one period. Smaller: errors
+# of the flow do. Larger than the shortest duration: a section that is crossed twice is missed.
+_ROUND = 1e-6
 
-# Sections that were placed last, since the same family on the same cycle is asked for again and
-# again (by `linearize`, then by `run_experiments`). Twice as many: twice the memory.
+# The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
 _recent: collections.deque[PlacedSections] = collections.deque(maxlen=4)
 
 
 @checked
 def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
-    """Find a family's sections on a cycle, and check them.
+    """Locate a family's sections on a cycle, and check them.
 
-    **Arguments:** `sections`, a family (`ClockPhase`, `KinematicPhase`, `SectionList`), or a list
-    of `Crossing` and `AtEvent`. The way from each section to the next may take as many steps as the
-    cycle's `settings` allow, and 1024 at least.
+    **Arguments:** `sections`, a family (`ClockPhase`, `ArcLength`, `KinematicPhase`,
+    `SectionList`), or a list of `Crossing` and `AtEvent`. The flow from each section to the next
+    may take as many steps as the cycle's `settings` allow, and at least 1024.
 
     **Raises:** `DefinitionError` for a family that does not fit the system; `ComputationError` that
     names the first section that the cycle does not cross, crosses more than once, touches
-    tangentially, or meets out of order.
+    tangentially, or crosses out of order.
     """
     family = as_family(sections)
     require_x64(cycle, family)
-    for known in list(_recent):
-        if known.cycle is cycle and known.family is family:
-            return known
-    family.check(Structure(cycle.system))
+    for placed in list(_recent):
+        if placed.cycle is cycle and placed.family is family:
+            return placed
+    family.check(cycle.structure)
     placed, first = _place(cycle, family)
     if not is_traced((cycle, family)):
-        refuse_unsound(placed, int(first))
-        # The program has made copies of what it was given.
+        _check(placed, int(first))
+        # The program has copied its arguments.
         placed = dataclasses.replace(placed, cycle=cycle, family=family)
         _recent.append(placed)
     return placed
@@ -84,13 +93,12 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     if not isinstance(sections, PlacedSections):
         return place_sections(cycle, sections)
     require_x64(cycle)
-    other = sections.cycle
-    if other is cycle:
+    if sections.cycle is cycle:
         return sections
-    mine, theirs = ((c.system, c.anchor, c.period) for c in (cycle, other))
-    if is_traced((mine, theirs)):
+    both = [(c.system, c.anchor, c.period) for c in (cycle, sections.cycle)]
+    if is_traced(both):
         return place_sections(cycle, sections.family)
-    if not eqx.tree_equal(*jax.device_get((mine, theirs))):
+    if not eqx.tree_equal(*jax.device_get(both)):
         raise DefinitionError(
             "these sections were placed on another cycle: pass the family itself, e.g. "
             "`placed.family`, and it is placed on this one."
@@ -98,29 +106,70 @@ def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
     return sections
 
 
+class _Arrivals(NamedTuple):
+    """Arrivals at N sections, one after the other, and the recorded steps to each."""
+
+    lanes: Lanes
+    result: Int[Array, "N 1"]
+    tape: Tape
+
+
 @host_first
 def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections, Int[Array, ""]]:
-    """The sections on the cycle, and the `Result` of the way to section 0."""
-    s, xp, N = Structure(cycle.system), namespace(cycle.period), family.n_sections
-    first, visits, bound = _visit(s, cycle, family)
-    # From an axis of visits and one of a single lane to one of lanes.
-    visits = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), visits)
+    """The sections on the cycle, and the `Result` of the flow to section 0, which lies at the
+    anchor if that is a crossing."""
+    s, xp = Structure(cycle.system), namespace(cycle.period)
+    N, period = family.n_sections, cycle.period
+    settings = dataclasses.replace(
+        cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
+    )
+
+    def go(lanes, h, result, target):
+        u = xp.zeros((s.nu, 1))
+        return record(s, lanes, u, target, settings, h, result, tangents=True)
+
+    def to(lanes, h, result, time, i, event, levels):
+        ends = time[None], i[None], event[None], lanes.t + _LONGEST_WAY * period
+        return go(lanes, h, result, Target(*ends, None, levels, Result.SECTION_MISSED))
+
+    begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
+    zero = xp.zeros(1, xp.int32)[0]
+    if isinstance(family.anchor, Crossing):
+        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + _LONGEST_WAY * period)
+        first, _ = go(*begin, to_section(target, family.anchor))
+        bound = _bind(s, cycle, family, first.lanes, go)
+    else:
+        bound = _bind(s, cycle, family, cycle.anchor, go)
+        first, _ = to(*begin, bound.time[0], zero, bound.event[0], bound.levels)
+
+    def next_section(carry, k):
+        i = k % N
+        time = bound.time[i] + (k // N) * period
+        lanes, h, result = carry
+        moved, tape = to(lanes, h, result, time, i, bound.event[i], bound.levels)
+        assert tape is not None
+        return (moved.lanes, moved.h, moved.result), _Arrivals(moved.lanes, moved.result, tape)
+
+    carry = first.lanes, first.h, first.result
+    _, arrivals = scan(next_section, carry, xp.arange(1, N + 1))
+    # From an axis of sections and one of a single lane to one of lanes.
+    arrivals = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), arrivals)
     lanes = jax.tree_util.tree_map(
-        lambda x, y: xp.concatenate([x, y[..., :-1]], axis=-1), first.lanes, visits.lanes
+        lambda x, y: xp.concatenate([x, y[..., :-1]], axis=-1), first.lanes, arrivals.lanes
     )
     normal = _normals(s, bound, lanes)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
     share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
     flat = xp.max(share, axis=0) == 0
-    with_time = xp.isinf(bound.time) & (cycle.system.period() is not None)
+    with_time = xp.isinf(bound.time) & cycle.clocked
     placed = PlacedSections(
         cycle=cycle,
         family=family,
         bound=bound,
         lanes=lanes,
-        tape=visits.tape,
-        duration=visits.lanes.t - lanes.t,
-        result=visits.result,
+        tape=arrivals.tape,
+        duration=arrivals.lanes.t - lanes.t,
+        result=arrivals.result,
         drop=xp.where(flat, -1, xp.argmax(share, axis=0)),
         dims=xp.asarray(s.dims)[lanes.chart] + with_time - ~flat,
         normal=normal,
@@ -128,71 +177,36 @@ def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections,
     return placed, first.result[0]
 
 
-class _Visits(NamedTuple):
-    """Arrivals at N sections, one after the other, with the way to each."""
-
-    lanes: Lanes
-    result: Int[Array, "N 1"]
-    tape: Tape
-
-
-def _visit(
-    s: Structure, cycle: LimitCycle, family: AbstractSections
-) -> tuple[Moved, _Visits, BoundSections]:
-    """Flow to section 0, which lies at the anchor if that is a crossing; and from there to each of
-    the others, and back to section 0."""
-    N, period, xp = family.n_sections, cycle.period, namespace(cycle.period)
-    patience = max(cycle.settings.max_steps, PATIENCE)
-    settings = dataclasses.replace(cycle.settings, max_steps=patience)
-    u = xp.zeros((s.nu, 1))
-
-    def go(lanes, h, result, time, index, event, levels):
-        limit = lanes.t + _LONGEST_WAY * period
-        target = Target(
-            time[None], index[None], event[None], limit, None, levels, Result.SECTION_MISSED
-        )
-        return record(s, lanes, u, target, settings, h, result, tangents=True)
-
-    begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
-    zero = xp.zeros(1, xp.int32)[0]
-    if isinstance(family.anchor, Crossing):
-        never = xp.full_like(period, np.inf)
-        first, _ = go(*begin, never, zero, zero - 1, ListLevels((family.anchor,)))
-        bound = _bind(s, cycle, family, first.lanes)
-    else:
-        bound = _bind(s, cycle, family, cycle.anchor)
-        first, _ = go(*begin, bound.time[0], zero, bound.event[0], bound.levels)
-
-    def step(carry, k):
-        i = k % N
-        time = bound.time[i] + (k // N) * period
-        moved, tape = go(*carry, time, i, bound.event[i], bound.levels)
-        return (moved.lanes, moved.h, moved.result), _Visits(moved.lanes, moved.result, tape)
-
-    _, visits = scan(step, (first.lanes, first.h, first.result), xp.arange(1, N + 1))
-    return first, visits, bound
-
-
 def _bind(
-    s: Structure, cycle: LimitCycle, family: AbstractSections, anchor: Lanes
+    s: Structure, cycle: LimitCycle, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
-    """The family with its numbers filled in; clock sections in the period that begins at the
-    anchor."""
-    period, t, xp = cycle.period, anchor.t[0], namespace(cycle.period)
-    f = slopes(s, anchor.t, anchor.chart, anchor.q, xp.zeros((s.nu, 1)))
-    point = CyclePoint(period, anchor.chart[0], t, anchor.q[:, 0], f[:, 0])
+    """The family evaluated on the cycle; clock sections in the period that begins at the anchor."""
+    period, t, xp, M = cycle.period, anchor.t[0], namespace(cycle.period), family.points
+
+    def later(carry, k):
+        moved, _ = go(*carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
+        return (moved.lanes, moved.h, moved.result), moved.lanes
+
+    lanes = anchor
+    if M > 1:
+        carry = anchor, (0.1 * period / M)[None], xp.zeros(1, xp.int32)
+        _, points = scan(later, carry, xp.arange(1, M))
+        points = jax.tree_util.tree_map(lambda x: xp.moveaxis(x[..., 0], 0, -1), points)
+        lanes = jax.tree_util.tree_map(lambda *x: xp.concatenate(x, axis=-1), anchor, points)
+    f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, M)))
+    orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T, f.T)
     if on_host(period):
-        bound = to_host(_bind_program(cycle.system, family, point))
+        bound = to_host(_bind_program(cycle.system, family, orbit))
     else:
-        bound = family.bind(s, point)
-    late = xp.ceil((t - bound.time[0]) / period - _SAME_PHASE)
+        bound = family.bind(s, orbit)
+    late = xp.ceil((t - bound.time[0]) / period - _SAME)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
 
 
 @quick_jit
-def _bind_program(system, family, point):
-    return family.bind(Structure(system), point)
+def _bind_program(system: HybridSystem, family: AbstractSections, orbit: Orbit) -> BoundSections:
+    return family.bind(Structure(system), orbit)
 
 
 def _normals(s: Structure, bound: BoundSections, lanes: Lanes) -> Float[Array, "N n"]:
@@ -203,11 +217,11 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes) -> Float[Array, "
         return out.T
     state_based = xp.isinf(bound.time) & (bound.event < 0)
 
-    def work(a, here, out):
+    def work(a, mask, out):
         n = s.dims[a]
-        point = only(here, xp.arange(N)), only(here, lanes.t), only(here, lanes.q[:n])
-        own = put(out, slice(1 + n), _level_gradients(s, a, levels, *point))
-        return xp.where(here, own, out) if levels.present(s, a) else out
+        point = only(mask, xp.arange(N)), only(mask, lanes.t), only(mask, lanes.q[:n])
+        gradients = put(out, slice(1 + n), _level_gradients(s, a, levels, *point))
+        return xp.where(mask, gradients, out) if levels.present(s, a) else out
 
     return for_each_chart(s, lanes.chart, state_based, work, out).T
 
@@ -225,142 +239,110 @@ def _level_gradients(s: Structure, a: int, levels: AbstractLevels, i, t, q) -> F
     return by_lane(gradient)(i, t, q)
 
 
-# None of these has a unit of the model's: all are numbers, or relative to the cycle itself.
-# Further crossings of a section are looked for in this many parts of every step that the flow took.
-# Doubled: two crossings half as far apart are still told apart, at twice the cost.
-_PARTS_OF_A_STEP = 16
-# A section is tangent to the cycle if its level changes there at less than this fraction of its
-# fastest rate on the cycle. Doubled: sections crossed at twice the angle are refused.
-_LEAST_STEEPNESS = 1e-4
-# The ways from section to section make one period, up to this fraction of it: less or more is a
-# section crossed twice, or out of order. Doubled: nothing changes, these are off by whole ways.
-_ROUND = 1e-6
-# Sections less than this fraction of a period apart are one. Doubled: so are those twice as far.
-_SAME = 1e-9
+def _check(placed: PlacedSections, first: int) -> None:
+    """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
+    or crossed twice."""
+    N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
+    again = "a section must be crossed once. Restrict it to a chart, or choose another phase."
 
+    def reason(code: int) -> str:
+        hint = " Give them to the search for the cycle, or place more sections."
+        return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
 
-def refuse_unsound(placed: PlacedSections, first: int) -> None:
-    """Raise for the first section that is missed, tangent, out of order, or crossed twice."""
-    N = placed.n_sections
-    describe = placed.family.describe
+    if first != Result.OK and isinstance(anchor, Crossing):
+        raise ComputationError(
+            f"the cycle has no point where {anchor} (the anchor of section 0): {reason(first)}"
+        )
     if first != Result.OK:
-        if isinstance(placed.family.anchor, Crossing):
-            raise ComputationError(
-                f"the cycle has no point where {placed.family.anchor} (the anchor of section 0): "
-                f"{_reason(first)}"
-            )
-        raise ComputationError(f"{describe(0)} is not reached on the cycle: {_reason(first)}")
-    for i, code in enumerate(np.asarray(placed.result)):
+        raise ComputationError(f"{name(0)} is not reached on the cycle: {reason(first)}")
+    for i, code in enumerate(np.asarray(placed.result).tolist()):
         if code != Result.OK:
-            hint = ""
-            if code == Result.SECTION_MISSED:
-                hint = " Does it lie on an event of the cycle? Then move it a little."
+            hint = " Does it lie on an event of the cycle? Then move it a little."
             raise ComputationError(
-                f"{describe((i + 1) % N)} is not reached from section {i} on the cycle: "
-                f"{_reason(int(code))}{hint}"
+                f"{name((i + 1) % N)} is not reached from section {i} on the cycle: "
+                f"{reason(code)}{hint if code == Result.SECTION_MISSED else ''}"
             )
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
         raise ComputationError(
-            f"{describe(int(moving[0]))} depends on time, which has no meaning on the cycle of an "
+            f"{name(int(moving[0]))} depends on time, which has no meaning on the cycle of an "
             "autonomous system: use a function of the state, or ClockPhase."
         )
     period, duration = float(placed.cycle.period), np.asarray(placed.duration)
-    total = float(duration.sum())
-    if total < (1 - _ROUND) * period:
-        raise ComputationError(
-            f"{describe(0)} is crossed more than once in one period; a section must be crossed "
-            "once. Restrict it to a chart, or choose another phase."
-        )
-    if total > (1 + _ROUND) * period:
+    rounds = float(duration.sum()) / period
+    if rounds < 1 - _ROUND:
+        raise ComputationError(f"{name(0)} is crossed more than once in one period; {again}")
+    if rounds > 1 + _ROUND:
         late = int(np.argmax(duration))
         raise ComputationError(
-            f"the sections are out of order: {describe((late + 1) % N)} comes before section "
-            f"{late} on the cycle, so that one round of all sections takes {total / period:.3g} "
-            "periods."
+            f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
+            f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
     short = int(np.argmin(duration))
     if duration[short] <= _SAME * period:
         raise ComputationError(
-            f"{describe((short + 1) % N)} coincides with section {short} on the cycle; sections "
+            f"{name((short + 1) % N)} coincides with section {short} on the cycle; sections "
             "must be distinct."
         )
-    counts, steepness = _crossings(placed)
-    for i in range(N):
-        if steepness[i] < _LEAST_STEEPNESS:
+    for i, (count, steepness) in enumerate(zip(*_crossings(placed), strict=True)):
+        if steepness < _LEAST_STEEPNESS:
             raise ComputationError(
-                f"{describe(i)} is tangent to the cycle: its level changes there at "
-                f"{steepness[i]:.1g} of its fastest rate. Choose another level."
+                f"{name(i)} is tangent to the cycle: its level changes there at "
+                f"{steepness:.1g} of its fastest rate. Choose another level."
             )
-        if counts[i] > 1:
-            raise ComputationError(
-                f"{describe(i)} is crossed {counts[i]} times in one period; a section must be "
-                "crossed once. Restrict it to a chart, or choose another phase."
-            )
-
-
-def _reason(code: int) -> str:
-    hint = " Give them to the search for the cycle, or place more sections."
-    return f"{Result(code).message}.{hint if code == Result.STEP_LIMIT else ''}"
+        if count > 1:
+            raise ComputationError(f"{name(i)} is crossed {count} times in one period; {again}")
 
 
 def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
-    """How often one period of the cycle crosses each section, and how steeply: the rate of a
+    """The number of crossings of each section in one period, and their steepness: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
-    event = np.asarray(placed.bound.event)
+    event, levels = np.asarray(placed.bound.event), placed.bound.levels
     counts = np.array([placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event])
     steepness = np.ones(placed.n_sections)
-    if placed.bound.levels is None:
+    if levels is None:
         return counts, steepness
     with at_ease():
-        more, fastest, rate = _levels_along(to_host(placed))
+        more, fastest, rate = _levels_along(to_host(placed), levels)
     state_based = np.isinf(np.asarray(placed.bound.time)) & (event < 0)
     counts = np.where(state_based, 1 + more, counts)
     np.divide(np.abs(rate), fastest, out=steepness, where=state_based)
     return counts, steepness
 
 
-def _levels_along(placed: PlacedSections):
-    """How often the cycle's steps cross each section (N,) but for where it lies, the fastest rate
-    of its level (N,), and the rate there (N,)."""
-    s, N, levels = placed.structure(), placed.n_sections, placed.bound.levels
-    t, chart, q, h, after, section = _steps(placed)
+def _levels_along(placed: PlacedSections, levels: AbstractLevels):
+    """The number of crossings of each section (N,) by the cycle's steps, besides its own, the
+    fastest rate of its level (N,), and the rate on the section (N,)."""
+    s, N, tape, lanes = placed.structure(), placed.n_sections, placed.tape, placed.lanes
     still = np.zeros((s.nu, 1))
-    f0, f1 = slopes(s, t, chart, q.T, still), slopes(s, t + h, chart, after.T, still)
+    # The steps of one period: start, length and end, and the section at their start or -1.
+    section, row = np.nonzero(tape.code.T != IDLE)
+    first = np.append(True, np.diff(section) > 0)
+
+    def start(at_section, ends):
+        before = np.concatenate([ends[:1], ends[:-1]])
+        return np.where(first.reshape(-1, *[1] * (ends.ndim - 1)), at_section[section], before)
+
+    end, after = tape.t[row, section], tape.before[row, :, section].T
+    t, chart = start(lanes.t, end), start(lanes.chart, tape.chart[row, section])
+    q, h = start(lanes.q.T, tape.after[row, :, section]).T, end - t
+    section = np.where(first, section, -1)
+    f0, f1 = slopes(s, t, chart, q, still), slopes(s, end, chart, after, still)
     x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
-    q = interpolate(x, h, q.T[:, None], after.T[:, None], f0[:, None], f1[:, None])
+    q = interpolate(x, h, q[:, None], after[:, None], f0[:, None], f1[:, None])
     t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)
     value, rate = np.ones((N, len(t))), np.zeros((N, len(t)))
     for a in np.unique(chart):
         if levels.present(s, int(a)):
-            here = np.flatnonzero(chart == a)
-            seen = kernels.levels(s, int(a), levels, N, t[here], q[: s.dims[a], here])
-            value[:, here], rate[:, here] = seen[:, 0], seen[:, 1]
+            rows = np.flatnonzero(chart == a)
+            both = kernels.levels(s, int(a), levels, N, t[rows], q[: s.dims[a], rows])
+            value[:, rows], rate[:, rows] = both[:, 0], both[:, 1]
     level = value.reshape(N, len(x), -1)
     falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (h > 0)
     # Around the section itself, rounding decides the signs.
-    own = np.arange(N)[:, None] == section
-    falls[:, 0] &= ~own
-    falls[:, -1] &= ~np.roll(own, -1, axis=1)
-    lanes = placed.lanes
+    itself = np.arange(N)[:, None] == section
+    falls[:, 0] &= ~itself
+    falls[:, -1] &= ~np.roll(itself, -1, axis=1)
     f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
-    there = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
-    return np.sum(falls, axis=(1, 2)), np.max(np.abs(rate), axis=1), there
-
-
-def _steps(placed: PlacedSections):
-    """The steps of one period: time, chart and state at their starts, length, state at their ends,
-    and the section they start from or -1."""
-    tape, lanes = placed.tape, placed.lanes
-    section, row = np.nonzero(tape.code.T != IDLE)
-    first = np.append(True, np.diff(section) > 0)
-
-    def start(own, rows):
-        before = np.concatenate([rows[:1], rows[:-1]])
-        return np.where(first.reshape(-1, *[1] * (rows.ndim - 1)), own[section], before)
-
-    end = tape.t[row, section]
-    t = start(lanes.t, end)
-    chart = start(lanes.chart, tape.chart[row, section])
-    q = start(lanes.q.T, tape.after[row, :, section])
-    return t, chart, q, end - t, tape.before[row, :, section], np.where(first, section, -1)
+    on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
+    return np.sum(falls, axis=(1, 2)), np.max(np.abs(rate), axis=1), on_section

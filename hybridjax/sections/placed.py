@@ -23,8 +23,8 @@ from .abstract import AbstractSections, BoundSections
 from .families import FamilyLike
 
 
-# A flow that does not arrive at its section gives up so many periods after the cycle itself would
-# have arrived. Doubled: failures are noticed later, at the cost of a longer flow.
+# Periods after the arrival of the cycle itself at which a flow to a section gives up. Smaller: late
+# arrivals are lost. Larger: failures take longer.
 _GRACE = 0.5
 
 
@@ -34,11 +34,11 @@ class PlacedSections(eqx.Module):
 
     **Fields:**
 
-    - `cycle`, `family`: what was placed where.
-    - `bound`: the family with its numbers filled in.
+    - `cycle`, `family`: the cycle, and the family that was placed on it.
+    - `bound`: the family evaluated on the cycle.
     - `lanes`: the cycle's state at each section (N lanes), in order, within one period from
         section 0.
-    - `tape`: the way from each section to the next, step by step.
+    - `tape`: the steps of the flow from each section to the next.
     - `duration` (N,): time from section i to the next.
     - `result` (N,): `Result` codes of the flow from section i to the next.
     - `drop` (N,): the coordinate of (t, states...) that is left out on section i, or -1.
@@ -71,35 +71,38 @@ class PlacedSections(eqx.Module):
         head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
-        placed = to_host(self)
-        names, charts = self.structure().names, placed.lanes.chart
-        inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
-        start = number(placed.lanes.t[0], unit=self.cycle.system.time_unit)
-        low, high = np.min(placed.dims), np.max(placed.dims)
-        dimension = f"{low}" if low == high else f"{low} to {high}"
-        return f"{head}: {', '.join(inside)}; dimension {dimension}; section 0 at t = {start})"
+        lines = self._facts()
+        low, high = lines["dimension"].split(" to ")
+        dimension = low if low == high else f"{low} to {high}"
+        start = lines["section 0 at t"]
+        return f"{head}: {lines['sections']}; dimension {dimension}; section 0 at t = {start})"
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        placed, names = to_host(self), self.structure().names
-        t, charts = placed.lanes.t, placed.lanes.chart
-        ways, unit = np.asarray(self.duration), self.cycle.system.time_unit
+        lanes = to_host(self.lanes)
+        drawn = orbit_picture(
+            self.structure(), self.cycle.trajectory(), (lanes.t, lanes.chart, lanes.q.T)
+        )
+        title = f"{self.n_sections} of a {type(self.family).__name__}"
+        return card("PlacedSections", title, facts(self._facts()), drawn)
+
+    def _facts(self) -> dict[str, str]:
+        names, unit = self.cycle.structure.names, self.cycle.system.time_unit
+        t, charts, *_ = to_host(self.lanes)
+        durations, dims = np.asarray(self.duration), np.asarray(self.dims)
         inside = (f"{np.sum(charts == a)} in {names[a]}" for a in dict.fromkeys(charts.tolist()))
-        known = {
+        return {
             "sections": ", ".join(inside),
-            "dimension": f"{np.min(placed.dims)} to {np.max(placed.dims)}",
+            "dimension": f"{np.min(dims)} to {np.max(dims)}",
             "section 0 at t": number(t[0], unit=unit),
-            "from one to the next": f"{np.min(ways):.4g} to {number(np.max(ways), 4, unit)}",
+            "from one to the next": (
+                f"{np.min(durations):.4g} to {number(np.max(durations), 4, unit)}"
+            ),
         }
-        drawn = orbit_picture(self.cycle.trajectory(), (t, charts, placed.lanes.q.T))
-        of = f"{self.n_sections} of a {type(self.family).__name__}"
-        return card("PlacedSections", of, facts(known), drawn)
 
     def structure(self) -> Structure:
-        """The system by the indices of its charts and transitions, made anew: where the sections
-        are constants of compiled functions, it holds values of one trace that mean nothing in the
-        next."""
+        """The system by the indices of its charts and transitions, made anew."""
         return Structure(self.cycle.system)
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
@@ -113,37 +116,46 @@ class PlacedSections(eqx.Module):
 
     @property
     def time_is_state(self) -> Bool[Array, " N"]:
-        """Whether the time of crossing is a coordinate: on state-based sections of a clocked
+        """True if the time of crossing is a coordinate: on state-based sections of a clocked
         system."""
         return namespace(self.bound.time).isinf(self.bound.time) & self.cycle.clocked
 
     def frames(self) -> tuple[Float[Array, "N n c"], Float[Array, "N c n"]]:
-        """Matrices from the coordinates on each section to deviations of (t, q), and back."""
-        return _frames(self.normal, self.drop, self.dims, self.time_is_state)
+        """Matrices from the coordinates on each section to deviations of (t, q), and back.
+
+        Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous
+        systems, and skipping `drop`. A move in coordinate j takes the dropped entry along the
+        section: -normal_k / normal_drop.
+        """
+        normal, drop = self.normal, self.drop[:, None]
+        xp, n, drops = namespace(normal), normal.shape[1], drop >= 0
+        k = np.arange(n)
+        kept = (k != drop) & ((k > 0) | self.time_is_state[:, None])
+        kept_first = xp.argsort(~kept, axis=1, stable=True)
+        # One column more than a chart has states is never needed: (t, q) less the dropped entry.
+        valid = k < self.dims[:, None]
+        select = xp.where(valid[:, :, None], xp.eye(n)[kept_first], 0.0)
+        slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
+        along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
+        return (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2), select
 
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
-        s = self.structure()
-        names = []
-        about = self.lanes.chart, self.drop, self.time_is_state
-        for a, drop, timed in np.stack(about, axis=1):
-            all_names = ("t", *s.charts[a].states)
-            keep = [k for k in range(len(all_names)) if k != drop]
-            names.append(tuple(all_names[k] for k in keep if k or timed))
+        charts, names = self.structure().charts, []
+        for a, drop, timed in np.stack([self.lanes.chart, self.drop, self.time_is_state], axis=1):
+            entries = enumerate(("t", *charts[a].states))
+            names.append(tuple(x for k, x in entries if k != drop and (k or timed)))
         return tuple(names)
 
     def target(
         self, i: Int[Array, " #L"], t: Float[Array, " L"], turns: Int[Array, " #L"]
     ) -> Target:
-        """The target of lanes that flow to section i, `turns` periods after the first turn.
-
-        Lanes that do not arrive give up in the end.
-        """
+        """The target of lanes that flow to section i, `turns` periods after the first turn."""
         return section_target(self.bound, self.lanes, self.cycle.period, i, t, turns)
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
-        """For each section, the one that follows, how many turns later, and the way to it."""
+        """The section after each, the turns until it, and the target on it."""
         xp = namespace(self.lanes.t)
         following = (xp.arange(self.n_sections) + 1) % self.n_sections
         turns = (following == 0).astype(np.int32)
@@ -158,17 +170,11 @@ def section_target(
     t: Float[Array, " L"],
     turns: Int[Array, " #L"],
 ) -> Target:
-    """See `PlacedSections.target`."""
+    """The target of lanes that flow to section i, `turns` periods after the first turn."""
     xp, arrival = namespace(t), lanes.t[i] + turns * period
-    return Target(
-        xp.broadcast_to(bound.time[i] + turns * period, t.shape),
-        i,
-        bound.event[i],
-        xp.maximum(arrival, t) + _GRACE * period,
-        None,
-        bound.levels,
-        Result.SECTION_MISSED,
-    )
+    time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
+    limit = xp.maximum(arrival, t) + _GRACE * period
+    return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
 
 
 SectionsLike = FamilyLike | PlacedSections
@@ -182,45 +188,19 @@ def _observe(placed: PlacedSections, outputs: tuple[str | Output, ...]) -> Float
     return observe(s, s.resolve_outputs(outputs), placed.lanes, u).T
 
 
-def _frames(
-    normal: Float[Array, "N n"],
-    drop: Int[Array, " N"],
-    dims: Int[Array, " N"],
-    with_time: Bool[Array, " N"],
-) -> tuple[Float[Array, "N n c"], Float[Array, "N c n"]]:
-    """From section coordinates to (t, q), and back.
-
-    Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous systems,
-    and skipping `drop`. A move in coordinate j takes the dropped entry along the section:
-    -normal_k / normal_drop.
-    """
-    xp, n = namespace(normal), normal.shape[1]
-    k, drop, drops = np.arange(n), drop[:, None], drop[:, None] >= 0
-    kept = (k != drop) & ((k > 0) | with_time[:, None])
-    kept_first = xp.argsort(~kept, axis=1, stable=True)
-    # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-    valid = k < dims[:, None]
-    select = xp.where(valid[:, :, None], xp.eye(n)[kept_first], 0.0)
-    slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
-    along = xp.where((k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0)
-    embed = (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2)
-    return embed, select
-
-
 def observe(
     s: Structure, z: Outputs, lanes: Lanes, u: Float[Array, "nu L"]
 ) -> Float[Array, "ny L"]:
-    """Outputs of every lane, NaN where its chart does not define them."""
-    L = lanes.t.shape[0]
+    """Outputs of every lane; NaN if its chart does not define them."""
+    xp, L = namespace(lanes.t), lanes.t.shape[0]
 
-    def work(a, here, out):
-        point = needed(here, [only(here, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
-        if on_host(here):
+    def work(a, mask, out):
+        point = needed(mask, [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)])
+        if on_host(mask):
             values = kernels.outputs(s, a, tuple(z.items), *point)[:, 0]
         else:
             values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
-        return xp.where(here, values, out)
+        return xp.where(mask, values, out)
 
-    xp = namespace(lanes.t)
-    nothing = xp.full((len(z.names), L), xp.nan)
-    return for_each_chart(s, lanes.chart, xp.ones(L, bool), work, nothing)
+    undefined = xp.full((len(z.names), L), xp.nan)
+    return for_each_chart(s, lanes.chart, xp.ones(L, bool), work, undefined)

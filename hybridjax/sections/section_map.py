@@ -3,6 +3,7 @@
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -21,8 +22,8 @@ from .placed import PlacedSections, SectionsLike
 
 
 class Arrival(NamedTuple):
-    """Where a section map arrives. Times and states are NaN if it does not, and so are their
-    derivatives."""
+    """The arrival of a section map. If it does not arrive, times, states and their derivatives are
+    NaN."""
 
     t: Float[Array, ""]
     """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""
@@ -36,10 +37,8 @@ class Arrival(NamedTuple):
 class SectionMap(eqx.Module):
     """P_{i->j}: from a state on section i, under a constant input, to section j.
 
-    Call it with `q` (n_i,), a state near section i of the cycle, `u` (nu,), zero by default, and
-    `t`, the time there (by default the cycle's). It returns an `Arrival` and can be
-    differentiated, jitted and vmapped. Made under a JAX transformation, where charts are not
-    known, it takes and returns states that are padded with zeros to the largest chart's dimension.
+    See `section_map`. Made under a JAX transformation, where charts are not known, it takes and
+    returns states that are padded with zeros to the largest chart's dimension.
 
     **Raises** (outside of JAX transformations): `ComputationError` if section j is not reached,
     or is reached in another chart than the cycle's.
@@ -75,10 +74,12 @@ class SectionMap(eqx.Module):
                 f"starts and states have the shape {self.dims[:1]}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)
-        u = np.zeros(nu) if u is None else u
-        if u.shape not in ((), (nu,)):
-            raise DefinitionError(f"`u` must be {nu} numbers, one for each input; got {u.shape}.")
-        arrival = _map(self, q, u, t)
+        held = np.zeros(nu) if u is None else u
+        if held.shape not in ((), (nu,)):
+            raise DefinitionError(
+                f"`u` must be {nu} numbers, one for each input; got {held.shape}."
+            )
+        arrival = _map(self, q, held, t)
         if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
             raise ComputationError(
                 f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
@@ -89,10 +90,16 @@ class SectionMap(eqx.Module):
 
 @checked
 def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -> SectionMap:
-    """The map P_{i->j} between two sections of a family on a cycle, for any i and j.
+    """Return the map P_{i->j} between two sections of a family on a cycle, for any i and j.
 
-    For i = j it is the Poincaré return map. **Raises:** `DefinitionError` for an index out of
-    range; `ComputationError` as `place_sections`.
+    For i = j it is the Poincaré return map. Call it with `q` (n_i,), a state near section i of the
+    cycle; `u` (nu,), a constant input, Default: 0; `t`, the time at section i, Default: that of the
+    cycle. The result has the time `t` and the state `q` (n_j,) at section j, can be differentiated,
+    jitted and vmapped, and raises `ComputationError` if section j is not reached, or is reached in
+    another chart than the cycle's. `fixed_point` is the cycle's state at section i, `dims` are
+    n_i and n_j.
+
+    **Raises:** `DefinitionError` for an index out of range; `ComputationError` as `place_sections`.
     """
     placed = as_placed(cycle, sections)
     for k in (i, j):
@@ -109,17 +116,12 @@ def section_map(cycle: LimitCycle, sections: SectionsLike, i: Index, j: Index) -
 def _map(map: SectionMap, q, u, t) -> Arrival:
     placed, i, j = map.placed, map.i, map.j
     s, xp, lanes = placed.structure(), namespace(q), placed.lanes
-    pick, u = slice(i, i + 1), xp.broadcast_to(u, len(placed.cycle.system.inputs))
     t = lanes.t[i] if t is None else t
     q = put(xp.zeros((s.d, 1)), (slice(len(q)), 0), q)
-    start = eqx.tree_at(
-        lambda x: (x.t, x.q, x.chart, x.armed, x.events, x.pace),
-        lanes,
-        (t[None], q, lanes.chart[pick], lanes.armed[:, pick], lanes.events[pick],
-         lanes.pace[:, pick]),
-    )  # fmt: skip
+    start = jax.tree_util.tree_map(lambda x: x[..., i : i + 1], lanes)._replace(t=t[None], q=q)
+    u = xp.broadcast_to(u, s.nu)[:, None]
     target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
-    moved = move(s, start, u[:, None], target, placed.cycle.settings)
+    moved = move(s, start, u, target, placed.cycle.settings)
     end = moved.lanes
     result = update_result(moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER)
     keep = xp.where(result == Result.OK, 1.0, xp.nan)  # a factor makes derivatives NaN, too

@@ -1,4 +1,4 @@
-"""What is rewritten in users' programs gives what it gave before.
+"""Rewritten programs of users' functions give what they gave before.
 
 To try an older or a newer JAX, install it and run this file alone:
 `python -m pytest -o addopts= tests/_core/test_rewrite.py`.
@@ -24,10 +24,6 @@ def plain(x, y):
     return jnp.stack([jnp.sin(x) * y**3, jnp.arctan2(y, x) + jnp.cos(x), jnp.exp(x) * x**-2])
 
 
-def several(x, y):
-    return {"sin": jnp.sin(x), "rest": (jnp.arcsin(y / 9), jnp.arctan(y) / jnp.arccos(x / 9))}
-
-
 @jax.jit
 def inner(x):
     return jnp.tan(x) + jax.jit(jnp.cos)(x)
@@ -37,25 +33,15 @@ def jitted(x, y):
     return inner(x) * inner(y) * inner(x)
 
 
-def branches(x, y):
-    return jax.lax.cond(x > y, lambda: jnp.sin(x), lambda: y * jnp.cos(x))
-
-
 def looped(x, y):
     z = jax.lax.fori_loop(0, 3, lambda _, z: jnp.sin(z) + y, x)
     return jax.lax.while_loop(lambda z: jnp.cos(z) > 2, lambda z: z + 1, z)
 
 
-def no_trigonometry(x, y):
-    return x * y + jnp.sqrt(y)
-
-
-FUNCTIONS = [plain, several, jitted, branches, looped, no_trigonometry]
+FUNCTIONS = [plain, jitted, looped]
 TRANSFORMATIONS = {
     "jit": lambda f: f,
-    "vmap": jax.vmap,
     "vmap of jit": lambda f: jax.vmap(jax.jit(f), in_axes=-1, out_axes=-1),
-    "jvp": lambda f: lambda x, y: jax.jvp(f, (x, y), (y, x)),
     "vmap of jvp": lambda f: jax.vmap(lambda x, y: jax.jvp(f, (x, y), (y, x))),
     "vjp": lambda f: jax.jacrev(f, (0, 1)),
     "second": lambda f: jax.vmap(jax.jacfwd(jax.jacrev(f, (0, 1)), (0, 1))),
@@ -63,20 +49,24 @@ TRANSFORMATIONS = {
 }
 
 
-@pytest.mark.parametrize("function", FUNCTIONS)
 @pytest.mark.parametrize("transformation", TRANSFORMATIONS)
-def test_vectorized_agrees_under_transformations(function, transformation):
-    if function is looped and transformation in ("vjp", "second", "checkpoint"):
-        pytest.skip("JAX does not reverse while_loop")
+def test_vectorized_agrees_under_transformations(transformation):
     transform = TRANSFORMATIONS[transformation]
+    reverse = transformation in ("vjp", "second", "checkpoint")
+    functions = [f for f in FUNCTIONS if not (reverse and f is looped)]  # JAX reverses no `while`
     x, y = jnp.array([0.3, 1.1, -2.0]), jnp.array([0.7, 2.0, 0.4])
     if "vmap" not in transformation and transformation != "second":
         x, y = x[0], y[0]
-    both = jax.jit(lambda *xs: [transform(f)(*xs) for f in (vectorized(function), function)])
-    ours, truth = both(x, y)
+    ours, truth = jax.jit(
+        lambda *xs: [[transform(wrap(f))(*xs) for f in functions] for wrap in (vectorized, same)]
+    )(x, y)
     assert jax.tree.structure(ours) == jax.tree.structure(truth)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(truth), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+
+
+def same(function):
+    return function
 
 
 def left(function, *xs):
@@ -85,21 +75,13 @@ def left(function, *xs):
     return set(re.findall(r"= (sin|cos|tan|atan2?|asin|acos)[ \[]", program))
 
 
-def test_vectorized_works_outside_of_jit():
-    np.testing.assert_allclose(vectorized(plain)(0.3, 0.7), plain(0.3, 0.7), rtol=1e-15)
-
-
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_vectorized_replaces_everything(function):
-    assert bool(left(function, 0.3, 0.7)) == (function is not no_trigonometry)
-    assert not left(vectorized(function), 0.3, 0.7)
+    assert left(function, 0.3, 0.7) and not left(vectorized(function), 0.3, 0.7)
 
 
-def test_other_types_stay():
+def test_other_types_and_requested_accuracies_stay():
     assert left(vectorized(jnp.sin), jnp.float16(1)) == {"sin"}
-
-
-def test_requested_accuracies_stay():
     exact = ft.partial(jax.lax.sin, accuracy=jax.lax.AccuracyMode.HIGHEST)
     assert left(vectorized(exact), 1.0) == {"sin"}
 
@@ -117,9 +99,8 @@ def test_types_are_kept():
         x = jnp.asarray(x)
         ours, truth = (jax.eval_shape(f, x, 3) for f in (vectorized(function), function))
         assert ours == truth
-        assert [v.weak_type for v in jax.tree.leaves(ours)] == [
-            v.weak_type for v in jax.tree.leaves(truth)
-        ]
+        weak = [[v.weak_type for v in jax.tree.leaves(tree)] for tree in (ours, truth)]
+        assert weak[0] == weak[1]
     assert all(isinstance(v, jax.Array) for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5))
 
 
@@ -128,16 +109,12 @@ def test_closures_over_tracers():
         return jax.vmap(f(lambda x: jnp.sin(a * x) * a**2))(x).sum()
 
     x = jnp.linspace(0, 1, 5)
-    for transform in (jax.grad, jax.hessian, lambda f: jax.vmap(jax.grad(f))):
-        a = jnp.array([0.7, 1.3]) if transform not in (jax.grad, jax.hessian) else 0.7
+    for transform, a in ((jax.hessian, 0.7), (lambda f: jax.vmap(jax.grad(f)), [0.7, 1.3])):
         ours, truth = (
-            jax.jit(transform(lambda a, f=f: response(f, a, x)))(a) for f in (vectorized, _same)
+            jax.jit(transform(lambda a, f=f: response(f, a, x)))(jnp.asarray(a))
+            for f in (vectorized, same)
         )
         np.testing.assert_allclose(ours, truth, rtol=1e-13)
-
-
-def _same(function):
-    return function
 
 
 def test_every_call_sees_the_present_parameters_and_traces_once():
@@ -181,41 +158,30 @@ def test_vectors_of_several_functions_are_put_together_row_by_row():
     np.testing.assert_allclose(new, old, rtol=1e-14)
 
 
-# --- Many functions of one and of two numbers, in both precisions ---------------------------------
-
-
 ZOO = {
-    "sin": jnp.sin,
-    "cos": jnp.cos,
+    "sin": lambda x, y: jnp.sin(x),
+    "cos": lambda x, y: jnp.cos(x),
     "tan": lambda x, y: jnp.tan(0.4 * x),
     "arcsin": lambda x, y: jnp.arcsin(x / 5),
     "arccos": lambda x, y: jnp.arccos(x / 5),
-    "arctan": jnp.arctan,
+    "arctan": lambda x, y: jnp.arctan(x),
     "arctan2": jnp.arctan2,
     "lax": lambda x, y: jax.lax.sin(x) + jax.lax.atan2(x, y),
     "angle": lambda x, y: jnp.angle(x + 1j * y),
-    "hypot": jnp.hypot,
     "where": lambda x, y: jnp.where(x > 0, jnp.sin(x), jnp.cos(y)),
-    "select": lambda x, y: jax.lax.select(x > y, jnp.sin(x), jnp.tan(0.4 * y)),
     "switch": lambda x, y: jax.lax.switch(1, [jnp.sin, jnp.cos, jnp.arctan], x),
+    "cond": lambda x, y: jax.lax.cond(x > y, lambda: jnp.sin(x), lambda: y * jnp.cos(x)),
     "scan": lambda x, y: jax.lax.scan(lambda c, k: (jnp.sin(k * c), c), x, jnp.arange(3))[0],
-    "fori": lambda x, y: jax.lax.fori_loop(0, 3, lambda _, z: jnp.cos(z) + y, x),
-    "nested jit": lambda x, y: jax.jit(lambda x: jnp.sin(jax.jit(jnp.cos)(x)))(x),
     "nested vmap": lambda x, y: jax.vmap(jnp.sin)(x * jnp.arange(3.0)).sum(),
     "gradient": lambda x, y: jax.grad(lambda x: jnp.sin(x) * jnp.arctan(x * y))(x),
-    "jvp": lambda x, y: jax.jvp(jnp.sin, (x,), (y,))[1],
     "checkpoint": lambda x, y: jax.checkpoint(lambda x: jnp.sin(jnp.cos(x)))(x),
     "custom jvp": lambda x, y: jax.nn.silu(x) * jnp.sin(y),
-    "sinc": lambda x, y: jnp.sinc(x),
     "interp": lambda x, y: jnp.interp(jnp.sin(x), jnp.linspace(-1, 1, 5), jnp.arange(5.0)),
-    "polynomial": lambda x, y: jnp.polyval(jnp.array([1.0, 2.0, 3.0]), jnp.cos(x)),
     "matrix": lambda x, y: rotation(x) @ jnp.stack([y, 1.0 * y]),
-    "stack": lambda x, y: jnp.stack([jnp.sin(x), jnp.cos(y), x * y]),
     "array": lambda x, y: jnp.array([jnp.sin(x), jnp.cos(x) * jnp.sin(y), 1.0]),
     "concatenate": lambda x, y: jnp.concatenate([jnp.sin(x)[None], jnp.cos(y)[None], y[None]]),
     "integers": lambda x, y: jnp.sin(jnp.arange(4)) * x,
-    "powers": lambda x, y: jnp.sin(x) ** 2 + jnp.cos(x) ** 2,
-    "nothing": lambda x, y: jnp.exp(x) * jnp.tanh(y),
+    "nothing": lambda x, y: {"exp": jnp.exp(x) * jnp.tanh(y)},
 }
 
 
@@ -224,33 +190,28 @@ def rotation(angle):
     return jnp.array([[c, -s], [s, c]])
 
 
-def of_two(name):
-    function = ZOO[name]
-    return (lambda x, y: function(x)) if name in ("sin", "cos", "arctan") else function
-
-
-@pytest.mark.parametrize("name", ZOO)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_what_is_rewritten_gives_what_it_gave_before(name, dtype):
+def test_a_zoo_of_functions_gives_what_it_gave_before(dtype):
     """Values and derivatives of both orders of nesting, over 16 lanes."""
-    function = of_two(name)
     x, y = np.random.default_rng(0).uniform(-2, 2, (2, 16)).astype(dtype)
 
-    @jax.jit
-    def everything(x, y):
-        def all_of(f):
-            values = jax.vmap(f)(x, y)
-            rates = jax.vmap(lambda x, y: jax.jvp(f, (x, y), (y, x))[1])(x, y)
-            slopes = jax.vmap(jax.jacrev(lambda x: f(x, 0.5 * x)))(x)
-            return values, rates, slopes
+    def evaluated(f):
+        values = jax.vmap(f)(x, y)
+        rates = jax.vmap(lambda x, y: jax.jvp(f, (x, y), (y, x))[1])(x, y)
+        slopes = jax.vmap(jax.jacrev(lambda x: f(x, 0.5 * x)))(x)
+        return values, rates, slopes
 
-        return all_of(vectorized(function)), all_of(function)
-
-    ours, truth = everything(x, y)
+    ours, truth = jax.jit(
+        lambda: [
+            {name: evaluated(wrap(f)) for name, f in ZOO.items()} for wrap in (vectorized, same)
+        ]
+    )()
     tolerance = 2e-14 if dtype == np.float64 else 2e-5
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(truth), strict=True):
+    pairs = zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True)
+    for (path, a), b in pairs:
         assert a.dtype == b.dtype and a.shape == b.shape
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(1.0, np.abs(b).max()))
+        atol = tolerance * max(1.0, np.abs(b).max())
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))
 
 
 @pytest.fixture
@@ -269,7 +230,6 @@ def test_it_can_be_switched_off(switched_off):
     np.testing.assert_array_equal(compiled(x), jax.jit(jnp.sin)(x))
     hj.enable_vector_math()
     assert not left(lambda x: by_lane(jnp.sin)(x), x)
-    text = compiled.lower(x).as_text()
-    assert "sine" not in text
+    assert "sine" not in compiled.lower(x).as_text()
     hj.enable_vector_math(False)
     assert "sine" in compiled.lower(x).as_text()

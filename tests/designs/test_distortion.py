@@ -142,7 +142,7 @@ def test_without_a_clock(vanderpol_cycle):
 
 @pytest.mark.parametrize("inputs", [("pull", "push"), ("pull",)])
 def test_two_inputs(two, inputs):
-    """In any order; charts with one and with two states; outputs that depend on the inputs."""
+    """Inputs in any order; charts with one and two states; outputs that depend on the inputs."""
     cycle, sections, _ = two
     quadratic = second_order(cycle, sections, ("x", "z"), inputs)
     u = SHORT.inputs()[:, :, [SHORT.input_names.index(n) for n in inputs]]

@@ -42,7 +42,7 @@ def test_transfer_functions_in_a_band(model, usual):
 
 
 def test_an_impulse_response_is_its_spectrum(model, usual):
-    """By Parseval's theorem the whole response has the variance of all transfer functions in the
+    """The whole response has, by Parseval's theorem, the variance of all transfer functions in the
     whole band."""
     impulse = hj.designs.ImpulseResponse(100)
     spectrum = hj.designs.FrequencyResponse((0.0, 2.0), wanted=(-2, -1, 0, 1))
@@ -120,7 +120,7 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
 
 
 def test_multipliers_keep_the_numbers_of_the_model():
-    """Of three, the first of which no input excites."""
+    """Three multipliers, the first of which no input excites."""
     A, ones = np.diag([0.9, 0.6, 0.3]), np.array([0.0, 1.0, 1.0])
     model = hj.LDTP(np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3)))
     usual = hj.multisine(2, 32, band=(0, 1))
@@ -175,8 +175,8 @@ def variance(model, design):
 
 @pytest.mark.parametrize("robust, exponent", [("mean", 1), ("worst", 16)])
 def test_several_models(robust, exponent):
-    """No design is better for the mean of powers than the certificate allows, limits hold for each
-    model, and standard errors of 1e-15 have no effect (their 16th powers are zero)."""
+    """The certificate bounds all designs for the mean of powers, limits hold for each model, and
+    standard errors of 1e-15 have no effect (their 16th powers are zero)."""
     models = [with_angle(angle) for angle in (0.8, 1.6, 2.4)]
     usual = hj.multisine(N, 32, band=(0, 2))
     about = dict(goal=GOAL, limit={"u": 0.1}, robust=robust)

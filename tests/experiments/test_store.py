@@ -141,18 +141,6 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
         np.testing.assert_array_equal(there[name], values)
 
 
-def test_events_are_kept(hopper_cycle, tmp_path):
-    design = hj.experiments.single_cosine([0.25, 0.75, 1.25], 4, 4)
-    call = hopper_cycle, hj.ClockPhase(4), design, "yM"
-    store = tmp_path / "records.zarr"
-    stored = stream(*call, Options(record_events=True), store=store, chunk=2)
-    whole = hj.run_experiments(*call, record_events=True)
-    assert [len(part.u) for part in stored] == [2, 1]
-    np.testing.assert_allclose(stored[0].events.time, whole.events.time[:2], rtol=1e-9)
-    np.testing.assert_array_equal(stored[1].events.event, whole.events.event[2:])
-    assert stored[0].events.of(0)[0].name == whole.events.of(0)[0].name
-
-
 def test_what_is_no_store(tmp_path, arguments):
     with pytest.raises(hj.DefinitionError, match="holds no experiments"):
         StoredExperiments(tmp_path)

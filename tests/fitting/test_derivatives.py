@@ -63,7 +63,7 @@ def test_states_on_sections_and_times_of_events(hopper_cycle, hopper_observed, s
         parts = []
         for one in hopper_observed:
             now = hj.ObservedCycle.of(cycle, one.sections, one.outputs)
-            parts += [np.ravel(x / s) for x, s in zip(now.seen, one.scales, strict=True)]
+            parts += [np.ravel(x / s) for x, s in zip(now.measured, one.scales, strict=True)]
         return np.concatenate(parts)
 
     np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
 
-from hybridjax.fitting.sensitivity import diagnose
+from hybridjax.fitting.model_fit import diagnose
 
 
 def blind(rows, residuals=30, seed=0):

@@ -42,7 +42,10 @@ def juggling():
     return hj.find_limit_cycle(TRUTH)
 
 
-@pytest.mark.parametrize("kind", [MultipliersBetweenSections, MultipliersOfTheCycle])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(MultipliersBetweenSections, marks=pytest.mark.slow), MultipliersOfTheCycle],
+)
 def test_a_parameter_comes_back_from_multipliers(juggling, kind):
     exact = TRUTH.exact()[-1]
     data = kind(jnp.poly(exact)[1:].real, jnp.asarray(False))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 import hybridjax as hj
-from hybridjax.fitting.parameters import free_parameters
+from hybridjax.fitting.problem import free_parameters
 
 
 HOPPER = hj.models.VerticalHopper

@@ -17,10 +17,7 @@ F = np.linspace(0.05, 9.95, 40)
 def test_the_hopper_from_markov_parameters(hopper, multipliers):
     model = hj.identify.realize(hopper.impulse_response(150), inputs="u", outputs=("yM", "vM"))
     np.testing.assert_array_equal(model.dims, MINIMAL)
-    assert (
-        hj.fit_multipliers(model.htf(np.linspace(0, 16, 300)), model).compare(multipliers).max_error
-        < 1e-10
-    )
+    np.testing.assert_allclose(model.multipliers[:2], multipliers, atol=1e-10)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-11
     np.testing.assert_allclose(
         model.impulse_response(300), hopper.impulse_response(300), atol=1e-12
@@ -39,7 +36,7 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
 SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_random_systems(shape, seed):
     dims, ny, nu = shape

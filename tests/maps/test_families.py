@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 
 import hybridjax as hj
 
+from ..conftest import APEX, OUTPUTS
+
 
 class ChosenPhases(hj.sections.AbstractSections):
     """Sections at chosen phases of the clock, in periods."""
@@ -27,8 +29,8 @@ class ChosenPhases(hj.sections.AbstractSections):
     def check(self, s):
         pass
 
-    def bind(self, s, point):
-        return hj.sections.BoundSections.at_times(self.phases * point.period)
+    def bind(self, s, orbit):
+        return hj.sections.BoundSections.at_times(self.phases * orbit.period)
 
     def describe(self, i):
         return f"section {i} (phase {float(self.phases[i]):.3g})"
@@ -61,7 +63,7 @@ class FallingPast(hj.sections.AbstractSections):
     def check(self, s):
         pass
 
-    def bind(self, s, point):
+    def bind(self, s, orbit):
         return hj.sections.BoundSections.at_levels(Levels(self.values), self.n_sections)
 
     def describe(self, i):
@@ -83,3 +85,19 @@ def test_a_family_of_levels(vanderpol_cycle):
     np.testing.assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
     a, b = (hj.linearize(vanderpol_cycle, x, "v") for x in (own, listed))
     np.testing.assert_allclose(a.A, b.A, atol=1e-12)
+
+
+def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
+    """Measured along a trajectory that is sampled densely, between its events."""
+    scale = np.array([0.3, 1.9])
+    family = hj.ArcLength(8, OUTPUTS, APEX, scale=scale)
+    placed = hj.place_sections(hopper_cycle, family)
+    t, *signals = hopper_cycle.trajectory(3.0)(*OUTPUTS, per_step=200)
+    steps = np.diff(np.stack(signals) / scale[:, None], axis=1)
+    length = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=0)))
+    at = np.append(placed.lanes.t, placed.lanes.t[0] + 1.0) + np.ceil(t[0] - placed.lanes.t[0])
+    pieces = np.diff(np.interp(at, t, length))
+    np.testing.assert_allclose(pieces, pieces.mean(), rtol=2e-3)
+    assert np.ptp(placed.duration) > 0.004
+    ldtp = hj.linearize(hopper_cycle, placed, OUTPUTS)
+    np.testing.assert_allclose(ldtp.multipliers, isochron_ldtp.multipliers, atol=1e-9)

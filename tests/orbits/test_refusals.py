@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.fitting.candidate import candidate_cycle
+from hybridjax.fitting.problem import candidate_cycle
 
 from ..toys import Field
 

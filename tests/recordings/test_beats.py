@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.beats.estimation import WAVES, fit_curve
-from hybridjax.recordings.beats.intervals import intervals_of
-from hybridjax.recordings.beats.phase_model import Table, basis, forecast
+from hybridjax.recordings.beats.model import forecast, intervals_of, tabulated
+
+from .mishaps import mishandle, misjudged
 
 
 X = np.arange(200) / 200
@@ -27,7 +27,9 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def found(noisy):
-    return hj.recordings.phase_response(noisy, BEAT, input="u")
+    """With one event in ten missed."""
+    lost = mishandle(noisy, misjudged(lost=0.1), input="u", outputs=(), event="beat", seed=1)
+    return hj.recordings.phase_response(lost, BEAT, input="u")
 
 
 def test_a_rhythm_without_noise_is_found_exactly():
@@ -37,15 +39,12 @@ def test_a_rhythm_without_noise_is_found_exactly():
     assert exact.r2 > 0.9999 and exact.result == 0 and exact.miscounted == 0
 
 
-def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
+def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     low, high = found.interval(X, 0.99)
     assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
     assert 3 < found.detail < 10 and abs(found.jitter - 0.05) < 0.01 and found.p_flat < 1e-3
-    assert rms(found.values - CURVE) < 0.1 and rms(found.plain - CURVE) < 0.1  # (little jitter)
-    flat = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=[1.0], folds=3)
-    own = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=found, folds=3)
-    true = hj.recordings.forecast_intervals(noisy, BEAT, input="u", curve=CURVE, folds=3)
-    assert flat.r2 + 0.01 < own.r2 < true.r2 + 0.02
+    assert rms(found.values - CURVE) < 0.12 and rms(found.plain - CURVE) < 0.12
+    assert found.left_out_flat + 0.01 < found.left_out < found.r2
     assert "Shape: it adds" in repr(found)
     page = found._repr_html_()
     assert page.count("<svg") == 1 and "Shape: it adds" in page
@@ -61,27 +60,19 @@ def test_a_curve_may_jump_at_the_reset_and_be_flat():
     assert rms(found.values - jump) < 0.1
     flat = hj.recordings.phase_response(beats(0.05, trials=8, curve=[1.0]), BEAT, input="u")
     assert flat.p_flat > 0.01 and np.ptp(flat.values) < 0.1
-    assert "nothing is seen of it" in flat.warnings[0]
+    assert "nothing is seen of it" in flat.warnings[0].text
 
 
 def test_slopes_are_derivatives(noisy):
     intervals = intervals_of(noisy, hj.recordings.estimate_phase(noisy, BEAT), "u")
-    table, a, rates = Table.of(4, 0.05), np.array([1, -0.4, 0.2, 0.1, 0]), np.full(8, 10.0)
+    table, a, rates = tabulated(4, 0.05), np.array([1, -0.4, 0.2, 0.1, 0]), np.full(8, 10.0)
     base = forecast(intervals, table, a, rates)
     for k in range(5):
-        moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates, slopes=False)
+        moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates)
         difference = (moved.duration - base.duration) / 1e-5
         np.testing.assert_allclose(base.by_curve[:, k], difference, atol=0.02 * 0.1)
-    moved = forecast(intervals, table, a, rates + 1e-5, slopes=False)
+    moved = forecast(intervals, table, a, rates + 1e-5)
     np.testing.assert_allclose(base.by_rate, (moved.duration - base.duration) / 1e-5, atol=5e-4)
-
-
-def test_missed_events_do_not_count(noisy):
-    lost = hj.testing.spoil(noisy, "u", hj.testing.Dirt(lost_events=6, seed=1))
-    phase = hj.recordings.estimate_phase(lost, BEAT)
-    fit = fit_curve(intervals_of(lost, phase, "u"), WAVES)
-    assert rms(basis(X, WAVES) @ fit.coefficients - CURVE) < 0.1
-    assert phase.missed + (~fit.used).sum() > 20
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():
@@ -122,4 +113,4 @@ def test_events_alone_are_identified(noisy):
     found = hj.identify_recording(noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=4)
     assert found.data.outputs == ("duration",) and found.fit.outputs == ("duration",)
     assert np.isfinite(found.fit.numerators).all()
-    assert any("Shape: it adds" in text for text in found.advice.warnings)
+    assert any("Shape: it adds" in repr(x) for x in found.advice.warnings)

@@ -5,9 +5,11 @@ import pytest
 
 import hybridjax as hj
 
+from .mishaps import mishandle
+
 
 def spoil(recording, signals=("yM", "vM"), **dirt):
-    return hj.testing.spoil(recording, signals, hj.testing.Dirt(**dirt))
+    return hj.testing.spoil(recording, signals, **dirt)
 
 
 def test_five_lines(hopper_recording, hopper_cycle, angle):
@@ -19,7 +21,7 @@ def test_five_lines(hopper_recording, hopper_cycle, angle):
     assert fit.contains(hopper_cycle.multipliers, 0.999).all()
     assert "199.94 cycles" in repr(data)
     said = hj.recordings.advise(data, fit).warnings
-    assert any(w.startswith("Outputs: where sections are crossed, yM and vM") for w in said)
+    assert any(repr(w).startswith("Outputs: where sections are crossed, yM and vM") for w in said)
 
 
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
@@ -31,22 +33,14 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
-    assert not any(w.startswith("Outputs") for w in hj.recordings.advise(data[1], fits[1]).warnings)
-
-
-def test_dirt(hopper_recording, hopper_cycle, angle):
-    dirty = spoil(hopper_recording, noise=1e-4, quantum=1e-5, missing=0.01, gap=(80.3, 90.7))
-    data = hj.recordings.section_data(dirty, angle, inputs="u", outputs=("yM", "vM"), n_sections=16)
-    fit = hj.fit_series(data.records, order=2)
-    assert len(data.records) == 2
-    assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
-    assert fit.contains(hopper_cycle.multipliers, 0.999).all()
+    assert not any(w.cause == "outputs" for w in hj.recordings.advise(data[1], fits[1]).warnings)
 
 
 def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
     """Everything goes slower and slower: multipliers stay what they are, and phase says by how
     much."""
-    slower = spoil(hopper_recording, noise=1e-4, stretch=0.05)
+    names = {"input": "u", "outputs": ("yM", "vM"), "event": ""}
+    slower = mishandle(spoil(hopper_recording, noise=1e-4), "clock slows down", **names)
     phase = hj.recordings.estimate_phase(slower, angle)
     assert phase.drift * phase.cycles == pytest.approx(0.05, rel=0.1)
     data = hj.recordings.section_data(
@@ -93,12 +87,7 @@ def test_compass_gait_by_events():
     noisy = spoil(made, outputs, noise=1e-4)
     marked = noisy.mark("middle", hj.Crossing("s", "falling"), bandwidth=20 / period)
     data = hj.recordings.section_data(
-        marked,
-        hj.AtEvent("middle"),
-        inputs="u",
-        outputs=outputs,
-        n_sections=16,
-        timing="duration",
+        marked, hj.AtEvent("middle"), inputs="u", outputs=outputs, n_sections=16, timing="duration"
     )
     fit = hj.fit_series(data.records, order=2, overhang=32)
     assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2
@@ -135,15 +124,15 @@ def test_order_and_advice(hopper_recording, angle):
     fit = hj.fit_series(data.records, order=2)
     advice = hj.recordings.advise(data, fit)
     assert hj.recordings.choose_order(data) == 2
-    assert any("plain regression (ARX) would give" in w for w in advice.warnings)
+    assert any("plain regression (ARX) would give" in w.text for w in advice.warnings)
     assert np.abs(advice.plain[0]) < np.abs(fit.multipliers[0])
     assert (np.diff(advice.expected[:, 0]) <= 0).all()
     fast = {"check": False}
     too_many = hj.recordings.advise(data, hj.fit_series(data.records, order=3, **fast)).warnings
     order = "Order: the data do not carry 3 multipliers"
-    assert any(w.startswith(order) for w in too_many)
-    assert not any(w.startswith("Order") for w in advice.warnings)
-    assert not any(w.startswith("Outputs") for w in advice.warnings)
+    assert any(repr(w).startswith(order) for w in too_many)
+    assert not any(w.cause == "order" for w in advice.warnings)
+    assert not any(w.cause == "outputs" for w in advice.warnings)
     slow = hj.Recording(
         noisy.trials[0].time,
         {"u": np.sin(0.3 * noisy.trials[0].time), **dict(zip(
@@ -151,4 +140,4 @@ def test_order_and_advice(hopper_recording, angle):
     )  # fmt: skip
     poor = hj.recordings.section_data(slow, angle, **options)
     said = hj.recordings.advise(poor, hj.fit_series(poor.records, order=2, **fast)).warnings
-    assert any(w.startswith("Narrow excitation") for w in said)
+    assert any(w.cause == "narrow excitation" for w in said)

@@ -7,7 +7,8 @@ import pytest
 from scipy import signal
 
 import hybridjax as hj
-from hybridjax.testing import EVENT_MISHAPS, MISHAPS
+
+from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle
 
 
 STRIDES, TRIALS, RATE = 60, 3, 64
@@ -41,7 +42,7 @@ def findings(recording, phase=TOP):
     clean = inspection.recording
     found = hj.recordings.estimate_phase(clean, phase)
     data = hj.recordings.section_data(clean, found, n_sections=16, **names)
-    return inspection.findings + hj.recordings.inspect_cycles(clean, found, data)
+    return hj.recordings.inspect(recording, **names, phase=found, data=data).findings
 
 
 def causes(recording, phase=TOP):
@@ -92,7 +93,7 @@ SAID = {
 @pytest.mark.parametrize("mishap", SAID)
 def test_causes_are_named(mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert SAID[mishap] in causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+    assert SAID[mishap] in causes(mishandle(made_up(0), mishap, **NAMES), phase)
 
 
 HARMLESS = sorted({
@@ -105,7 +106,7 @@ HARMLESS = sorted({
 @pytest.mark.parametrize("mishap", HARMLESS)
 def test_nothing_is_said_of_what_does_no_harm(mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
-    assert not causes(hj.testing.mishandle(made_up(0), mishap, **NAMES), phase)
+    assert not causes(mishandle(made_up(0), mishap, **NAMES), phase)
 
 
 def test_all_mishaps_are_tried():

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.testing import EVENT_MISHAPS, MISHAPS
+
+from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle
 
 
 APEX = hj.Crossing("vM", "falling")
@@ -17,7 +18,7 @@ def trials(hopper_cycle):
     made = hj.testing.simulate_recording(
         hopper_cycle, np.stack(force), ("yM", "vM"), rate=128, steps=1
     )
-    noisy = hj.testing.spoil(made, ("yM", "vM"), hj.testing.Dirt(noise=1e-4))
+    noisy = hj.testing.spoil(made, ("yM", "vM"), noise=1e-4)
     return noisy.mark("apex", APEX, bandwidth=16)
 
 
@@ -33,7 +34,7 @@ def test_none_is_silently_wrong(trials, hopper_cycle, mishap):
     names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
     phase = hj.AtEvent("apex") if mishap in EVENT_MISHAPS else APEX
     try:
-        found = identify(hj.testing.mishandle(trials, mishap, **names), phase)
+        found = identify(mishandle(trials, mishap, **names), phase)
     except hj.DefinitionError:
         return
     assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()
@@ -44,7 +45,7 @@ def test_what_is_found_is_printed_and_copies_count_once(trials):
     clean = identify(trials)
     assert clean.findings == ()
     names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
-    thrice = identify(hj.testing.mishandle(trials, "the same trial thrice", **names))
+    thrice = identify(mishandle(trials, "the same trial thrice", **names))
     np.testing.assert_array_equal(thrice.fit.multipliers, clean.fit.multipliers)
     assert "A trial twice (left out): all samples of trial" in repr(thrice)
-    assert thrice.advice.warnings[: len(thrice.findings)] == tuple(map(repr, thrice.findings))
+    assert thrice.advice.warnings[: len(thrice.findings)] == thrice.findings

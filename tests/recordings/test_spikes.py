@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.spikes import input_spikes, spike_heights, without_spikes
+from hybridjax.recordings.smoothing import input_spikes, spike_heights, without_spikes
 
 
 T = np.arange(20000) / 500
@@ -105,9 +105,9 @@ def test_impacts_are_part_of_the_motion(wave):
 @pytest.mark.parametrize("share, most", [(1e-3, 1.3), (1e-2, 2.0)])
 def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle, share, most):
     """Sixteen sections of four samples each, spikes in force and outputs."""
-    Dirt, spoil = hj.testing.Dirt, hj.testing.spoil
-    clean = spoil(hopper_recording, ("yM", "vM"), Dirt(noise=1e-4))
-    dirty = spoil(clean, ("u", "yM", "vM"), Dirt(spikes=share, seed=1))
+    spoil = hj.testing.spoil
+    clean = spoil(hopper_recording, ("yM", "vM"), noise=1e-4)
+    dirty = spoil(clean, ("u", "yM", "vM"), spikes=share, seed=1)
     fits = []
     for recording in (clean, dirty):
         data = hj.recordings.section_data(
@@ -121,4 +121,4 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     assert fits[1].standard_errors[0] < most * fits[0].standard_errors[0]
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     said = hj.recordings.advise(data, fits[1]).warnings
-    assert any(w.startswith("Spikes: ") for w in said)
+    assert any(w.cause == "spikes" for w in said)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.inspection.feedback import feedback
+from hybridjax.recordings.inspection.answers import feedback
 
 
 N = 8
@@ -33,11 +33,11 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0):
 
 def test_instruments_have_no_bias_by_noise():
     found = [hj.recordings.natural_multipliers(variable(0.7, seed=k)) for k in range(3)]
-    (low, high), (_, top) = found[0].interval(0.99)[0], found[0].plain_interval()[0]
+    (low, high), (_, top) = found[0].interval(0.99)[0], found[0].interval(plain=True)[0]
     assert low < 0.6 < high and top < 0.6
     assert abs(np.mean([f.multipliers[0].real for f in found]) - 0.6) < 0.05
     assert np.mean([f.plain[0].real for f in found]) < 0.53
-    assert any("least squares gives" in text for text in found[0].warnings)
+    assert any("least squares gives" in text.text for text in found[0].warnings)
     assert found[0]._repr_html_().count("<tr>") == 3
 
 
@@ -45,7 +45,7 @@ def test_short_records_are_drawn_whole():
     """No interval is narrow because a record holds only one block."""
     found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
     low, high = found.interval()[0]
-    assert high - low > 0.2 and any("Few cycles" in text for text in found.warnings)
+    assert high - low > 0.2 and any(text.cause == "few cycles" for text in found.warnings)
     assert found.block * found.records == found.cycles
     (alone,) = hj.recordings.natural_multipliers(variable(0.1, strides=(11,))).interval()
     assert alone[1] - alone[0] > 0.2
@@ -73,7 +73,7 @@ def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
     given = hj.recordings.section_data(
         marked, turns, inputs="force", outputs=("x", "v"), n_sections=8
     )
-    assert feedback(given) == []
+    assert list(feedback(given)) == []
     loop = hj.recordings.section_data(marked, turns, inputs="x", outputs="v", n_sections=8)
     (finding,) = feedback(loop)
     assert finding.cause == "feedback" and "repeats with the cycle" in finding.text

@@ -5,7 +5,7 @@ import inspect
 import sys
 import typing
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import jax
 
@@ -42,11 +42,11 @@ def checked(thing: Thing) -> Thing:
     It stands above all other decorators, except `classmethod` and `staticmethod`.
     """
     if not isinstance(thing, type):
-        return _wrapped(thing, thing.__qualname__)
+        return cast(Thing, _wrapped(thing, thing.__qualname__))
     maker = "__new__" if issubclass(thing, tuple) else "__init__"
     if maker in vars(thing):
         setattr(thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing))
-    return checked_methods(thing)
+    return cast(Thing, checked_methods(thing))
 
 
 def checked_methods(cls: Class) -> Class:
@@ -69,7 +69,8 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
 
     **Raises:** `DefinitionError`.
     """
-    fields = _fields.recall(cls, None, lambda: _Fields(cls.__init__, cls))
+    constructor = cls.__init__  # type: ignore[misc]
+    fields = _fields.recall(cls, None, lambda: _Fields(constructor, cls))
     try:
         fields.take((None, *args), dict(kwargs))
     except Misfit as misfit:
@@ -93,7 +94,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
             f"{name} needs values, but JAX traces them here: call it outside of jit, vmap and grad."
         )
 
-    call.kinds = kinds
+    setattr(call, "kinds", kinds)  # noqa: B010 (that of a function is not declared)
     return call
 
 
@@ -106,7 +107,7 @@ class _Kinds:
 
     @functools.cached_property
     def by_name(self) -> dict[str, Kind | None]:
-        """Of all parameters that can be given by name."""
+        """Kinds of all parameters that can be given by name."""
         where = vars(sys.modules[self.cls.__module__]) if self.cls else None
         hints = typing.get_type_hints(self.function, where, include_extras=True)
         kinds = {}
@@ -121,14 +122,14 @@ class _Kinds:
 
     @functools.cached_property
     def in_order(self) -> tuple[tuple[str, Kind | None], ...]:
-        """Of those that can be given by position."""
+        """Names and kinds of those that can be given by position."""
         parameters = inspect.signature(self.function).parameters.values()
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         return tuple((p.name, self.by_name[p.name]) for p in parameters if p.kind in positional)
 
     @functools.cached_property
-    def rest(self) -> tuple[str, Kind | None]:
-        """Of all further ones: `*args`."""
+    def variadic(self) -> tuple[str, Kind | None]:
+        """Name and kind of all further ones: `*args`."""
         for parameter in inspect.signature(self.function).parameters.values():
             if parameter.kind is parameter.VAR_POSITIONAL:
                 return parameter.name, self.by_name[parameter.name]
@@ -139,19 +140,18 @@ class _Kinds:
 
         **Raises:** `Misfit` for the first that does not fit.
         """
-        taken = []
-        at = None
+        taken, name = [], ""
         try:
-            for at, value in zip(self.in_order, args, strict=False):
-                taken.append(value if at[1] is None else at[1].take(value))
+            for (name, kind), value in zip(self.in_order, args, strict=False):  # noqa: B007
+                taken.append(value if kind is None else kind.take(value))
             for value in args[len(taken) :]:
-                at = self.rest
-                taken.append(value if at[1] is None else at[1].take(value))
+                name, kind = self.variadic
+                taken.append(value if kind is None else kind.take(value))
             for name, value in kwargs.items():
-                at = name, self.by_name.get(name)
-                kwargs[name] = value if at[1] is None else at[1].take(value)
+                kind = self.by_name.get(name)
+                kwargs[name] = value if kind is None else kind.take(value)
         except Misfit as misfit:
-            raise misfit.of(at[0]) from None
+            raise misfit.of(name) from None
         return taken, kwargs
 
 
@@ -162,8 +162,10 @@ class _Fields(_Kinds):
     def by_name(self) -> dict[str, Kind | None]:
         hints = self.function.__annotations__
         kinds = dict.fromkeys(inspect.signature(self.function).parameters)
-        own = {name: hint for name, hint in hints.items() if typing.get_origin(hint) is Annotated}
-        return kinds | {name: kind_of(hint) for name, hint in own.items()}
+        annotated = {
+            name: kind_of(x) for name, x in hints.items() if typing.get_origin(x) is Annotated
+        }
+        return kinds | annotated
 
 
 _fields = Memory()

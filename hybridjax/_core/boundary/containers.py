@@ -7,12 +7,13 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import numpy as np
 
+from ..executor import is_tracer
 from ..signal import Signal
 from .values import Kind, Misfit, Text, listed, refuse_traced, show, with_article
 
 
 class Either(Kind):
-    """What one of several kinds takes, tried in their order."""
+    """A value that one of several kinds takes, tried in their order."""
 
     def __init__(self, *kinds: Kind):
         self.kinds = kinds
@@ -54,11 +55,8 @@ class Having(Kind):
         self.names = sorted(set(vars(protocol)) - _OF_EVERY_PROTOCOL)
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
-    def take(self, value):
-        for name in self.names:
-            if inspect.getattr_static(value, name, self) is self:
-                raise self.refused(value)
-        return value
+    def fits(self, value):
+        return all(inspect.getattr_static(value, name, self) is not self for name in self.names)
 
 
 @runtime_checkable
@@ -76,10 +74,8 @@ class Subclass(Kind):
         self.cls = cls
         self.allowed = f"a class derived from {cls.__name__}"
 
-    def take(self, value):
-        if isinstance(value, type) and issubclass(value, self.cls):
-            return value
-        raise self.refused(value)
+    def fits(self, value):
+        return isinstance(value, type) and issubclass(value, self.cls)
 
 
 class Function(Kind):
@@ -87,23 +83,15 @@ class Function(Kind):
 
     allowed = "a function"
 
-    def take(self, value):
-        if callable(value):
-            return value
-        raise self.refused(value)
+    def fits(self, value):
+        return callable(value)
 
 
 class Items(Kind):
     """A sequence all of whose items are of one kind: a list, a tuple, an array's first axis. With
     `form`, it is brought to that form; with `iterable`, whatever can be iterated over is taken."""
 
-    def __init__(
-        self,
-        item: Kind | None,
-        *,
-        form: type | None = None,
-        iterable: bool = False,
-    ):
+    def __init__(self, item: Kind | None, *, form: type | None = None, iterable: bool = False):
         self.item, self.form, self.iterable = item, form, iterable
         self.allowed = "a sequence" if item is None else f"a sequence (each item {item.allowed})"
 
@@ -114,7 +102,7 @@ class Items(Kind):
             if value.ndim == 0:
                 refuse_traced(value, self.allowed)
                 raise self.refused(value)
-            value = list(value if isinstance(value, jax.core.Tracer) else np.asarray(value))
+            value = list(value if is_tracer(value) else np.asarray(value))
         elif not isinstance(value, Sequence):
             if not (self.iterable and isinstance(value, Iterable)):
                 raise self.refused(value)
@@ -210,7 +198,7 @@ def _taken(kind: Kind, key: Any, value: Any) -> Any:
 
 
 def _rebuilt(given: Any, taken: Any) -> Any:
-    """What was given, where nothing in it changed."""
+    """Return `given` itself if nothing in it changed."""
     items = taken.values() if isinstance(taken, dict) else taken
     before = given.values() if isinstance(given, Mapping) else given
     if all(a is b for a, b in zip(before, items, strict=True)):
@@ -229,8 +217,7 @@ class Stream(Kind):
     def take(self, value):
         if isinstance(value, Sequence):
             return Items(self.item).take(value)
-        others = np.ndarray | jax.Array | Mapping
-        if isinstance(value, others) or not isinstance(value, Iterable):
+        if isinstance(value, np.ndarray | jax.Array | Mapping) or not isinstance(value, Iterable):
             raise self.refused(value)
         once = iter(value) is value
         return self.checked(value) if once else _Again(self, value)

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
-from jax.typing import ArrayLike
 
 from .. import limits
 from ..arguments import Numbers
@@ -51,9 +50,9 @@ Index = Annotated[int, Whole(0, limits.COUNT)]
 """Also numbers that may be zero: samples to discard, lags of a lead."""
 SectionCount = Annotated[int, Whole(1, limits.SECTIONS)]
 PeriodCount = Annotated[int, Whole(1, limits.PERIODS)]
-ExperimentCount = Annotated[int, Whole(1, limits.EXPERIMENTS)]
+ExperimentCount = Annotated[int, Whole(1, limits.PERIODS)]
 Order = Annotated[int, Whole(1, limits.ORDER)]
-StepCount = Annotated[int, Whole(1, limits.STEPS)]
+StepCount = Annotated[int, Whole(1, limits.COUNT)]
 WorkerCount = Annotated[int, Whole(1, limits.WORKERS)]
 Seed = Annotated[int, Whole(0)]
 
@@ -65,13 +64,13 @@ Share = Annotated[float, Number("a number above 0, at most 1", above=0, high=1)]
 Fraction = Annotated[float, Number("a number from 0 to 1", low=0, high=1)]
 
 # The same, where one has an array of JAX at hand as often as a `float`.
-Duration = Annotated[ArrayLike, Number("a positive number", above=0)]
-Wait = Annotated[ArrayLike, Number("a number that is not negative", low=0)]
+Duration = Annotated[Numbers, Number("a positive number", above=0)]
+Wait = Annotated[Numbers, Number("a number that is not negative", low=0)]
 
 # Numbers that JAX may trace.
-Scalar = Annotated[ArrayLike, Reals("")]
-PositiveScalar = Annotated[ArrayLike, Reals("", sign="positive")]
-NonNegativeScalar = Annotated[ArrayLike, Reals("", sign="nonnegative")]
+Scalar = Annotated[Numbers, Reals("")]
+PositiveScalar = Annotated[Numbers, Reals("", sign="positive")]
+NonNegativeScalar = Annotated[Numbers, Reals("", sign="nonnegative")]
 Vector = Annotated[Numbers, Reals("n")]
 
 # Words.
@@ -94,7 +93,7 @@ _PLAIN = {
     type(None): Nothing(),
     typing.SupportsIndex: Whole(),
 }
-_SEQUENCES = {
+_SEQUENCES: dict[Any, dict[str, Any]] = {
     list: {"form": list},
     collections.abc.Sequence: {},
     collections.abc.Iterable: {"iterable": True},
@@ -105,7 +104,7 @@ _ARRAYS = {"complex128": Complexes, "float64": Reals, "int64": Integers}
 
 
 def kind_of(hint: Any) -> Kind | None:
-    """What a parameter with this annotation may be; None for anything.
+    """Return the kind of a parameter with this annotation; None if it may be anything.
 
     **Raises:** `TypeError` for an annotation that has no kind.
     """
@@ -115,8 +114,8 @@ def kind_of(hint: Any) -> Kind | None:
         return _PLAIN[hint]
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        own = [x for x in hint.__metadata__ if isinstance(x, Kind)]
-        return own[-1] if own else kind_of(arguments[0])
+        declared = [x for x in hint.__metadata__ if isinstance(x, Kind)]
+        return declared[-1] if declared else kind_of(arguments[0])
     if origin is Literal:
         return OneOf(*arguments)
     if origin in (Union, types.UnionType):
@@ -144,16 +143,15 @@ def kind_of(hint: Any) -> Kind | None:
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
     arrays = [kind for kind in kinds if isinstance(kind, Reals)]
-    if (
-        len(arrays) > 1 and arrays[0].form is not None
-    ):  # of NumPy or of JAX: they stay what they are
+    if len(arrays) > 1 and arrays[0].form is not None:  # of NumPy or of JAX: stay what they are
         arrays[0].form = None
         kinds = [kind for kind in kinds if kind not in arrays[1:]]
     if len(kinds) == 1:
         return kinds[0]
-    if None in kinds:
+    narrow = [kind for kind in kinds if kind is not None]
+    if len(narrow) < len(kinds):
         return None
-    return Either(*sorted(kinds, key=lambda kind: isinstance(kind, Nothing)))
+    return Either(*sorted(narrow, key=lambda kind: isinstance(kind, Nothing)))
 
 
 def _of_class(cls: type) -> Kind:
@@ -167,9 +165,9 @@ def _of_class(cls: type) -> Kind:
 
 
 def _array(hint: Any) -> Kind:
-    """Of jaxtyping's annotation: NaN and infinity are left to those who declare more."""
+    """Return the kind of a jaxtyping annotation, which allows NaN and infinity."""
     kind = next((kind for dtype, kind in _ARRAYS.items() if dtype in hint.dtypes), None)
     if kind is None:
         return Instance(hint)
-    form = {np.ndarray: np.asarray, jax.Array: jnp.asarray}.get(hint.array_type)
-    return kind(hint.dim_str, missing=True, infinite=True, form=form)
+    forms: dict[Any, collections.abc.Callable] = {np.ndarray: np.asarray, jax.Array: jnp.asarray}
+    return kind(hint.dim_str, missing=True, infinite=True, form=forms.get(hint.array_type))

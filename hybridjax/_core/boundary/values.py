@@ -1,5 +1,6 @@
 """Kinds of single values and of arrays, and what is wrong with a value that does not fit."""
 
+import contextlib
 import math
 import numbers
 import operator
@@ -10,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..executor import is_tracer
 
-# Characters of a value that are shown.
+
+# Characters of a value that a message shows. More: messages of several lines. Fewer: names are cut.
 _SHOWN = 60
 
 
@@ -28,7 +31,7 @@ class Misfit(Exception):
 
     @property
     def problem(self) -> str:
-        """In words, which are made when they are asked for: of several sorts most do not fit."""
+        """The words, composed at the first use: of several kinds most do not fit, unseen."""
         return self._problem if isinstance(self._problem, str) else self._problem()
 
     def __str__(self) -> str:
@@ -46,7 +49,7 @@ class Misfit(Exception):
 def show(value: Any) -> str:
     """A value in a few words: numbers and strings as they are written, arrays by their shape,
     other objects by their class."""
-    if isinstance(value, jax.core.Tracer):
+    if is_tracer(value):
         return f"a traced value of shape {value.shape}"
     if isinstance(value, np.ndarray | jax.Array):
         if value.ndim == 0:
@@ -56,10 +59,14 @@ def show(value: Any) -> str:
         return show(value.item())
     if (
         value is None
-        or value is Ellipsis
+        or value is ...
         or isinstance(value, bool | int | float | complex | str | bytes)
     ):
-        return _shortened(value)
+        try:
+            text = repr(value)
+        except ValueError:  # an integer with more digits than Python writes
+            return "a number with thousands of digits"
+        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
     if isinstance(value, type):
         return f"the class {value.__name__} itself"
     if isinstance(value, list | tuple | set | frozenset | dict) and len(value) < 100:
@@ -68,14 +75,6 @@ def show(value: Any) -> str:
     if callable(value) and hasattr(value, "__name__"):
         return f"the function {value.__name__}"
     return with_article(type(value).__name__)
-
-
-def _shortened(value: Any) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # an integer with more digits than Python writes
-        return "a number with thousands of digits"
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 def with_article(name: str) -> str:
@@ -94,14 +93,19 @@ class Kind:
     by `kind_of`."""
 
     allowed: str
-    """What is allowed, as it stands after "must be"."""
+    """The values that are allowed, as it stands after "must be"."""
 
     def take(self, value: Any) -> Any:
-        """The value in the form that functions work with: an `int` for any whole number, an array
-        for nested lists of numbers, most others as they are.
+        """Return the value in the form that functions work with: an `int` for any whole number, an
+        array for nested lists of numbers, most others as they are.
 
         **Raises:** `Misfit` where it is not allowed.
         """
+        if self.fits(value):
+            return value
+        raise self.refused(value)
+
+    def fits(self, value: Any) -> bool:
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -119,23 +123,22 @@ class Whole(Kind):
         self.low = -math.inf if low is None else low
         self.high = math.inf if high is None else high
         self.allowed = "an integer"
-        if low is not None and high is not None:
-            self.allowed += f" from {low} to {high}"
-        elif low is not None:
-            self.allowed += f" of at least {low}"
+        if low is not None:
+            self.allowed += f" of at least {low}" if high is None else f" from {low} to {high}"
 
     def take(self, value):
+        number = value
         if type(value) is not int:
             if isinstance(value, bool | np.bool_):
                 raise self.refused(value)
             refuse_traced(value, self.allowed)
             try:
-                value = operator.index(value)
+                number = operator.index(value)
             except TypeError:
                 raise self.refused(value) from None
-        if not self.low <= value <= self.high:
-            raise self.refused(value)
-        return value
+        if not self.low <= number <= self.high:
+            raise self.refused(number)
+        return number
 
 
 class Number(Kind):
@@ -159,46 +162,23 @@ class Number(Kind):
         self.infinite, self.missing = infinite, missing
 
     def take(self, value):
-        number = value if type(value) is float else self._as_float(value)
+        number = value
+        if type(value) is not float:
+            number = _plain(value, self.allowed)
+            if isinstance(number, bool | np.bool_) or not isinstance(number, numbers.Real):
+                raise self.refused(value)
+            try:
+                number = float(number)
+            except OverflowError:
+                raise self.refused(value) from None
         if not self.fits(number):
             raise self.refused(value)
         return number
 
-    def fits(self, number: float) -> bool:
-        if not math.isfinite(number):
-            return (self.infinite and number > 0) or (self.missing and math.isnan(number))
-        return self.low <= number <= self.high and self.above < number < self.below
-
-    def _as_float(self, value: Any) -> float:
-        refuse_traced(value, self.allowed)
-        if (
-            isinstance(value, np.ndarray | jax.Array)
-            and value.ndim == 0
-            and value.dtype.kind in "fiu"
-        ):
-            value = value.item()
-        if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
-            raise self.refused(value)
-        try:
-            return float(value)
-        except OverflowError:
-            raise self.refused(value) from None
-
-
-class Switch(Kind):
-    """True or False."""
-
-    allowed = "True or False"
-
-    def take(self, value):
-        if value is True or value is False:
-            return value
-        refuse_traced(value, self.allowed)
-        if isinstance(value, np.bool_):
-            return bool(value)
-        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0 and value.dtype == bool:
-            return bool(value)
-        raise self.refused(value)
+    def fits(self, value):
+        if not math.isfinite(value):
+            return (self.infinite and value > 0) or (self.missing and math.isnan(value))
+        return self.low <= value <= self.high and self.above < value < self.below
 
 
 class ComplexNumber(Kind):
@@ -207,14 +187,24 @@ class ComplexNumber(Kind):
     allowed = "a finite number"
 
     def take(self, value):
-        refuse_traced(value, self.allowed)
-        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
-            value = value.item()
-        if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Complex):
+        number = _plain(value, self.allowed)
+        if isinstance(number, bool | np.bool_) or not isinstance(number, numbers.Complex):
             raise self.refused(value)
-        if not (math.isfinite(value.real) and math.isfinite(value.imag)):
+        if not (math.isfinite(number.real) and math.isfinite(number.imag)):
             raise self.refused(value)
-        return complex(value)
+        return complex(number)
+
+
+class Switch(Kind):
+    """True or False."""
+
+    allowed = "True or False"
+
+    def take(self, value):
+        switch = value if isinstance(value, bool) else _plain(value, self.allowed)
+        if not isinstance(switch, bool | np.bool_):
+            raise self.refused(value)
+        return bool(switch)
 
 
 class OneOf(Kind):
@@ -224,11 +214,8 @@ class OneOf(Kind):
         self.words = words
         self.allowed = listed([repr(word) for word in words])
 
-    def take(self, value):
-        for word in self.words:
-            if value is word or (type(value) is type(word) and value == word):
-                return value
-        raise self.refused(value)
+    def fits(self, value):
+        return any(value is x or (type(value) is type(x) and value == x) for x in self.words)
 
 
 class Text(Kind):
@@ -236,10 +223,8 @@ class Text(Kind):
 
     allowed = "a string"
 
-    def take(self, value):
-        if isinstance(value, str):
-            return value
-        raise self.refused(value)
+    def fits(self, value):
+        return isinstance(value, str)
 
 
 class Nothing(Kind):
@@ -247,14 +232,19 @@ class Nothing(Kind):
 
     allowed = "None"
 
-    def take(self, value):
-        if value is None:
-            return value
-        raise self.refused(value)
+    def fits(self, value):
+        return value is None
+
+
+def _plain(value: Any, allowed: str) -> Any:
+    """A number of Python for an array without axes."""
+    refuse_traced(value, allowed)
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    return value.item() if is_array and value.ndim == 0 else value
 
 
 def refuse_traced(value: Any, allowed: str) -> None:
-    if isinstance(value, jax.core.Tracer):
+    if is_tracer(value):
         raise Misfit(
             f"must be {allowed} whose value is known, but JAX traces it: call this outside of jit, "
             "vmap and grad",
@@ -309,9 +299,9 @@ class Reals(Kind):
         if array.dtype.kind not in self.types:
             raise self._wrong_type(value, array)
         if not self._fits(array.shape):
-            one = "one number" if self.shape == () else f"of shape {self._written()}"
-            raise Misfit(f"must be {one}, not of shape {array.shape}", near=True)
-        if not isinstance(array, jax.core.Tracer):
+            what = "one number" if self.shape == () else f"of shape {self._written()}"
+            raise Misfit(f"must be {what}, not of shape {array.shape}", near=True)
+        if not is_tracer(array):
             self._check_values(array)
         if array.dtype.kind != self.types[0]:
             array = array.astype(self.dtype)
@@ -320,21 +310,15 @@ class Reals(Kind):
     def _array(self, value: Any) -> np.ndarray | jax.Array:
         try:
             return np.asarray(value)
-        except jax.errors.TracerArrayConversionError:
-            return self._traced(value)
+        except jax.errors.TracerArrayConversionError:  # some of the numbers are traced
+            with contextlib.suppress(ValueError, TypeError):
+                return jnp.asarray(value)
         except (ValueError, TypeError):
             if isinstance(value, list | tuple):
                 raise Misfit(
                     "must be a rectangular array, but its rows differ in length", near=True
                 ) from None
-            raise self.refused(value) from None
-
-    def _traced(self, value: Any) -> jax.Array:
-        """Numbers in sequences of which some are traced."""
-        try:
-            return jnp.asarray(value)
-        except (ValueError, TypeError):
-            raise self.refused(value) from None
+        raise self.refused(value) from None
 
     def _wrong_type(self, value: Any, array: Any) -> Misfit:
         if array.dtype.kind == "c":
@@ -361,8 +345,8 @@ class Reals(Kind):
             return False
         sizes: dict[str, int] = {}
         for word, n in zip(words, shape, strict=True):
-            known = int(word) if word.isdecimal() else sizes.setdefault(word, n)
-            if n != known and word.isalnum():
+            size = int(word) if word.isdecimal() else sizes.setdefault(word, n)
+            if n != size and word.isalnum():
                 return False
         return True
 
@@ -370,7 +354,9 @@ class Reals(Kind):
         values = np.asarray(array)
         # (A sum is a number where all of them are, and takes no memory.)
         free = self.missing and self.infinite
-        if values.dtype.kind not in "iu" and not free and not np.isfinite(_sum(values)):
+        with np.errstate(all="ignore"):
+            finite = values.dtype.kind in "iu" or free or np.isfinite(np.sum(values))
+        if not finite:
             bad = np.isinf(values) if self.missing else ~np.isfinite(values)
             if self.infinite:
                 bad &= ~np.isinf(values)
@@ -384,8 +370,8 @@ class Reals(Kind):
         if not bad.any():
             return
         if values.ndim == 0:
-            one = self.single if self.sign == "any" else f"a {self.sign} number"
-            raise Misfit(f"must be {one}, not {show(values.item())}", near=True)
+            single = self.single if self.sign == "any" else f"a {self.sign} number"
+            raise Misfit(f"must be {single}, not {show(values.item())}", near=True)
         index = tuple(map(int, np.argwhere(bad)[0]))
         raise Misfit(
             f"must be {allowed}, but is {values[index]:.6g} at index "
@@ -411,8 +397,3 @@ class Integers(Reals):
     single, sort = "an integer", "integers"
     types = "iu"
     dtype = int
-
-
-def _sum(values: np.ndarray) -> Any:
-    with np.errstate(all="ignore"):
-        return np.sum(values)

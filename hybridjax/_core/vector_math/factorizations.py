@@ -14,6 +14,7 @@ infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, 
 """
 
 import functools as ft
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,9 @@ def solve_positive(
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
-    lower, below, pivots, x = _square(n), _square(n), [], []
+    lower, below = _square(n), _square(n)
+    pivots: list[Array] = []
+    x: list[Array] = []
     singular = jnp.asarray(False)
     for j in range(n):
         for i in range(j, n):
@@ -201,7 +204,7 @@ def lu(
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))
 
 
-def _square(n, fill=None):
+def _square(n: int, fill: Any = None) -> list[list[Any]]:
     return [[fill] * n for _ in range(n)]
 
 

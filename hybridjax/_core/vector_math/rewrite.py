@@ -2,8 +2,8 @@
 
 A function that a user has written with `jnp` is traced, and in its program (a jaxpr) the equations
 for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `trigonometry`, and
-the factorizations behind `jnp.linalg` by those of `factorizations`;
-docs/how-to/speed-up.md says why, and how accurate that is. Only the public `jax.extend.core` is used.
+the factorizations behind `jnp.linalg` by those of `factorizations`
+(docs/how-to/speed-up.md: reasons, accuracy). Only the public `jax.extend.core` is used.
 Where a later JAX has another name for what is looked for here, nothing is replaced, and all is as
 slow as it would be without.
 """
@@ -51,9 +51,8 @@ _enabled = True
 
 @checked
 def enable_vector_math(enabled: bool = True) -> None:
-    """Whether trigonometric functions, and factorizations of small matrices, in fields, guards,
-    resets and outputs are computed for several lanes at once, for this process: they are, unless
-    this is called with `False`.
+    """Switch vectorized trigonometric functions and small factorizations on or off in vector
+    fields, guards, resets and outputs, for this process. Default: on.
 
     On CPU, `jnp.sin` and its relatives take 8 to 22 ns for every number in double precision; what
     replaces them takes 2 to 3 ns and is accurate to 1.5 to 3.3 units in the last place (see
@@ -103,7 +102,7 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
 
 
 def _number(eqn: jex.JaxprEqn) -> int:
-    """How many of our trigonometric functions there are in an equation."""
+    """Return the number of our trigonometric functions in an equation."""
     if eqn.primitive in _TRIGONOMETRY:
         return 1
     if eqn.primitive.name not in _OUTER:
@@ -137,7 +136,7 @@ def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
         sources = [behind.get(v, frozenset()) for v in eqn.invars if isinstance(v, jex.Var)]
         functions = frozenset((k, j) for j in range(_number(eqn))).union(*sources)
         behind |= dict.fromkeys(eqn.outvars, functions)
-        vector = eqn.primitive.name in ("stack", "concatenate") and eqn.outvars[0].aval.ndim == 1
+        vector = eqn.primitive.name in ("stack", "concatenate") and len(_shape(eqn.outvars[0])) == 1
         if vector and len(functions) > _TOGETHER:
             rows = _equation(_rows, tuple(v.aval for v in eqn.invars))
             eqn = rows.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
@@ -204,8 +203,8 @@ def _solved(eqn: jex.JaxprEqn, factors: dict) -> jex.JaxprEqn | None:
     if lengths.matvec != 1 or not by_factors or product.primitive is not primitives.dot_general_p:
         return None
     (left, last), batch = product.params["dimension_numbers"]
-    n, axes = matrix.aval.shape[-1], right.aval.ndim
-    shared = matrix.aval.ndim == 2 and (tuple(left), tuple(last)) == ((1,), (axes - 1,))
+    n, axes = _shape(matrix)[-1], len(_shape(right))
+    shared = len(_shape(matrix)) == 2 and (tuple(left), tuple(last)) == ((1,), (axes - 1,))
     if not shared or batch != ((), ()) or n > factorizations.UNROLLED_PIVOTED:
         return None
     if product.invars != times.jaxpr.invars:
@@ -245,12 +244,12 @@ def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:
 def _with_own_derivative(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
     """A function with a derivative rule of its own that factorizes a matrix, as `det` does; its
     rule is rewritten, too."""
-    known = [v for v in eqn.invars if isinstance(v, jex.Var)]
+    variables = [v for v in eqn.invars if isinstance(v, jex.Var)]
     kept = all(type(v).__name__ != "DropVar" for v in eqn.outvars)
-    if not (len(set(known)) == len(eqn.invars) and kept and _factorizes(eqn)):
+    if not (len(set(variables)) == len(eqn.invars) and kept and _factorizes(eqn)):
         return None
     program = eqn.params["call_jaxpr"]
-    alone = program.jaxpr.replace(constvars=[], invars=known, outvars=eqn.outvars, eqns=[eqn])
+    alone = program.jaxpr.replace(constvars=[], invars=variables, outvars=eqn.outvars, eqns=[eqn])
     theirs = jex.jaxpr_as_fun(program.replace(jaxpr=alone, consts=[]))
     ours = jex.jaxpr_as_fun(_replaced_program(program, trigonometry))
     return _Ours(_derived_as(theirs, ours, trigonometry), _avals(eqn))
@@ -270,6 +269,10 @@ def _derived_as(theirs: Callable, ours: Callable, trigonometry: bool) -> Callabl
         return vectorized(derivative, trigonometry=trigonometry)(primals, tangents)
 
     return jax.jit(function)
+
+
+def _shape(v: Any) -> tuple[int, ...]:
+    return v.aval.shape
 
 
 def _avals(eqn: jex.JaxprEqn) -> tuple:
@@ -296,17 +299,16 @@ def _as_tuple(value: Any) -> tuple:
 
 # JAX traces an inner jit once and keeps it: what becomes of it is kept as well, since JAX's caches
 # of its derivatives and its batched form go by the identity of a program.
-_KNOWN: dict[bool, WeakKeyDictionary] = {flag: WeakKeyDictionary() for flag in (False, True)}
+_REPLACED: dict[bool, WeakKeyDictionary] = {flag: WeakKeyDictionary() for flag in (False, True)}
 
 
 def _replaced_program(program: jex.ClosedJaxpr, trigonometry: bool) -> jex.ClosedJaxpr:
-    known = _KNOWN[trigonometry]
-    if program not in known:
+    replaced = _REPLACED[trigonometry]
+    if program not in replaced:
         jaxpr = _replaced(program.jaxpr, trigonometry)
         # None: unchanged. (The program itself as the value would keep its own key alive.)
-        known[program] = None if jaxpr is program.jaxpr else program.replace(jaxpr=jaxpr)
-    found = known[program]
-    return program if found is None else found
+        replaced[program] = None if jaxpr is program.jaxpr else program.replace(jaxpr=jaxpr)
+    return replaced[program] or program
 
 
 @ft.lru_cache(maxsize=256)

@@ -21,6 +21,7 @@ Each has derivatives of all orders, in forward and reverse mode. Arguments of ot
 """
 
 import functools as ft
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -46,37 +47,15 @@ class _Numbers(NamedTuple):
 
 _DOUBLE = _Numbers(
     (1.5707963267341256, 6.077100506303966e-11, 2.0222662487111665e-21, 8.4784276603689e-32),
-    (
-        -0.1666666666666663,
-        0.008333333333322103,
-        -0.00019841269829577054,
-        2.7557313616915243e-06,
-        -2.5050747041638134e-08,
-        1.5896187163960848e-10,
-    ),
-    (
-        0.0416666666666666,
-        -0.001388888888887412,
-        2.4801587289479338e-05,
-        -2.755731435145688e-07,
-        2.0875723147665586e-09,
-        -1.1359639900700292e-11,
-    ),
-    (
-        -0.333333333333332,
-        0.1999999999995404,
-        -0.14285714280244025,
-        0.1111111078590334,
-        -0.09090897829448295,
-        0.07692061508484056,
-        -0.06663118879205376,
-        0.05847997682515918,
-        -0.05039793699138138,
-        0.03807697614533479,
-        -0.017920777271075074,
-    ),
+    (-0.1666666666666663, 0.008333333333322103, -0.00019841269829577054, 2.7557313616915243e-06,
+     -2.5050747041638134e-08, 1.5896187163960848e-10),
+    (0.0416666666666666, -0.001388888888887412, 2.4801587289479338e-05, -2.755731435145688e-07,
+     2.0875723147665586e-09, -1.1359639900700292e-11),
+    (-0.333333333333332, 0.1999999999995404, -0.14285714280244025, 0.1111111078590334,
+     -0.09090897829448295, 0.07692061508484056, -0.06663118879205376, 0.05847997682515918,
+     -0.05039793699138138, 0.03807697614533479, -0.017920777271075074),
     3.061616997868383e-17,
-)
+)  # fmt: skip
 _SINGLE = _Numbers(
     (1.5703125, 4.837512969970703e-4, 7.549533620476723e-08, 2.5633440682570896e-12),
     (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4),
@@ -85,7 +64,7 @@ _SINGLE = _Numbers(
     -2.1855695000931213e-8,
 )
 _NUMBERS = {jnp.dtype("float64"): _DOUBLE, jnp.dtype("float32"): _SINGLE}
-_TAN_PI_8 = 0.41421356237309503
+_TAN_PI_8 = math.tan(math.pi / 8)
 
 
 def _polynomial(coefficients, z):
@@ -102,8 +81,8 @@ def _sincos(x):
     a = x - k * n.pi_2[0]
     b = k * n.pi_2[1]
     r = a - b
-    rest = (a - r) - b  # what rounding took from r
-    r = (r + (rest - k * n.pi_2[2])) - k * n.pi_2[3]
+    lost = (a - r) - b  # by rounding
+    r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]
     # Acts from |x| ~ 1e14 on only, where x does not determine r any more.
     r = jax.lax.clamp(jax.lax.full_like(r, -0.8), r, jax.lax.full_like(r, 0.8))
     z = r * r
@@ -162,7 +141,7 @@ def _leg(x):
 
 
 def of_one_type(*dtypes) -> bool:
-    """Whether arguments of these types are all float64, or all float32."""
+    """Return whether arguments of these types are all float64, or all float32."""
     return dtypes[0] in _NUMBERS and all(x == dtypes[0] for x in dtypes)
 
 

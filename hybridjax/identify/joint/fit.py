@@ -1,25 +1,180 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from ..._core.arguments import Numbers
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Order, StepCount
+from ..._core.boundary.kinds import Order, Scalar, StepCount, Vector
 from ..._core.boundary.values import Integers
 from ..._core.precision import require_x64
+from ..._core.results import Result
+from ..._core.signal import unit_of
+from ..._core.text import number
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
+from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from .ldtp_fit import LDTPFit
-from .to_htf import fit_to_htf
-from .to_series import fit_to_series
+from ..denominator import multipliers_of
+from ..htf_errors import ROUNDING, check_values, error_weights
+from ..multiplier_estimate import MultiplierEstimate
+from ..multipliers import exact_htf
+from ..series.records import PreparedRecords
+from .descent import ModelPoint, Spread, minimize
+from .frequency import FrequencyProblem, transfer, transfer_slopes
+from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
+from .noise import Predictor, noise_model, noise_spectrum
+from .prediction import SeriesPart, SeriesProblem
+from .realization import given_dims, realize
+from .subspace import subspace_model
+
+
+# Cost, relative to its expectation, above which a `repr` reports a misfit. Larger: errors 1.4 times
+# as large as their variances go unmentioned; smaller: chance does.
+_TOO_LARGE = 2.0
+# Periods of the impulse response from which a minimal model is made, and lags at least. Fewer:
+# states that appear late are missed.
+_PERIODS, _LAGS = 4, 17
+
+Guess = LDTP | Order | Annotated[Numbers, Integers("N", sign="positive")]
+
+
+class LDTPFit(MultiplierEstimate):
+    r"""A linear periodic model that maximizes the likelihood, and its uncertainty.
+
+    **Fields:**
+
+    - `model`: the fitted `LDTP`. The coordinates of its states are arbitrary; multipliers and HTFs
+      do not depend on them, and have standard errors.
+    - `multipliers` (d,): by decreasing modulus, d the smallest dimension of any x[n].
+      `coefficients` (d,): of their polynomial.
+    - `covariance` (d, d): covariance of the coefficients, with `covariance_freedom` degrees of
+      freedom (infinite if variances were given). `standard_errors`, `contains` and `ellipse` follow
+      from it. Infinite if the data do not determine all coefficients.
+    - `unknowns`: number of unknowns, without the choice of coordinates.
+    - `cost`: sum of squares of the residuals in units of the errors' standard deviations, and
+      `freedom`, its expectation. A larger cost means too few dimensions, or a local minimum.
+      Without variances, as always for time series, the unit follows from the residuals, and the two
+      are equal: use `hj.validate`.
+    - `result`: code of `Result`, OK or NOT_CONVERGED.
+    - `harmonics` (M,): harmonics that were fitted; for time series, all N.
+    - `noise`: an `LDTP` whose response to independent white inputs of variance one is the noise of
+      the outputs; None for HTFs.
+    """
+
+    model: LDTP
+    multipliers: Complex[np.ndarray, " d"]
+    coefficients: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    covariance_freedom: float = eqx.field(static=True)
+    cost: float = eqx.field(static=True)
+    freedom: int = eqx.field(static=True)
+    result: int = eqx.field(static=True)
+    harmonics: tuple[int, ...] = eqx.field(static=True)
+    noise: LDTP | None
+    _coordinates: LocalCoordinates
+    _root: Float[np.ndarray, "P r"]
+    _hidden: Float[np.ndarray, "P h"]
+    _scale: Float[np.ndarray, " ny"]
+
+    @property
+    def unknowns(self) -> int:
+        return self._coordinates.size
+
+    @property
+    def n_sections(self) -> int:
+        return self.model.n_sections
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return self.model.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.model.outputs
+
+    @checked
+    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
+        """Return the HTFs of the fitted model at frequencies f (F,), in cycles per period.
+
+        The variance is that of the fit, to first order. It is infinite for combinations that the
+        data do not determine, e.g. at harmonics that were not fitted.
+
+        **Arguments:** `harmonics`: Default: those that were fitted.
+        """
+        f = np.atleast_1d(np.asarray(f, float))
+        harmonics = (
+            self.harmonics if harmonics is None else check_harmonics(harmonics, self.n_sections)
+        )
+        H = transfer(self._coordinates.model, f, harmonics)
+        variance, spread = np.zeros(H.shape), Spread(self._root, self._hidden)
+        for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):
+            variance[:, rows] = spread.variance(slopes)
+        size = self._scale[:, None]
+        return HTF(
+            f, H * size, harmonics, self.n_sections, self.inputs, self.outputs, "fit",
+            variance=variance * size**2,
+        )  # fmt: skip
+
+    @checked
+    def noise_spectrum(
+        self, f: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> Float[np.ndarray, "M F ny"]:
+        """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
+
+        See `hj.identify.noise_spectrum`.
+
+        **Raises:** `DefinitionError` if no noise was fitted.
+        """
+        if self.noise is None:
+            raise DefinitionError(
+                "no noise was fitted: HTFs tell its variance at their own lines only "
+                "(`HTF.variance`); fit to series."
+            )
+        return noise_spectrum(self.noise, f, harmonics)
+
+    @property
+    def predictor(self) -> Predictor | None:
+        """The predictor one step ahead that `hj.validate` uses; None if no noise was fitted."""
+        if self.noise is None:
+            return None
+        model, size = self._coordinates.model, self._scale[:, None]
+        D = np.asarray(self.noise.D)
+        model = model._replace(
+            C=[size * C for C in model.C],
+            D=[size * x for x in model.D],
+            K=[K / size.T if K.shape[1] else K for K in model.K],
+        )
+        return Predictor(model, D @ D.swapaxes(1, 2), self.inputs, self.outputs)
+
+    def __repr__(self) -> str:
+        return f"LDTPFit(multipliers {self.show_multipliers()}; {self._about()})"
+
+    def _about(self) -> str:
+        state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
+        about = f"misfit {self.cost:.6g}, expected {self.freedom}"
+        if self.cost > _TOO_LARGE * self.freedom:
+            about += (
+                " (errors are larger than their variances: too few dimensions, or a local minimum "
+                "that another guess avoids)"
+            )
+        if self.noise is not None:
+            size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
+            each = zip(self.outputs, size, strict=True)
+            shown = ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in each)
+            about = f"errors one step ahead {shown}"
+        return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections{state}"
 
 
 @checked
 def fit_ldtp(
     data: HTF | RecordedData,
-    guess: LDTP | Order | Annotated[Numbers, Integers("N", sign="positive")],
+    guess: Guess,
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
@@ -28,25 +183,25 @@ def fit_ldtp(
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
-    *To HTFs*, with independent, circular, normal errors of the variances given:
+    *HTFs*, with independent, circular, Gaussian errors of the variances given:
 
     $$V(A, B, C, D) = \sum \frac{2}{v}\, | H_m(\omega) - \hat H_m(\omega; A, B, C, D) |^2$$
 
     over all frequencies, harmonics, outputs and inputs. `fit_multipliers` gives each of the
-    transfer functions a numerator of its own; here they follow from fewer numbers, and
-    multipliers are more exact (`hj.identify.ldtp_bound` says by how much).
+    transfer functions a numerator of its own; here they follow from fewer unknowns, and the
+    standard errors of multipliers are smaller (`hj.identify.ldtp_bound` returns them).
 
-    *To series*, with normal errors e of predictions one step ahead:
+    *Time series*, with Gaussian errors e of predictions one step ahead:
 
     $$x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n], \qquad y[n] = C[n] x[n] + D[n] u[n] + e[n]$$
 
     $V = \sum_n T_n \log \det S[n]$ with S[n] the covariance of the $T_n$ errors at section n
     (Ljung, *System Identification*, 1999, for each section). With `noise="output"` K is zero and S
-    the same at all sections: white noise of sensors. With "innovations" the noise is whatever
-    periodic process the states can make: noise that drives the system (every such system has this
-    form, by Kalman's filter), and, with more states, colored noise.
+    the same at all sections: white noise of sensors. With "innovations" the noise is any periodic
+    process of the states: process noise (every such system has this form, by Kalman's filter),
+    and, with more states, colored noise.
 
-    By Levenberg and Marquardt's iteration, with exact derivatives, in local coordinates in which
+    The iteration is Levenberg-Marquardt's, with exact derivatives, in local coordinates in which
     the choice of states does not count (McKelvey, Helmersson and Ribarits 2004).
 
     ```python
@@ -55,31 +210,202 @@ def fit_ldtp(
 
     **Arguments:**
 
-    - `data`: HTFs, estimated, with harmonics as many as can be had: few of them determine few of
-      the matrices' entries; without variances each output counts relative to its misfit. Or series,
-      as for `fit_series`.
-    - `guess`: the dimension of the state at each section or at all: the fit begins with what
-      `hj.identify.realize` makes of HTFs, and with a subspace method for series. Or the model to
-      begin with, observable, which has these dimensions. Too few bias the multipliers: the misfit
-      shows it where variances are known (`cost` beside `freedom`), `hj.validate` for series. The
-      iteration finds the nearest minimum, which the same numbers show not to be the lowest.
-    - `noise`: of series, see above; "output" for HTFs.
-    - `start`: of series. "free": the state at the start of each record is unknown; "cycle": zero.
-      "free" for HTFs, which have none.
+    - `data`: estimated HTFs, with as many harmonics as possible: few harmonics determine few
+      entries of the matrices. Without variances each output is weighted by its residuals. Or time
+      series, as for `fit_series`.
+    - `guess`: dimension of the state, at each section or at all. The fit then starts from
+      `hj.identify.realize` for HTFs, and from a subspace method for time series. Or an observable
+      model with these dimensions to start from. Too few dimensions bias the multipliers: compare
+      `cost` with `freedom` where variances are known, and use `hj.validate` for time series. The
+      iteration finds the nearest minimum; the same numbers show whether it is the lowest.
+    - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
+    - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
+      none. Default: "free".
     - `direct`: whether outputs may depend on the input at their own section; if not, D = 0.
-    - `max_steps`: of the iteration.
+      Default: True.
+    - `max_steps`: largest number of steps. Default: 50.
 
-    **Raises:** `DefinitionError` if the two do not fit together, for NaN in the HTFs, variances
-    that are not positive, a guess with a state that outputs never show, or fewer numbers in the
-    data than unknowns; for records with `lead`.
+    **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
+    variances that are not positive, a guess with an unobservable state, fewer numbers in the data
+    than unknowns, or records with `lead`.
     """
     require_x64()
-    if isinstance(data, HTF):
-        if noise == "innovations":
-            raise DefinitionError("HTFs tell nothing of innovations: give the series.")
-        if start == "cycle":
-            raise DefinitionError(
-                "HTFs have no start, the response is periodic: leave `start` out."
-            )
-        return fit_to_htf(data, guess, direct, max_steps)
-    return fit_to_series(data, guess, noise == "innovations", start == "free", direct, max_steps)
+    if not isinstance(data, HTF):
+        return _fit_to_series(
+            PreparedRecords(data), guess, noise == "innovations", start == "free", direct, max_steps
+        )
+    if noise == "innovations":
+        raise DefinitionError("HTFs tell nothing of innovations: give the series.")
+    if start == "cycle":
+        raise DefinitionError("HTFs have no start, the response is periodic: leave `start` out.")
+    return _fit_to_htf(data, guess, direct, max_steps)
+
+
+def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit:
+    scale = check_values(htf)
+    if not isinstance(guess, LDTP):
+        guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
+    require_same("guess and data", guess, htf)
+    problem = FrequencyProblem.of(htf, error_weights(htf, scale), scale)
+    model = _without_direct(PeriodicModel.of(guess, scale), direct)
+    unknowns = local_coordinates(model, direct).size
+    freedom = problem.residuals - unknowns
+    if freedom < 1:
+        raise DefinitionError(
+            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns."
+        )
+    if not np.isfinite(problem.cost(model)):
+        raise DefinitionError("the guess is resonant at a frequency of the HTFs.")
+    point, converged = minimize(problem, model, direct, max_steps)
+    if htf.variance is None:
+        # A second descent, with the outputs weighted by their residuals.
+        square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
+        weight = problem.weight / np.maximum(np.sqrt(square / 2), ROUNDING)[:, None]
+        problem = problem._replace(weight=weight)
+        point, converged = minimize(problem, point.model, direct, max_steps)
+    model = point.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)
+    known = htf.variance is not None
+    return _finished(point, converged, model, scale, htf.harmonics, freedom, known)
+
+
+def _fit_to_series(
+    records: PreparedRecords,
+    guess: Guess,
+    innovations: bool,
+    free_start: bool,
+    direct: bool,
+    max_steps: int,
+) -> LDTPFit:
+    if records.lead:
+        raise DefinitionError(
+            f"the outputs of the records depend on inputs up to {records.lead} samples later "
+            "(`lead`), those of an LDTP on earlier ones only: use `fit_series`."
+        )
+    N, ny, scale = records.n_sections, len(records.outputs), records.scale
+    parts = SeriesParts(records)
+    first = [n for part in parts for n in part.first.tolist()]
+    drift = sum(round(float((part.drift**2).sum())) for part in parts)
+    numbers = int(records.sampled.sum()) - drift
+    same = np.tile(np.eye(ny), (N, 1, 1))
+    problem = SeriesProblem(parts, same, innovations, free_start, numbers)
+    if not isinstance(guess, LDTP):
+        model = subspace_model(parts, given_dims(guess, N, "guess") or [], innovations)
+    else:
+        require_same("guess and data", guess, records)
+        model = PeriodicModel.of(guess, scale)
+        if innovations:
+            model = _with_gain(model, problem)
+    model = _without_direct(model, direct)
+    unknowns = local_coordinates(model, direct).size
+    freedom = numbers - unknowns
+    if free_start:
+        freedom -= sum(model.dims[n] for n in first)
+    fewest = records.sampled.min()
+    if freedom < 1 or fewest <= ny + unknowns / (N * ny):
+        raise DefinitionError(
+            f"the series hold {numbers} numbers, {fewest} samples of an output at one of "
+            f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
+        )
+    if not np.isfinite(problem.cost(model)):
+        raise DefinitionError("the predictions of the guess grow beyond all numbers.")
+    point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
+    model = point.coordinates.model
+    sources = noise_model(model, point.problem.S, scale, records.outputs)
+    fitted = model.to_ldtp(scale, records.inputs, records.outputs)
+    harmonics = all_harmonics(N)
+    return _finished(point, converged, fitted, scale, harmonics, freedom, False, sources)
+
+
+class SeriesParts:
+    """The grids of records by section, which can be iterated over again and again."""
+
+    def __init__(self, records: PreparedRecords):
+        self._records = records
+        self._kept = list(self._read()) if records.in_memory else None
+
+    def _read(self) -> Iterator[SeriesPart]:
+        return (SeriesPart.of(grid, self._records.scale) for grid in self._records)
+
+    def __iter__(self) -> Iterator[SeriesPart]:
+        return self._read() if self._kept is None else iter(self._kept)
+
+
+def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:
+    return model if direct else model._replace(D=[0.0 * D for D in model.D])
+
+
+def _with_gain(model: PeriodicModel, problem: SeriesProblem) -> PeriodicModel:
+    """Return the guess with K = 0, or the model of the subspace method with its dimensions, where
+    the data suffice for that and it is more likely."""
+    K = [np.zeros((len(A), len(C))) for A, C in zip(model.A, model.C, strict=True)]
+    plain = model._replace(K=K)
+    try:
+        other = subspace_model(problem.parts, model.dims, True)
+    except DefinitionError:
+        return plain
+    return min(plain, other, key=lambda x: np.linalg.slogdet(problem.reweighted(x).S)[1].sum())
+
+
+def _finished(
+    point: ModelPoint,
+    converged: bool,
+    model: LDTP,
+    scale: Float[np.ndarray, " ny"],
+    harmonics: tuple[int, ...],
+    freedom: int,
+    known: bool,
+    noise: LDTP | None = None,
+) -> LDTPFit:
+    """Return the fit at a minimum.
+
+    **Arguments:** `model`: with the outputs in their own units, which are `scale`. `known`: whether
+    the variances of the errors were given.
+    """
+    c, slopes = characteristic_slopes(point.coordinates)
+    spread = point.equations.spread(1.0 if known else point.cost / freedom)
+    return LDTPFit(
+        model=model,
+        multipliers=multipliers_of(c),
+        coefficients=c,
+        covariance=spread.covariance(slopes),
+        covariance_freedom=np.inf if known else float(freedom),
+        cost=point.cost if known else float(freedom),
+        freedom=freedom,
+        result=Result.OK if converged else Result.NOT_CONVERGED,
+        harmonics=harmonics,
+        noise=noise,
+        _coordinates=point.coordinates,
+        _root=spread.root,
+        _hidden=spread.hidden,
+        _scale=scale,
+    )
+
+
+@checked
+def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
+    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
+
+    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
+    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
+    numerators: this is the bound of `fit_ldtp`. The square of the ratio of the two standard errors
+    is the factor of data that the structure saves.
+
+    **Arguments:**
+
+    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
+      harmonics and `variance` of the experiment; H is not used.
+
+    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
+
+    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
+    """
+    exact = exact_htf(model, htf)
+    lags = max(_PERIODS * model.n_sections, _LAGS - 1) + 1
+    minimal = realize(np.asarray(model.impulse_response(lags)))
+    scale = check_values(exact)
+    problem = FrequencyProblem.of(exact, error_weights(exact, scale), scale)
+    direct = bool(np.asarray(model.D).any())
+    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
+    c, slopes = characteristic_slopes(coordinates)
+    spread = problem.linearize(coordinates).spread()
+    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

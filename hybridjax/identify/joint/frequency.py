@@ -1,4 +1,4 @@
-r"""Misfit of harmonic transfer functions, and its derivatives in closed form.
+r"""Residuals of harmonic transfer functions, and their derivatives in closed form.
 
 With $z = e^{2 \pi i f / N}$ and periodic $\tilde x$, the response to $u[n] = z^n$ is
 $z^n \tilde x[n]$ and
@@ -23,17 +23,16 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ...linear.htf import HTF
-from .coordinates import LocalCoordinates
-from .normal_equations import NormalEquations
-from .periodic_model import PeriodicModel
+from .descent import NormalEquations
+from .model import LocalCoordinates, PeriodicModel
 
 
-# Numbers of a Jacobian that are held at once. Doubled: twice the memory, 64 MB.
+# Numbers of a Jacobian that are held at once, 32 MB. Larger: memory; smaller: loops in Python.
 _HELD = 2**21
 
 
 class FrequencyProblem(NamedTuple):
-    """Harmonic transfer functions that a model is to have."""
+    """Harmonic transfer functions to which a model is fitted."""
 
     f: Float[np.ndarray, " F"]
     harmonics: tuple[int, ...]
@@ -45,28 +44,24 @@ class FrequencyProblem(NamedTuple):
     def of(
         cls, htf: HTF, weight: Float[np.ndarray, "M F ny nu"], scale: Float[np.ndarray, " ny"]
     ) -> "FrequencyProblem":
-        """With outputs in units of `scale`; `weight` is for those in their own."""
+        """Return the problem with outputs in units of `scale`.
+
+        **Arguments:** `weight`: for outputs in their own units.
+        """
         size = scale[:, None]
         return cls(np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size)
 
     @property
     def residuals(self) -> int:
-        """How many there are, of real ones."""
+        """The number of real residuals."""
         return 2 * self.target.size
 
-    def thinned(self, step: int) -> "FrequencyProblem":
-        """Only every so many lines."""
-        rows = slice(step // 2, None, step)
-        return FrequencyProblem(
-            self.f[rows], self.harmonics, self.target[:, rows], self.weight[:, rows]
-        )
-
     def errors(self, model: PeriodicModel) -> Complex[np.ndarray, "M F ny nu"]:
-        """In units of standard deviations."""
+        """Return the residuals in units of standard deviations."""
         return self.weight * (self.target - transfer(model, self.f, self.harmonics))
 
     def cost(self, model: PeriodicModel) -> float:
-        """Infinite for a model that is resonant, or grows beyond all numbers, in a period."""
+        """Return the sum of squares; infinite for a model that is resonant or overflows."""
         try:
             with np.errstate(all="ignore"):
                 cost = float((np.abs(self.errors(model)) ** 2).sum())
@@ -75,13 +70,13 @@ class FrequencyProblem(NamedTuple):
         return cost if np.isfinite(cost) else np.inf
 
     def reweighted(self, model: PeriodicModel) -> "FrequencyProblem":
-        """Itself: its weights are known."""
+        """Return the problem itself: its weights are known."""
         return self
 
     def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
-        """With the B (and D, if it is free) that fit best, in which the HTFs are linear.
+        """Return the model with the best B (and D, if free), in which the HTFs are linear.
 
-        What cannot be computed, as at a resonance, is left as it is.
+        A model that is resonant stays as it is.
         """
         N, (ny, nu) = model.n_sections, model.D[0].shape
         m = np.array(self.harmonics)
@@ -103,12 +98,12 @@ class FrequencyProblem(NamedTuple):
                 gram[j] += columns @ columns.T
                 along[j] += columns @ target.ravel().view(float)
         try:
-            each = [NormalEquations(g, a).solution()[0] for g, a in zip(gram, along, strict=True)]
+            each = [NormalEquations(g, a).step(0.0)[0] for g, a in zip(gram, along, strict=True)]
         except np.linalg.LinAlgError:
             return model
-        found = np.stack(each, axis=1)
-        B = [found[a:b] for a, b in pairwise(ends)]
-        D = list(found[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
+        x = np.stack(each, axis=1)
+        B = [x[a:b] for a, b in pairwise(ends)]
+        D = list(x[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
         return model._replace(B=B, D=D)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
@@ -125,7 +120,7 @@ class FrequencyProblem(NamedTuple):
 def transfer(
     model: PeriodicModel, f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]
 ) -> Complex[np.ndarray, "M F ny nu"]:
-    """The harmonic transfer functions of a model."""
+    """Return the harmonic transfer functions of a model."""
     N = model.n_sections
     G = np.stack(
         [
@@ -140,7 +135,7 @@ def transfer(
 def transfer_slopes(
     coordinates: LocalCoordinates, f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
-    """Derivatives of the harmonic transfer functions, for some frequencies at a time."""
+    """Iterate over derivatives of the harmonic transfer functions, by groups of frequencies."""
     ny, nu = coordinates.model.D[0].shape
     for rows in _chunks(len(f), coordinates.size * len(harmonics) * ny * nu):
         ones = np.ones((len(harmonics), len(f[rows]), ny, nu))
@@ -148,7 +143,7 @@ def transfer_slopes(
 
 
 def _chunks(length: int, size: int) -> list[slice]:
-    """Frequencies in stretches, for each of which so many numbers are held."""
+    """Return slices of frequencies, `size` numbers of a Jacobian for each frequency."""
     step = max(_HELD // size, 1)
     return [slice(k, min(k + step, length)) for k in range(0, length, step)]
 
@@ -159,7 +154,7 @@ def _slopes(
     harmonics: tuple[int, ...],
     weight: Float[np.ndarray, "M F ny nu"],
 ) -> Complex[np.ndarray, "P M F ny nu"]:
-    """Derivatives of the HTFs times weights."""
+    """Return derivatives of the HTFs times weights."""
     model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
     N, (ny, nu) = model.n_sections, model.D[0].shape
     states, after = states_at(model, f), _after(model, f, m)
@@ -182,7 +177,7 @@ def _slopes(
 
 
 def _after(model: PeriodicModel, f: Float[np.ndarray, " F"], m: Int[np.ndarray, " M"]):
-    """What a change of the state after each section adds to the HTFs, (d, M, F, ny) each."""
+    """Return derivatives of the HTFs by the state after each section, (d, M, F, ny)."""
     N, ny = model.n_sections, len(model.C[0])
     z = np.exp(2j * np.pi / N * (m[:, None] + f))
     mu = adjoints(model, z.ravel())
@@ -199,16 +194,16 @@ def _waves(m: Int[np.ndarray, " M"], n: int, N: int):
 def states_at(
     model: PeriodicModel, f: Float[np.ndarray, " F"]
 ) -> list[Complex[np.ndarray, "_ F nu"]]:
-    r"""$\tilde x$ at each section, (d, F, nu)."""
+    r"""Return $\tilde x$ at each section, (d, F, nu)."""
     N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
     back = np.exp(-2j * np.pi / N * f)[:, None]
 
     def around(x):
-        found = []
+        states = []
         for A, B in zip(model.A, model.B, strict=True):
-            found.append(x)
+            states.append(x)
             x = (_real_times(A, x) + B[:, None, :]) * back
-        return found, x
+        return states, x
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
     return around(np.einsum("fab,bfj->afj", _resolvent(phi, np.exp(-2j * np.pi * f)), forced))[0]
@@ -217,29 +212,29 @@ def states_at(
 def adjoints(
     model: PeriodicModel, z: Complex[np.ndarray, " F"]
 ) -> list[Complex[np.ndarray, "_ F ny"]]:
-    r"""$\mu$ at each section, transposed: (d, F, ny)."""
+    r"""Return $\mu$ at each section, transposed: (d, F, ny)."""
     ny, phi = len(model.C[0]), model.monodromy()
     back = 1 / z[:, None]
 
     def around(mu):
-        found = []
+        out = []
         for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
             mu = _real_times(A.T, mu)
             mu *= back
             mu += C.T[:, None, :]
-            found.append(mu)
-        return found[::-1]
+            out.append(mu)
+        return out[::-1]
 
     forced = around(np.zeros((len(phi), len(z), ny), complex))[0]
     return around(np.einsum("fba,bfi->afi", _resolvent(phi, z**-model.n_sections), forced))
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
-    """(a, *rest): a product with a real matrix."""
+    """Return the product with a real matrix, (a, *rest)."""
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
     return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
 
 
 def _resolvent(phi: Float[np.ndarray, "d d"], z_N: Complex[np.ndarray, " F"]):
-    r"""$(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
+    r"""Return $(I - \Phi z^{-N})^{-1}$, given $z^{-N}$."""
     return np.linalg.inv(np.eye(len(phi)) - phi * z_N[:, None, None])

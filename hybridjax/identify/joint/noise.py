@@ -1,57 +1,68 @@
-r"""Periodic noise: what a linear periodic model makes of white inputs."""
+"""Periodic noise: spectra, models of noise, and predictors one step ahead."""
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.arguments import require_same
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Scalar, Vector
 from ...errors import DefinitionError
+from ...experiments.record import Record
 from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
+from ..series.records import CycleGrid
 from .frequency import adjoints
-from .periodic_model import PeriodicModel
+from .model import Blocks, PeriodicModel
+from .prediction import SeriesPart, SeriesProblem
+
+
+# Periods after which a gain that still changes raises an error, and the last change of a
+# covariance, relative to the standard deviations.
+_MAX_PERIODS, _SETTLED = 10_000, 1e-12
 
 
 @checked
 def noise_spectrum(
     noise: LDTP, f: Scalar | Vector, harmonics: Harmonics | None = None
 ) -> Float[np.ndarray, "M F ny"]:
-    r"""The spectrum of periodic noise where the harmonics of lines lie.
+    r"""Return the spectrum of periodic noise at the harmonics of excited frequencies.
 
-    Noise v of the outputs that a periodic model makes of independent inputs w of variance one,
+    The noise v of the outputs is the response of a periodic model to independent inputs w of
+    variance one,
 
     $$s[n+1] = A[n] s[n] + B[n] w[n], \qquad v[n] = C[n] s[n] + D[n] w[n],$$
 
-    has, over long windows of L samples,
+    Over long windows of L samples its spectrum is
 
     $$S(\varphi) = \lim \frac{1}{L}\, E\,\Big|\sum_n v[n]\, e^{-2 \pi i \varphi n / N}\Big|^2
     = \frac{1}{N} \sum_n \big| D[n] + z^{-1} \mu[n+1] B[n] \big|^2, \qquad
     z = e^{2 \pi i \varphi / N},$$
 
     with the adjoint $\mu[n] = C[n] + z^{-1} \mu[n+1] A[n]$ (the cyclic spectrum at cycle frequency
-    zero: Gardner, Napolitano and Paura 2006). $H_m$ at the line f is disturbed by what lies at
-    f + m.
+    zero: Gardner, Napolitano and Paura 2006). The noise of $H_m$ at f is that at f + m.
 
-    White noise with the standard deviation sigma gives sigma^2 for all f and m. The variance of
-    an H_m that was measured with a cosine of amplitude a in P periods is
-    $4 S(f + m) / (N P a^2)$: that of `Design.expected_variance(noise=1)` times this.
+    White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
+    variance of an H_m that is measured with a cosine of amplitude a in P periods is
+    $4 S(f + m) / (N P a^2)$: that of `Design.expected_variance(noise=1)` times the spectrum.
 
     **Arguments:**
 
-    - `noise`: stable, its inputs white with variance one: as many as it has outputs, more, or less.
-    - `f` (F,): lines, cycles per period. `harmonics`: which ones; None means all N.
+    - `noise`: a stable model with any number of white inputs of variance one.
+    - `f` (F,): frequencies, in cycles per period. `harmonics`: Default: all N.
 
     **Returns:** (M, F, ny), the squared unit of each output.
 
     **Raises:** `DefinitionError` for a model with a multiplier of modulus one or more, whose noise
-    grows without end.
+    is not stationary.
     """
     f = np.atleast_1d(np.asarray(f, float))
     N = noise.n_sections
     harmonics = check_harmonics(harmonics, N)
     if len(noise.multipliers) and np.abs(noise.multipliers[0]) >= 1:
         raise DefinitionError(
-            f"the noise grows without end: its model has a multiplier of modulus "
+            f"the noise grows without bound: its model has a multiplier of modulus "
             f"{np.abs(noise.multipliers[0]):.4g}, which must be below 1."
         )
     model = PeriodicModel.of(noise, np.ones(len(noise.outputs)))
@@ -70,17 +81,104 @@ def noise_model(
     scale: Float[np.ndarray, " ny"],
     outputs: tuple[str, ...],
 ) -> LDTP:
-    """The noise of a model in innovation form, of inputs with variance one.
+    """Return the noise of a model in innovation form, with inputs of variance one.
 
     **Arguments:** `S`: covariances of the innovations, in units of `scale`, as the model's outputs.
     """
-    ny = len(outputs)
     L = np.linalg.cholesky(S)
     names = tuple(f"noise of {name}" for name in outputs)
     D = [scale[:, None] * root for root in L]
     if not model.K[0].shape[1]:
         zero = np.zeros((len(S), 1, 1))
-        return LDTP(zero, zero * np.ones(ny), np.zeros((len(S), ny, 1)), D, None, names, outputs)
+        B, C = zero * np.ones(len(outputs)), np.zeros((len(S), len(outputs), 1))
+        return LDTP(zero, B, C, D, None, names, outputs)
     B = [K @ root for K, root in zip(model.K, L, strict=True)]
-    C = [scale[:, None] * C for C in model.C]
-    return LDTP.from_blocks(model.A, B, C, D, names, outputs)
+    return LDTP.from_blocks(model.A, B, [scale[:, None] * C for C in model.C], D, names, outputs)
+
+
+class Predictor(NamedTuple):
+    """A model in innovation form, in the units of the outputs."""
+
+    model: PeriodicModel
+    S: Float[np.ndarray, "N ny ny"]
+    """Covariances of the innovations."""
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def n_sections(self) -> int:
+        return self.model.n_sections
+
+    @property
+    def dims(self) -> list[int]:
+        return self.model.dims
+
+    @classmethod
+    def of(cls, model: LDTP, noise: LDTP) -> "Predictor":
+        """Return the predictor of outputs that are the sum of those of a model and of noise.
+
+        **Raises:** `DefinitionError` if these do not fit together, or an output has no noise of its
+        own.
+        """
+        require_same("model and noise", model, noise, ("n_sections", "outputs"))
+        ones = np.ones(len(model.outputs))
+        plant, source = PeriodicModel.of(model, ones), PeriodicModel.of(noise, ones)
+        K, S = _innovations(source)
+        d, after = plant.dims, [len(A) for A in plant.A]
+        both = PeriodicModel(
+            A=[
+                np.block([[a, np.zeros((len(a), e))], [np.zeros((len(b), i)), b]])
+                for a, b, i, e in zip(plant.A, source.A, d, source.dims, strict=True)
+            ],
+            B=[np.pad(b, [(0, len(k)), (0, 0)]) for b, k in zip(plant.B, K, strict=True)],
+            C=[np.concatenate(pair, axis=1) for pair in zip(plant.C, source.C, strict=True)],
+            D=plant.D,
+            K=[np.pad(k, [(i, 0), (0, 0)]) for k, i in zip(K, after, strict=True)],
+        )
+        return cls(both, S, model.inputs, model.outputs)
+
+    def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
+        """Return the outputs expected at each sample, given the samples before it."""
+        part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(len(self.outputs)))
+        path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
+        expected = [
+            x @ C.T + u @ D.T
+            for x, C, u, D in zip(path.x, self.model.C, part.u, self.model.D, strict=True)
+        ]
+        expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
+        rows = slice(record.first_section, record.first_section + len(record.u))
+        return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, len(self.outputs))[rows]
+
+
+def _innovations(noise: PeriodicModel) -> tuple[Blocks, Float[np.ndarray, "N ny ny"]]:
+    """Return the Kalman gain and the covariance of the innovations of the steady state.
+
+    The periodic Riccati equation is iterated (Bittanti and Colaneri 2009) from the covariance of
+    the state without measurements, after as many periods as the state has coordinates: it has the
+    units of the states, and all noise has reached it.
+    """
+    P = np.zeros((noise.dims[0], noise.dims[0]))
+    for _ in range(noise.dims[0]):
+        for A, B in zip(noise.A, noise.B, strict=True):
+            P = A @ P @ A.T + B @ B.T
+    unit, S = np.sqrt(np.diag(P)), np.zeros((noise.n_sections, *noise.D[0].shape[:1] * 2))
+    for _ in range(_MAX_PERIODS):
+        before, K = (P, S), []
+        S = np.zeros_like(S)
+        for n, (A, B, C, D) in enumerate(zip(noise.A, noise.B, noise.C, noise.D, strict=True)):
+            S[n] = C @ P @ C.T + D @ D.T
+            if not np.linalg.eigvalsh(S[n])[0] > 0:
+                raise DefinitionError(
+                    "the outputs have no noise of their own at a section: give each some, however "
+                    "small, by an input of its own in `noise.D`."
+                )
+            K.append(np.linalg.solve(S[n], (A @ P @ C.T + B @ D.T).T).T)
+            left, entering = A - K[-1] @ C, B - K[-1] @ D
+            P = left @ P @ left.T + entering @ entering.T
+        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+        if all(
+            (np.abs(new - old) <= _SETTLED * size[..., :, None] * size[..., None, :]).all()
+            for new, old, size in zip((P, S), before, (unit, sizes), strict=True)
+        ):
+            return K, S
+    raise DefinitionError("the noise has no steady state: give a stable model of it.")

@@ -1,1 +1,1 @@
-"""Rhythms of which the times of events are known: intervals, and the phase response curve."""
+"""Rhythms of which only the times of events are known."""

@@ -1,37 +1,48 @@
-"""Phase response curves from intervals: least squares on durations."""
+r"""Phase response curves from intervals: penalized least squares on durations.
+
+The coefficients of a curve have prior variances $\tau^2 / k^4$, as those of a smoothing spline do
+(Wahba, *Spline Models for Observational Data*, 1990), and $\tau$ maximizes the marginal likelihood
+of the durations. Residuals of intervals of one block may add up to more than independent errors
+would: the likelihood is that of errors with as much variance as sums over blocks have
+(quasi-likelihood: McCullagh 1983).
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import optimize
 
 from ...identify.denominator import Covariance, sandwich
-from .intervals import Intervals
-from .phase_model import Forecast, Table, forecast
-from .smoothness import Smoothness, smoothness_of
+from .model import Forecast, Intervals, Table, basis, forecast, tabulated
 
 
-# Half waves of a curve. Doubled: finer detail, which few data show and the smoothness keeps out.
+# Half waves of a curve. More: time, for detail that the smoothness removes. Fewer: curves that jump
+# are cut off.
 WAVES = 20
-# Iterations of Gauss and Newton, at most. Doubled: slow ones come to their end.
-_STEPS = 30
-# Halvings of a step that raises the cost. Doubled: steps down to 1e-5 are tried.
-_HALVINGS = 8
-# Relative change of the cost that is the last. Doubled: minima are missed by 1.4 times as much.
-_SETTLED = 1e-6
-# How often jitter, smoothness and miscounted intervals are found anew, at most. Doubled: nothing
-# changes.
-_ROUNDS = 8
-# Phase by which an interval may miss the model's: half a cycle more, and it is nearer to two.
-# Doubled: intervals in which an event was missed count as one.
-_MISCOUNTED = 0.5
-# Relative changes of the jitter, and of the smoothness, that are the last. Doubled: they are known
-# to 2 and 20 %.
-_SAME_JITTER, _SAME_SMOOTHNESS = 0.01, 0.1
-# Blocks from which standard errors are computed: one for each trial where there are so many, else
-# parts of trials with so many intervals or more. Doubled: standard errors of few long trials
-# scatter less, but know of shorter memory only.
+# Most Gauss-Newton steps, and most halvings of a step or updates of jitter, smoothness and
+# miscounted intervals. More: time. Fewer: fits end before convergence.
+_STEPS, _ROUNDS = 30, 8
+# Relative changes at convergence: of the cost, and of jitter and smoothness. Larger: estimates
+# depend on the start. Smaller: more iterations for digits that noise hides.
+_SETTLED, _SAME = 1e-6, 0.01
+# Blocks from which standard errors are computed: one per trial if there are so many, else parts of
+# trials with at least so many intervals. More, shorter: blocks are not independent. Fewer, longer:
+# standard errors scatter.
 _BLOCKS, _SHORTEST_BLOCK = 30, 10
+
+
+class Smoothness(NamedTuple):
+    """The prior of a curve."""
+
+    penalty: Float[np.ndarray, " p"]
+    """Addition to the curvature of the sum of squares; zero for the mean."""
+    noise: float
+    """Variance of the residual of an interval, s^2, times the excess."""
+    excess: float
+    """Variance of sums over blocks relative to that of independent errors; at least 1."""
+    evidence: float
+    """Twice the logarithm of the likelihood ratio to a flat curve."""
 
 
 class CurveFit(NamedTuple):
@@ -42,95 +53,50 @@ class CurveFit(NamedTuple):
     jitter: float
     """Standard deviation of the phase at the end of a cycle."""
     used: Bool[np.ndarray, " L"]
-    """The intervals that count."""
+    """Intervals that are not miscounted."""
     residual: Float[np.ndarray, " L"]
-    """Of the durations, in s."""
+    """Residuals of the durations, in s."""
     forecast: Forecast
-    smoothness: Smoothness | None
-    """None for a flat curve, and one that is given."""
+    smoothness: Smoothness
     converged: bool
 
     @property
     def penalty(self) -> Float[np.ndarray, " p"]:
-        return np.zeros(len(self.coefficients)) if self.smoothness is None else self.smoothness[0]
+        return self.smoothness.penalty
+
+    def counted(self) -> Bool[np.ndarray, " L"]:
+        """Return the intervals whose forecast is off by less than half a cycle: others contain a
+        missed or a false event."""
+        return np.abs(self.residual * self.forecast.rate) < 0.5
 
 
-def fit_curve(
-    intervals: Intervals,
-    waves: int,
-    start: CurveFit | None = None,
-    given: Bool[np.ndarray, " L"] | None = None,
-) -> CurveFit:
-    """The curve of so many half waves that forecasts durations best (least squares), as smooth as
-    the data say.
+def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -> CurveFit:
+    """Return the curve of so many half waves that forecasts durations best (least squares), as
+    smooth as the marginal likelihood suggests.
 
-    Intervals that miss the forecast by half a cycle or more were miscounted (an event was missed,
-    or one was none), and do not count. `start`: a fit with as many half waves or fewer. `given`:
-    the intervals from which to learn; by default all.
+    Intervals whose forecast is off by half a cycle or more were miscounted, and not used.
+    `start`: a fit with as many half waves or fewer.
     """
-    given = np.ones(len(intervals.start), bool) if given is None else given
-    a, jitter, used = np.zeros(waves + 1), 0.0, given
+    a, jitter, used = np.zeros(waves + 1), 0.0, np.ones(len(intervals.start), bool)
     if start is None:
-        rates = _mean_rates(intervals, given)
+        rates = intervals.sums(1.0 * used) / intervals.sums(intervals.duration)
     else:
         a[: len(start.coefficients)], rates = start.coefficients, start.rates
-        jitter = start.jitter
-        used = given & ~miscounted(start.residual, start.forecast.rate)
-    smooth = None
+        jitter, used = start.jitter, start.counted()
+    flat = Smoothness(np.zeros(waves + 1), 0.0, 1.0, 0.0)
+    smooth, same = flat, False
     for _ in range(_ROUNDS):
-        table, before = Table.of(waves, jitter), smooth
+        table, before = tabulated(waves, jitter), smooth.penalty[-1]
         if waves:
-            smooth = _smoothness(intervals, _look(intervals, table, a, rates, used))
-        fit = _minimize(intervals, table, a, rates, used, smooth)
-        a, rates = fit.coefficients, fit.rates
-        counted = given & ~miscounted(fit.residual, fit.forecast.rate)
+            smooth = _smoothness(intervals, _look(intervals, table, a, rates, used, flat))
+        fit = _minimize(intervals, table, _look(intervals, table, a, rates, used, smooth))
+        a, rates, counted = fit.coefficients, fit.rates, fit.counted()
         now = float((fit.residual * fit.forecast.rate)[counted].std())
-        same = (counted == used).all() and abs(now - jitter) < _SAME_JITTER * now
+        same = (counted == used).all() and abs(now - jitter) < _SAME * now
         jitter, used = now, counted
-        if same and _as_smooth(before, smooth):
+        if same and abs(before - smooth.penalty[-1]) <= 10 * _SAME * smooth.penalty[-1]:
             break
     return fit._replace(jitter=jitter, used=used)
-
-
-def _as_smooth(before: Smoothness | None, now: Smoothness | None) -> bool:
-    if before is None or now is None:
-        return now is None
-    return bool(abs(before.penalty[-1] - now.penalty[-1]) < _SAME_SMOOTHNESS * now.penalty[-1])
-
-
-def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
-    """From the model near a fit."""
-    across, along = projected(intervals, fit)
-    left = (fit.residual - fit.forecast.by_rate * along[intervals.trial, 0]) * fit.used
-    freedom = int(fit.used.sum()) - intervals.trials
-    return smoothness_of(across, left, fit.coefficients, blocks_of(intervals), freedom)
-
-
-def fit_rates(intervals: Intervals, table: Table, given: Bool[np.ndarray, " L"]) -> CurveFit:
-    """The rates of the trials for a given curve."""
-    rates, used = _mean_rates(intervals, given), given
-    for _ in range(_ROUNDS):
-        fit = _minimize(intervals, table, np.ones(1), rates, used, None, fixed=True)
-        counted = given & ~miscounted(fit.residual, fit.forecast.rate)
-        if (counted == used).all():
-            break
-        rates, used = fit.rates, counted
-    return fit._replace(used=used)
-
-
-def miscounted(
-    residual: Float[np.ndarray, " L"], rate: Float[np.ndarray, " L"]
-) -> Bool[np.ndarray, " L"]:
-    """Intervals that miss the model's by half a cycle or more."""
-    return np.abs(residual * rate) >= _MISCOUNTED
-
-
-def _mean_rates(
-    intervals: Intervals, given: Bool[np.ndarray, " L"]
-) -> Float[np.ndarray, " trials"]:
-    """Intervals over their duration; of trials without one, that of the others."""
-    count, time = intervals.sums(1.0 * given), intervals.sums(given * intervals.duration)
-    return np.where(count > 0, count / np.where(count > 0, time, 1.0), count.sum() / time.sum())
 
 
 def _look(
@@ -139,48 +105,37 @@ def _look(
     a: Float[np.ndarray, " p"],
     rates: Float[np.ndarray, " trials"],
     used: Bool[np.ndarray, " L"],
-    smooth: Smoothness | None = None,
+    smooth: Smoothness,
 ) -> CurveFit:
-    """What a curve and rates leave."""
-    found = forecast(intervals, table, a, rates)
-    return CurveFit(a, rates, 0.0, used, intervals.duration - found.duration, found, smooth, True)
+    """Return a curve and rates with their residuals."""
+    ahead = forecast(intervals, table, a, rates)
+    return CurveFit(a, rates, 0.0, used, intervals.duration - ahead.duration, ahead, smooth, True)
 
 
-def _minimize(
-    intervals: Intervals,
-    table: Table,
-    a: Float[np.ndarray, " p"],
-    rates: Float[np.ndarray, " trials"],
-    used: Bool[np.ndarray, " L"],
-    smooth: Smoothness | None,
-    fixed: bool = False,
-) -> CurveFit:
-    """Gauss and Newton's iteration; `fixed`: over the rates only."""
+def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
+    """Gauss-Newton iteration over curve and rates."""
 
-    def at(a, rates):
-        fit = _look(intervals, table, a, rates, used, smooth)
-        return fit, float((fit.residual[used] ** 2).sum() + a @ (fit.penalty * a))
+    def cost_of(fit):
+        a = fit.coefficients
+        return float((fit.residual[fit.used] ** 2).sum() + a @ (fit.penalty * a))
 
-    fit, cost = at(a, rates)
+    cost = cost_of(fit)
     for _ in range(_STEPS):
         across, along = projected(intervals, fit)
-        step = np.zeros_like(a)
-        if not fixed:
-            curvature = across.T @ across + np.diag(fit.penalty)
-            downhill = across.T @ fit.residual - fit.penalty * fit.coefficients
-            step = np.linalg.lstsq(curvature, downhill)[0]
+        curvature = across.T @ across + np.diag(fit.penalty)
+        downhill = across.T @ fit.residual - fit.penalty * fit.coefficients
+        step = np.linalg.lstsq(curvature, downhill)[0]
         faster = along @ np.append(1.0, -step)
-        for k in range(_HALVINGS):
-            slowest = fit.rates / 2  # (a rate is never zero)
-            new, price = at(
-                fit.coefficients + step / 2**k, np.maximum(fit.rates + faster / 2**k, slowest)
-            )
-            if price < cost:
+        for k in range(_ROUNDS):
+            rates = np.maximum(fit.rates + faster / 2**k, fit.rates / 2)  # (never zero)
+            a = fit.coefficients + step / 2**k
+            new = _look(intervals, table, a, rates, fit.used, fit.smoothness)
+            if cost_of(new) < cost:
                 break
         else:
             return fit
-        settled = cost - price < _SETTLED * cost
-        fit, cost = new, price
+        settled = cost - cost_of(new) < _SETTLED * cost
+        fit, cost = new, cost_of(new)
         if settled:
             return fit
     return fit._replace(converged=False)
@@ -189,54 +144,117 @@ def _minimize(
 def projected(
     intervals: Intervals, fit: CurveFit
 ) -> tuple[Float[np.ndarray, "L p"], Float[np.ndarray, "trials p1"]]:
-    """Derivatives by the curve's coefficients less what the rates of the trials explain of them,
-    zero where intervals do not count; and how much rates explain of the residuals, and of these."""
-    found = fit.forecast
-    own = found.by_rate * fit.used
-    square = np.maximum(intervals.sums(own**2), np.finfo(float).tiny)
-    columns = np.column_stack([fit.residual, found.by_curve])
-    along = np.stack([intervals.sums(own * x) for x in columns.T], axis=1) / square[:, None]
-    explained = found.by_rate[:, None] * along[intervals.trial, 1:]
-    return (found.by_curve - explained) * fit.used[:, None], along
+    """Return derivatives with respect to the coefficients, without the part that the rates of the
+    trials explain (zero for miscounted intervals), and what rates explain of the residuals, and of
+    these derivatives."""
+    ahead = fit.forecast
+    by_rate = ahead.by_rate * fit.used
+    square = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
+    columns = np.column_stack([fit.residual, ahead.by_curve])
+    along = np.stack([intervals.sums(by_rate * x) for x in columns.T], axis=1) / square[:, None]
+    explained = ahead.by_rate[:, None] * along[intervals.trial, 1:]
+    return (ahead.by_curve - explained) * fit.used[:, None], along
 
 
-def blocks_of(intervals: Intervals) -> Int[np.ndarray, " L"]:
-    """The blocks whose errors count as independent."""
+def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
+    """Return the blocks whose errors count as independent."""
     if intervals.trials >= _BLOCKS:
         return intervals.trial
     return intervals.blocks(max(_SHORTEST_BLOCK, len(intervals.start) // (2 * _BLOCKS)))
 
 
+def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
+    """Maximize the marginal likelihood of the durations near a fit."""
+    tiny = np.finfo(float).tiny
+    across, along = projected(intervals, fit)
+    residual = (fit.residual - fit.forecast.by_rate * along[intervals.trial, 0]) * fit.used
+    p = across.shape[1]
+    curvature, pull = across.T @ across, across.T @ residual
+    # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
+    noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
+    freedom = max(int(fit.used.sum()) - intervals.trials - p, 1)
+    variance = float(noise_only @ noise_only) / freedom
+    block = _blocks(intervals)
+    sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)
+    values, axes = np.linalg.eigh(curvature)
+    determined = values > 1e-6 * values[-1]  # beyond rounding
+    excess = float(((sums @ axes[:, determined]) ** 2 / values[determined]).sum())
+    excess = max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
+    noise = variance * excess
+    weight = np.arange(1.0, p) ** 4
+    score = pull + curvature @ fit.coefficients
+    # The mean is free: its part is taken out.
+    share = curvature[1:, 0] / curvature[0, 0]
+    inner = curvature[1:, 1:] - np.outer(share, curvature[0, 1:])
+    gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
+    gain = np.maximum(gain, 0.0) / max(noise, tiny)
+    pull = (axes.T @ ((score[1:] - share * score[0]) / np.sqrt(weight))) ** 2
+    pull = pull / max(noise, tiny) ** 2
+
+    def improbable(log_size: float) -> float:
+        size = np.exp(log_size)
+        return float((np.log1p(size * gain) - size * pull / (1 + size * gain)).sum())
+
+    # Logarithms of tau^2, around that at which the best direction is half noise.
+    grid = np.arange(-24.0, 24.5, 0.5) - np.log(max(gain[-1], tiny))
+    best = grid[np.argmin([improbable(x) for x in grid])]
+    top = optimize.minimize_scalar(improbable, bounds=(best - 0.5, best + 0.5), method="bounded")
+    penalty = np.append(0.0, noise * weight / np.exp(top.x))
+    return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
+
+
 class Accuracy(NamedTuple):
-    """How well a curve is known."""
+    """Accuracy of a curve."""
 
     covariance: Covariance
     left_out: Float[np.ndarray, " blocks"]
-    """Sum of the squared errors of each block, of the forecast by a fit to the others."""
+    """Sums of squared errors of each block, forecast by a fit to the others."""
     detail: float
-    """How many numbers the data determine: the trace of what they say of the coefficients."""
+    """Number of coefficients that the data determine: the trace of their share in the curvature."""
 
 
 def accuracy_of(intervals: Intervals, fit: CurveFit) -> Accuracy:
-    """From blocks of intervals whose errors may depend on each other.
+    """Estimate the accuracy from blocks of intervals whose errors may depend on each other.
 
-    The errors of each are those of a forecast by a curve that was fitted to the other blocks, to
-    first order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a
-    bias, whose expected square is added (Nychka 1988: such intervals hold the curve at as many
-    phases as they say).
+    The errors of each block are those of a forecast by a curve fitted to the other blocks, to first
+    order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a bias,
+    whose expected square is added (Nychka 1988: such intervals hold the curve at as many phases as
+    they claim).
     """
     across, _ = projected(intervals, fit)
     data, smooth = across.T @ across, np.diag(fit.penalty)
-    curvature, block = data + smooth, blocks_of(intervals)
+    curvature, block = data + smooth, _blocks(intervals)
     count, p = int(block.max()) + 1, across.shape[1]
     score, shares, left_out = np.zeros((count, p)), np.zeros((count, p, p)), np.zeros(count)
     for k in range(count):
         rows = (block == k) & fit.used
-        own, error = across[rows], fit.residual[rows]
-        shares[k] = own.T @ own
-        change = np.linalg.lstsq(curvature - shares[k], own.T @ error)[0]
-        error = error + own @ change
-        score[k], left_out[k] = own.T @ error, error @ error
-    noise = 0.0 if fit.smoothness is None else fit.smoothness.noise
-    covariance = sandwich(curvature, score.T @ score + noise * smooth, shares + smooth / count)
+        x, error = across[rows], fit.residual[rows]
+        shares[k] = x.T @ x
+        error = error + x @ np.linalg.lstsq(curvature - shares[k], x.T @ error)[0]
+        score[k], left_out[k] = x.T @ error, error @ error
+    meat = score.T @ score + fit.smoothness.noise * smooth
+    covariance = sandwich(curvature, meat, shares + smooth / count)
     return Accuracy(covariance, left_out, float(np.trace(np.linalg.lstsq(curvature, data)[0])))
+
+
+def plain_curve(intervals: Intervals, fit: CurveFit) -> Float[np.ndarray, " p"]:
+    """Return coefficients by regression of durations on the input at phases that grow linearly from
+    event to event, as smooth as those of the fit.
+
+    An interval that ends late has other regressors than it would have had: they contain its noise,
+    so that the curve is biased.
+    """
+    waves = len(fit.coefficients) - 1
+    across = np.zeros((len(intervals.start), waves + 1))
+    for rows, inputs in intervals.chunks():
+        half, duration = intervals.step[rows] / 2, intervals.duration[rows]
+        for k, u in enumerate(inputs):
+            phase = k * half / duration
+            across[rows] += (np.where(phase < 1, u, 0.0) * half)[:, None] * basis(phase, waves)
+    across *= (-1 / fit.rates)[intervals.trial, None] * fit.used[:, None]
+    count = np.maximum(intervals.sums(1.0 * fit.used), 1.0)
+    both = np.column_stack([across, intervals.duration * fit.used])
+    mean = np.stack([intervals.sums(x) for x in both.T], axis=1) / count[:, None]
+    both -= mean[intervals.trial] * fit.used[:, None]
+    across, deviation = both[:, :-1], both[:, -1]
+    return np.linalg.lstsq(across.T @ across + np.diag(fit.penalty), across.T @ deviation)[0]

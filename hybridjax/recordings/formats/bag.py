@@ -1,7 +1,6 @@
 """Bags of ROS 1 and ROS 2, and MCAP files with messages of ROS."""
 
 import dataclasses
-import textwrap
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,47 +8,36 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import FileFormatError, HybridJaxError
-from .columns import Columns, Wanted, belongs, missing_library, no_such_signal
+from ...errors import FileFormatError
+from .columns import Columns, Wanted, library, reading
 
 
-# The longest array in a message whose numbers become signals. Doubled: parts of scans and images
-# may become signals.
+# Longest array in a message whose numbers become signals. Longer: scans and images become thousands
+# of signals. Shorter: joint positions of a humanoid are left out.
 _LONGEST = 64
-_BILLION = 10**9
-_HEADER = "std_msgs/msg/Header"
 
 
 def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
-    """A table for each wanted topic, with columns `topic.field`; times are those in the headers of
-    messages, else of their arrival, and count from the start of the bag. Only wanted topics are
-    read.
+    """Read a table with columns `topic.field` for each wanted topic; other topics are not decoded.
 
-    **Raises:** `DefinitionError` for a topic that is not there; `FileFormatError` for what is no
-    such file, or damaged, and for arrays whose length changes.
+    Times are the stamps in the headers of messages, or else the times of arrival. They count from
+    the start of the bag.
+
+    **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
+    file, and arrays whose length changes.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise missing_library("Bags of ROS and MCAP files", "rosbags", "ros") from error
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-            topics = {x.topic.lstrip("/") for x in bag.connections}
-            for name in wanted.signals or ():
-                if not any(belongs(name, x) or belongs(x, name) for x in topics):
-                    raise no_such_signal(path, name, sorted(topics))
-            chosen = [x for x in bag.connections if wanted.reaches(x.topic.lstrip("/"))]
-            found = {x.topic: _Topic(path, x.topic.lstrip("/"), wanted) for x in chosen}
-            for connection, arrival, data in bag.messages(chosen) if chosen else ():
-                message = bag.deserialize(data, connection.msgtype)
-                found[connection.topic].add(message, arrival)
-            return [x.columns(bag.start_time) for x in found.values() if x.names]
-    except HybridJaxError:
-        raise
-    except Exception as error:  # whatever broken bytes make rosbags stumble over
-        reason = textwrap.shorten(str(error) or type(error).__name__, 100)
-        raise FileFormatError(f"'{path}' is no bag of ROS, or damaged ({reason}).") from error
+    reader = library("rosbags.highlevel", "Bags of ROS and MCAP files", "ros").AnyReader
+    typesys = library("rosbags.typesys", "Bags of ROS and MCAP files", "ros")
+    store = typesys.get_typestore(typesys.Stores.LATEST)
+    with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
+        names = {x.topic.lstrip("/") for x in bag.connections}
+        wanted.require(path, sorted(names), groups=True)
+        chosen = [x for x in bag.connections if wanted.reaches(x.topic.lstrip("/"))]
+        topics = {x.topic: _Topic(path, x.topic.lstrip("/"), wanted) for x in chosen}
+        for connection, arrival, data in bag.messages(chosen) if chosen else ():
+            message = bag.deserialize(data, connection.msgtype)
+            topics[connection.topic].add(message, arrival)
+        return [x.columns(bag.start_time) for x in topics.values() if x.names]
 
 
 class _Topic:
@@ -73,28 +61,29 @@ class _Topic:
         self.values.extend(v for _, v in pairs)
         self.arrivals.append(arrival)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        self.stamps.append(0 if stamp is None else stamp.sec * _BILLION + stamp.nanosec)
+        self.stamps.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
 
     def columns(self, start: int) -> Columns:
-        """In the order of their times, in s since the start of the bag, in ns."""
+        """Return the columns in the order of their times, in s since the start of the bag (ns)."""
         stamps, notes = np.array(self.stamps), ()
         if not stamps.all():
             note = f"the times of {self.name} are those of arrival: its messages have no stamps"
             stamps, notes = np.array(self.arrivals), (note,)
         order = np.argsort(stamps, kind="stable")
-        time = (stamps[order] - start) / _BILLION
         rows = np.array(self.values).reshape(len(order), -1)[order]
         values = dict(zip(self.names, rows.T, strict=True))
-        return Columns({"time (s)": time} | values, notes)
+        return Columns({"time (s)": (stamps[order] - start) / 10**9} | values, notes)
 
 
 def _numbers(message: Any, name: str) -> Iterator[tuple[str, float]]:
-    """Numbers by the names of their fields; not those of headers, and of long arrays."""
+    """Yield numbers by the names of their fields, without headers and long arrays."""
     for field in dataclasses.fields(message):
-        value, own = getattr(message, field.name), f"{name}.{field.name}"
+        value, path = getattr(message, field.name), f"{name}.{field.name}"
         if isinstance(value, bool | int | float | np.number):
-            yield own, float(value)
+            yield path, float(value)
         elif isinstance(value, np.ndarray) and value.size <= _LONGEST:
-            yield from ((f"{own}.{k}", float(x)) for k, x in enumerate(value))
-        elif dataclasses.is_dataclass(value) and getattr(value, "__msgtype__", "") != _HEADER:
-            yield from _numbers(value, own)
+            yield from ((f"{path}.{k}", float(x)) for k, x in enumerate(value))
+        elif dataclasses.is_dataclass(value) and (
+            getattr(value, "__msgtype__", "") != "std_msgs/msg/Header"
+        ):
+            yield from _numbers(value, path)

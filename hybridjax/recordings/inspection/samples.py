@@ -1,39 +1,44 @@
-"""Samples that are none: numbers that stand for "no value", frozen, clipped and wrapped signals."""
+"""Samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies."""
 
+from collections.abc import Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ..recording import Trial
-from .finding import Finding, places, runs
+from ..findings import Finding, places
+from ..recording import Recording, Trial
+from ..smoothing import Series
 
 
-# How many ranges of all other samples a number that stands for "no value" lies outside of them.
-# Doubled: -999 is no longer recognized beside signals of the order of 100.
+# Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
+# signals of the order of 100. Smaller: genuine extremes are left out.
 _FAR = 3.0
-# The least number of equal samples in a row that are a plateau. Doubled: short plateaus pass.
+# Fewest equal samples in a row that form a plateau. More: short plateaus pass. Fewer: rounding
+# makes plateaus everywhere.
 _PLATEAU = 3
 # Plateaus per cycle from which on they belong to the rhythm, as those of a foot on the ground.
-# Doubled: a sensor that fails in every second cycle is recognized.
+# More: the rests of a limb are left out. Fewer: a sensor that fails now and then is believed.
 _BELONGS = 0.3
-# A frozen sensor stays for so many cycles and samples; where plateaus belong to the rhythm, for
-# so many times their length. Doubled: shorter failures pass.
-_FROZEN_CYCLES, _FROZEN_SAMPLES, _FROZEN_TIMES = 0.25, 10, 4
-# Of all samples, the share on plateaus at the largest (or least) value that is clipping, and how
-# many times more plateaus there are than at other values. Doubled: less clipping is seen.
+# Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
+# plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
+_FROZEN = 0.25, 10, 4
+# Least fraction of samples on plateaus at an extreme that is clipping, and its ratio to those on
+# other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are reported.
 _CLIPPED, _MOSTLY = 0.005, 5
-# Of its number of levels, the share by which an integer jumps that overflows. (Not to be doubled:
-# it lies below 1.)
-_WRAP = 0.5
-# Rounding of integers that were scaled, in levels. Doubled: nothing changes.
-_ROUNDING = 1e-3
+# Fraction of equal samples that makes two signals, or two trials, copies. Larger: copies with a few
+# edited samples pass. Smaller: signals that rest at zero together are copies.
+_EQUAL = 0.99
+# Difference of equal samples in standard deviations. Larger: similar cycles of a regular rhythm
+# match. Smaller: copies written with fewer digits pass.
+_SAME = 1e-3
 
 Rows = list[Bool[np.ndarray, " _"]]
 
 
 class Signal(NamedTuple):
-    """One signal in each trial. `period`: the rough durations of a cycle, in samples."""
+    """One signal in each trial. `period`: rough durations of a cycle, in samples."""
 
     name: str
     trials: tuple[Trial, ...]
@@ -41,87 +46,42 @@ class Signal(NamedTuple):
     period: list[float]
     is_input: bool
 
+    def left_out(self, cause: str, bad: Rows, text: str) -> tuple[Rows, list[Finding]]:
+        """Return the rows and a finding, if there are any; {} in `text`: number and places."""
+        count = sum(int(rows.sum()) for rows in bad)
+        text = f"{self.name} {text.format(count, places(self.trials, bad))}"
+        return bad, [Finding(cause, text, "left out")] if count else []
+
 
 def placeholders(s: Signal) -> tuple[Rows, list[Finding]]:
-    """Numbers such as -9999, far from all other samples."""
+    """Find numbers such as -9999, far from all other samples."""
     bad = [_placeholders(x) for x in s.values]
-    count = sum(int(b.sum()) for b in bad)
-    if not count:
-        return bad, []
     used = np.unique(np.concatenate([x[b] for x, b in zip(s.values, bad, strict=True)]))
-    text = (
-        f"{s.name} is {', '.join(f'{v:.6g}' for v in used)} at {count} samples "
-        f"({places(s.trials, bad)}), which is taken for missing; write NaN, or an empty field."
+    return s.left_out(
+        "no value",
+        bad,
+        f"is {', '.join(f'{v:.6g}' for v in used)} at {{}} samples ({{}}), which is taken for "
+        "missing; write NaN, or an empty field.",
     )
-    return bad, [Finding("no value", "left out", text)]
 
 
-def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
-    """A sensor that stays at one value for longer than its rhythm allows."""
-    bad = [_frozen(x, p, s.is_input) for x, p in zip(s.values, s.period, strict=True)]
-    count = sum(int(b.sum()) for b in bad)
-    if not count:
-        return bad, []
-    text = (
-        f"{s.name} does not change at all for {count} samples ({places(s.trials, bad)}), which are "
-        "taken for missing; look for the sensor, or the wire, that failed."
-    )
-    return bad, [Finding("frozen", "left out", text)]
-
-
-def clipped(s: Signal) -> list[Finding]:
-    """Plateaus at the largest or least value, and nowhere else. One at 0 is none."""
-    found = [_clipped(x) for x in s.values]
-    where = [t.name for t, (count, _) in zip(s.trials, found, strict=True) if count]
-    if not where:
-        return []
-    count, levels = sum(c for c, _ in found), next(v for c, v in found if c)
-    more = f" and {len(where) - 1} more trials" if len(where) > 1 else ""
-    text = (
-        f"{s.name} is cut off at {' and '.join(f'{v:.4g}' for v in levels)} in trial '{where[0]}'"
-        f"{more}, {count} samples: deviations beyond are not seen; choose a larger range."
-    )
-    return [Finding("clipped", "warned", text)]
-
-
-def wrapped(s: Signal) -> list[Finding]:
-    """Integers that begin anew at the other end of their range."""
-    for trial, x in zip(s.trials, s.values, strict=True):
-        levels = np.unique(x[np.isfinite(x)])
-        if len(levels) < 2:
-            continue
-        step = float(np.diff(levels).min())
-        count = (x - levels[0]) / step
-        whole = 1 + round(float(np.nanmax(count)))
-        off = np.nanmax(np.abs(count - np.round(count)))
-        jumps = int((np.abs(np.diff(count)) > _WRAP * whole).sum())
-        if off < _ROUNDING and whole.bit_count() == 1 and jumps > 1:
-            text = (
-                f"{s.name} jumps by the whole range of its {whole} levels {jumps} times in trial "
-                f"'{trial.name}', as integers that overflow: undo it (`numpy.unwrap` with "
-                f"period={whole * step:.6g}), or choose a larger range."
-            )
-            return [Finding("overflow", "refused", text)]
-    return []
-
-
-def _placeholders(x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _placeholders(x: Series) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
-    for pick in (np.min, np.max) * 2:  # two of either sign
-        rest = x[np.isfinite(x) & ~bad]
-        if not len(rest):
+    for extreme in (np.min, np.max) * 2:  # two of either sign
+        left = x[np.isfinite(x) & ~bad]
+        if not len(left):
             break
-        value = pick(rest)
-        others = rest[rest != value]
-        if len(others) and np.ptp(others) > 0 and _stands_for_nothing(value):
-            outside = max(others.min() - value, value - others.max())
-            if outside > _FAR * np.ptp(others):
+        value = extreme(left)
+        usual = left[left != value]
+        if len(usual) and np.ptp(usual) > 0 and _is_placeholder(value):
+            outside = max(usual.min() - value, value - usual.max())
+            if outside > _FAR * np.ptp(usual):
                 bad |= x == value
     return bad
 
 
-def _stands_for_nothing(value: float) -> bool:
-    """Whether a number is one that programs write for "no value": 999, -8888, -32768, 1e20, ..."""
+def _is_placeholder(value: float) -> bool:
+    """Return whether programs write this number for "no value": 999, -8888, -32768, 1e20, ..."""
     size = abs(float(value))
     digits = f"{size:.0f}"
     if size == round(size) and len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
@@ -129,24 +89,55 @@ def _stands_for_nothing(value: float) -> bool:
     return size in (2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1) or size >= 1e15
 
 
-def _frozen(x: Float[np.ndarray, " n"], period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
+def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
+    """Find a sensor that stays at one value for longer than its rhythm allows."""
+    return s.left_out(
+        "frozen",
+        [_frozen(x, p, s.is_input) for x, p in zip(s.values, s.period, strict=True)],
+        "does not change at all for {} samples ({}), which are taken for missing; look for the "
+        "sensor, or the wire, that failed.",
+    )
+
+
+def _frozen(x: Series, period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
-    first, length = runs(x)
+    first, length = _runs(x)
     plateaus = length[length >= _PLATEAU]
-    limit = max(_FROZEN_CYCLES * period, _FROZEN_SAMPLES)
+    limit = max(_FROZEN[0] * period, _FROZEN[1])
     if len(plateaus) > _BELONGS * len(x) / period:
-        if is_input:  # it is held, or rests, now and then
+        if is_input:  # an input that is held, or rests, now and then
             return bad
-        limit = max(limit, _FROZEN_TIMES * float(np.median(plateaus)))
+        limit = max(limit, _FROZEN[2] * float(np.median(plateaus)))
     for a, n in zip(first[length > limit], length[length > limit], strict=True):
         if not (is_input and x[a] == 0):
             bad[a : a + n] = True
     return bad
 
 
-def _clipped(x: Float[np.ndarray, " n"]) -> tuple[int, list[float]]:
-    """How many samples are cut off, and at which values."""
-    first, length = runs(x)
+def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+    """Return first samples and lengths of the runs of equal values; each NaN is its own run."""
+    first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
+    return first, np.diff(np.append(first, len(x)))
+
+
+def clipped(s: Signal) -> Iterator[Finding]:
+    """Find plateaus at the largest or least value, and nowhere else; one at 0 is no clipping."""
+    cut = [_clipped(x) for x in s.values]
+    where = [t.name for t, (count, _) in zip(s.trials, cut, strict=True) if count]
+    if where:
+        count, levels = sum(c for c, _ in cut), next(v for c, v in cut if c)
+        more = f" and {len(where) - 1} more trials" if len(where) > 1 else ""
+        yield Finding(
+            "clipped",
+            f"{s.name} is cut off at {' and '.join(f'{v:.4g}' for v in levels)} in trial "
+            f"'{where[0]}'{more}, {count} samples: deviations beyond are not seen; choose a larger "
+            "range.",
+        )
+
+
+def _clipped(x: Series) -> tuple[int, list[float]]:
+    """Return the number of clipped samples, and their values."""
+    first, length = _runs(x)
     flat = length >= _PLATEAU
     if not flat.any():
         return 0, []
@@ -156,3 +147,94 @@ def _clipped(x: Float[np.ndarray, " n"]) -> tuple[int, list[float]]:
     count = int(length[at_ends].sum())
     enough = count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum())
     return (count, ends) if enough else (0, [])
+
+
+def wrapped(s: Signal) -> Iterator[Finding]:
+    """Find integers that overflow: jumps by half of their levels, which are a power of two."""
+    for trial, x in zip(s.trials, s.values, strict=True):
+        levels = np.unique(x[np.isfinite(x)])
+        if len(levels) < 2:
+            continue
+        step = float(np.diff(levels).min())
+        count = (x - levels[0]) / step
+        whole = 1 + round(float(np.nanmax(count)))
+        off = np.nanmax(np.abs(count - np.round(count)))
+        jumps = int((np.abs(np.diff(count)) > 0.5 * whole).sum())
+        if off < 1e-3 and whole.bit_count() == 1 and jumps > 1:  # scaled integers, but for rounding
+            text = (
+                f"{s.name} jumps by the whole range of its {whole} levels {jumps} times in trial "
+                f"'{trial.name}', as integers that overflow: undo it (`numpy.unwrap` with "
+                f"period={whole * step:.6g}), or choose a larger range."
+            )
+            yield Finding("overflow", text, "refused")
+            return
+
+
+def doubled_signals(recording: Recording, names: list[str]) -> Iterator[Finding]:
+    """Find two columns with the same numbers."""
+    for a, b in combinations(names, 2):
+        for trial in recording.trials:
+            x, y = (trial.values[:, recording.column(name)] for name in (a, b))
+            both = np.isfinite(x) & np.isfinite(y)
+            if both.any() and np.ptp(x[both]) > 0 and (x == y)[both].mean() > _EQUAL:
+                text = (
+                    f"{a} and {b} are the same numbers in trial '{trial.name}': one of them was "
+                    "copied over the other, or leave one out."
+                )
+                yield Finding("a signal twice", text, "refused")
+                break
+
+
+def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list[Finding]]:
+    """Return for each trial the samples that an earlier trial holds already.
+
+    A few samples in a row are searched for in the other trial. If they occur there once (and only
+    once in their own trial), both trials are compared sample by sample.
+    """
+    columns, trials = [recording.column(name) for name in names], recording.trials
+    size = _SAME * np.nanstd(np.concatenate([t.values[:, columns] for t in trials]), axis=0)
+    repeated, findings = [np.zeros(len(t.time), bool) for t in trials], []
+    for (_, a), (j, b) in combinations(enumerate(trials), 2):
+        x, y = a.values[:, columns], b.values[:, columns]
+        shift = _shift(x, y, size)
+        if shift is None:
+            continue
+        first, last = max(0, shift), min(len(x), len(y) + shift)
+        same = np.zeros(len(y), bool)
+        off = np.abs(x[first:last] - y[first - shift : last - shift])
+        same[first - shift : last - shift] = (~(off > size)).all(axis=1)
+        if not (same & ~repeated[j]).any():
+            continue
+        cause, start = "overlap", f"{same.sum()} samples ({places([b], [same])}) are"
+        end = f"in trial '{a.name}' too, and count once; cut one of the two."
+        if same.mean() > _EQUAL:
+            cause, start = "a trial twice", f"all samples of trial '{b.name}' are"
+            end, same[:] = f"in trial '{a.name}' already, and count once.", True
+        repeated[j] |= same
+        findings.append(Finding(cause, f"{start} {end}", "left out"))
+    return repeated, findings
+
+
+def _shift(
+    x: Float[np.ndarray, "n k"], y: Float[np.ndarray, "m k"], size: Float[np.ndarray, " k"]
+) -> int | None:
+    """Return the number of samples by which y comes later than x, from eight probes of 64 samples:
+    overlaps of an eighth of a trial are found."""
+    n = 64
+    for at in np.linspace(0, len(y) - n, 8).astype(int) if len(y) >= n else ():
+        probe = y[at : at + n]
+        if np.isnan(probe).any() or len(_where(y, probe, size)) > 1:
+            continue
+        matches = _where(x, probe, size)
+        if len(matches) == 1:
+            return int(matches[0] - at)
+    return None
+
+
+def _where(
+    x: Float[np.ndarray, "n k"], probe: Float[np.ndarray, "m k"], size: Float[np.ndarray, " k"]
+) -> Int[np.ndarray, " _"]:
+    at = np.arange(len(x) - len(probe) + 1)
+    for k, row in enumerate(probe):
+        at = at[(np.abs(x[at + k] - row) <= size).all(axis=1)]
+    return at

@@ -1,0 +1,288 @@
+r"""Errors of predictions one step ahead, and their derivatives.
+
+$$e[n] = y[n] - C[n] x[n] - D[n] u[n], \qquad x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n]$$
+
+With K = 0 these are the errors of a simulation (output error). A change of the matrices at
+section n changes the predictions by $\delta C\,x + \delta D\,u$ there, and the next state by
+$\delta A\,x + \delta B\,u + \delta K\,e - K (\delta C\,x + \delta D\,u)$, which decays with
+$F = A - K C$. The error of a missing output is replaced by its mean, given the errors of the other
+outputs of this sample.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..series.output_error import RANK
+from ..series.records import CycleGrid
+from ..series.robust import ROUNDING
+from .descent import NormalEquations
+from .model import LocalCoordinates, PeriodicModel
+
+
+Columns = Float[np.ndarray, "_ _ _ _"]
+"""(R, T, d, columns): states of R records in T cycles, one for each column."""
+
+
+class SeriesPart(NamedTuple):
+    """R records of T cycles, by section."""
+
+    u: Float[np.ndarray, "N R T nu"]
+    y: Float[np.ndarray, "N R T ny"]
+    """In units of a scale; zero where there is no sample."""
+    sampled: Bool[np.ndarray, "N R T ny"]
+    lost: Bool[np.ndarray, "N R T ny"]
+    """Inside of a record, but not sampled."""
+    first: Int[np.ndarray, " R"]
+    """The section at which each record starts."""
+    drift: Float[np.ndarray, "N R T ny K"]
+    """An orthonormal basis of the drift of the samples of each output, zero beyond its rank."""
+
+    @classmethod
+    def of(cls, grid: CycleGrid, scale: Float[np.ndarray, " ny"]) -> "SeriesPart":
+        by_section = np.moveaxis(grid.sampled, 2, 0)
+        waves = grid.drift[None, :, None] * np.moveaxis(by_section, 3, 2)[..., None]
+        basis, s, _ = np.linalg.svd(waves, full_matrices=False)  # (N R ny T K)
+        kept = s > RANK * np.maximum(s.max(axis=-1, keepdims=True, initial=0), RANK)
+        return cls(
+            u=np.ascontiguousarray(np.moveaxis(grid.u, 2, 0)),
+            y=np.ascontiguousarray(np.moveaxis(grid.y / scale, 2, 0)),
+            sampled=by_section,
+            lost=np.moveaxis(grid.inside, 2, 0)[..., None] & ~by_section,
+            first=np.argmax(grid.inside[:, 0], axis=1),
+            drift=np.moveaxis(basis * kept[..., None, :], 2, 3),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """R, T."""
+        return self.u.shape[1], self.u.shape[2]
+
+    def without_drift(
+        self, n: int, x: Float[np.ndarray, "R T ny columns"]
+    ) -> Float[np.ndarray, "R T ny columns"]:
+        """Return columns at the samples of section n without the part that a drift explains."""
+        x = x * self.sampled[n][..., None]
+        if not self.drift.shape[-1]:
+            return x
+        basis = self.drift[n]
+        return x - np.einsum("rtik,rsik,rsic->rtic", basis, basis, x, optimize=True)
+
+
+class Path(NamedTuple):
+    """States and errors of a model, section by section."""
+
+    F: list[Float[np.ndarray, "R1 T1 after d"]]
+    gain: list[Float[np.ndarray, "R1 T1 after ny"]]
+    """K as a factor of the errors of sampled outputs."""
+    whiten: list[Float[np.ndarray, "R1 T1 ny ny"]]
+    """Factors that make these errors independent with variance one."""
+    x: list[Float[np.ndarray, "R T d"]]
+    entering: list[Float[np.ndarray, "R T ny"]]
+    """Errors that K multiplies, with their means for missing outputs."""
+    error: list[Float[np.ndarray, "R T ny"]]
+    """Zero where an output is missing, and without drift."""
+    starts: list[Float[np.ndarray, "R rows s"]]
+    """Responses of the predictions to the initial states, whitened."""
+    start_gram: Float[np.ndarray, "R s s"]
+
+
+class SeriesProblem(NamedTuple):
+    """Records that a model is to predict."""
+
+    parts: Iterable[SeriesPart]
+    S: Float[np.ndarray, "N ny ny"]
+    """Covariance of the errors at each section, whose inverse weights them."""
+    by_section: bool
+    """Whether each section has its own covariance."""
+    free_start: bool
+    residuals: int
+    """The number of samples."""
+
+    def cost(self, model: PeriodicModel) -> float:
+        """Return the weighted sum of squares; infinite for a model whose predictions overflow."""
+        cost = 0.0
+        with np.errstate(all="ignore"):
+            for part in self.parts:
+                try:
+                    path = self.path(model, part)
+                except np.linalg.LinAlgError:
+                    return np.inf
+                pairs = zip(path.whiten, path.error, strict=True)
+                cost += sum(float((_times(w, e) ** 2).sum()) for w, e in pairs)
+        return cost if np.isfinite(cost) else np.inf
+
+    def refined(self, model: PeriodicModel, direct: bool) -> PeriodicModel:
+        """Return the model itself: elimination of unknowns costs as much as a step."""
+        return model
+
+    def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
+        """Return the problem with the covariance of the errors of a model."""
+        square, count = np.zeros(self.S.shape), np.zeros(self.S.shape)
+        for part in self.parts:
+            for n, e in enumerate(self.path(model, part).error):
+                square[n] += np.einsum("rti,rtj->ij", e, e)
+                sampled = part.sampled[n].astype(float)
+                count[n] += np.einsum("rti,rtj->ij", sampled, sampled)
+        if not self.by_section:
+            square[:], count[:] = square.sum(axis=0), count.sum(axis=0)
+        values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
+        floor = np.maximum(ROUNDING**2, ROUNDING * values[:, -1:])
+        S = vectors * np.maximum(values, floor)[:, None] @ vectors.swapaxes(1, 2)
+        return self._replace(S=S)
+
+    def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
+        P = coordinates.size
+        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        for part in self.parts:
+            path = self.path(coordinates.model, part)
+            R, _ = part.shape
+            along = np.zeros((R, path.start_gram.shape[1], P))
+            for n, slopes in enumerate(_slopes(coordinates, part, path)):
+                J = path.whiten[n] @ part.without_drift(n, slopes)
+                flat = J.reshape(-1, P)
+                gram += flat.T @ flat
+                gradient += _times(path.whiten[n], path.error[n]).ravel() @ flat
+                along += path.starts[n].swapaxes(1, 2) @ J.reshape(R, -1, P)
+            solved = _solve_starts(path.start_gram, along)
+            gram -= np.tensordot(along, solved, ((0, 1), (0, 1)))
+        return NormalEquations(gram, gradient)
+
+    def path(self, model: PeriodicModel, part: SeriesPart) -> Path:
+        """Return states and errors for the initial states that fit best."""
+        R, T = part.shape
+        given, whiten = zip(*[self._weights(part, n) for n in range(len(self.S))], strict=True)
+        gain = [
+            K @ G if K.shape[1] else np.zeros((1, 1, len(K), G.shape[-1]))
+            for K, G in zip(model.K, given, strict=True)
+        ]
+        F = [A - G @ C for A, C, G in zip(model.A, model.C, gain, strict=True)]
+        y = [part.y[n] - part.u[n] @ D.T for n, D in enumerate(model.D)]
+        s = max(model.dims[n] for n in part.first) if self.free_start else 0
+
+        def enter(n: int, x: Columns) -> None:
+            begins = part.first == n
+            if s and begins.any():
+                x[begins, 0, :, 1 : 1 + x.shape[2]] = np.eye(x.shape[2])
+
+        def drive(n: int, later: Columns) -> None:
+            forced = _times(gain[n], y[n] * part.sampled[n])
+            later[..., 0] += part.u[n] @ model.B[n].T + forced
+
+        states, left, starts = [], [], []
+        gram, along = np.zeros((R, s, s)), np.zeros((R, s, 1))
+        for n, x in enumerate(recursion(F, (R, T, 1 + s), enter, drive, [1 + s] * len(F))):
+            error = model.C[n] @ x
+            error[..., 0] = y[n] - error[..., 0]
+            error = part.without_drift(n, error)
+            white = whiten[n] @ error
+            rows = white[..., 1:].reshape(R, error.shape[1] * error.shape[2], s)
+            gram += rows.swapaxes(1, 2) @ rows
+            along += rows.swapaxes(1, 2) @ white[..., :1].reshape(R, -1, 1)
+            states.append(x)
+            left.append(error)
+            starts.append(rows)
+        x0 = _solve_starts(gram, along)[:, None]
+        states = [x[..., 0] + (x[..., 1:] @ x0)[..., 0] for x in states]
+        entering = [
+            _times(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
+            for n, x in enumerate(states)
+        ]
+        error = [e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in left]
+        return Path(F, gain, list(whiten), states, entering, error, starts, gram)
+
+    def _weights(self, part: SeriesPart, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrix of the mean of all errors, given the sampled ones, and the matrix that
+        whitens the sampled ones."""
+        S, lost = self.S[n], part.lost[n]
+        if not lost.any():
+            return np.eye(len(S))[None, None], np.linalg.inv(np.linalg.cholesky(S))[None, None]
+        kept = 1.0 - lost
+        both = kept[..., :, None] * kept[..., None, :] * S + np.eye(len(S)) * lost[..., None]
+        mean = (S * kept[..., None, :]) @ np.linalg.inv(both)
+        return mean, np.linalg.inv(np.linalg.cholesky(both))
+
+
+def recursion(
+    F: Sequence[Float[np.ndarray, "_ _ _ _"]],
+    shape: tuple[int, int, int],
+    enter: Callable[[int, Columns], None],
+    drive: Callable[[int, Columns], None],
+    filled: Sequence[int],
+) -> Iterator[Columns]:
+    """Iterate over x at each section, where $x[n+1] = F[n] x[n] + \\ldots$ begins at zero.
+
+    All cycles are computed in parallel, first from zero at the start of each cycle, and then from
+    the states at the starts, which the first pass gives.
+
+    **Arguments:**
+
+    - `F`: (R, T, after, d) for each section; the first axes may have the length 1.
+    - `shape`: R, T and the number of columns.
+    - `enter`: adds terms to x at a section; `drive`: adds terms to the x after it.
+    - `filled`: number of columns that are not zero in the first cycle after each section.
+    """
+    R, T, columns = shape
+    x, phi = np.zeros((R, T, F[0].shape[-1], columns)), np.eye(F[0].shape[-1])[None, None]
+    for n, step in enumerate(F):
+        enter(n, x)
+        later = np.zeros((R, T, step.shape[-2], columns))
+        later[..., : filled[n]] = step @ x[..., : filled[n]]
+        drive(n, later)
+        x, phi = later, step @ phi
+    starts = np.zeros_like(x)
+    for k in range(T - 1):
+        starts[:, k + 1] = phi[:, min(k, phi.shape[1] - 1)] @ starts[:, k] + x[:, k]
+    x = starts
+    for n, step in enumerate(F):
+        enter(n, x)
+        yield x
+        x = step @ x
+        drive(n, x)
+
+
+def _slopes(
+    coordinates: LocalCoordinates, part: SeriesPart, path: Path
+) -> Iterator[Float[np.ndarray, "_ _ ny P"]]:
+    """Iterate over the derivatives of the predictions at each section."""
+    model, places = coordinates.model, coordinates.places
+
+    def drive(n: int, later: Columns) -> None:
+        place, gain, u = places[n], path.gain[n], part.u[n]
+        left = coordinates.to_A[n] - gain @ coordinates.to_C[n]
+        later[..., place["Y"]] += _outer(left, path.x[n])
+        unit = np.eye(later.shape[2])[None, None]
+        later[..., place["B"]] += _outer(unit, u)
+        if model.K[n].shape[1]:
+            later[..., place["K"]] += _outer(unit, path.entering[n])
+        if coordinates.direct:
+            later[..., place["D"]] -= _outer(gain, u)
+
+    ends = [max(s.stop for s in place.values()) for place in places]
+    shape = (*part.shape, coordinates.size)
+    for n, x in enumerate(recursion(path.F, shape, lambda n, x: None, drive, ends)):
+        J = model.C[n] @ x
+        J[..., places[n]["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
+        if coordinates.direct:
+            J[..., places[n]["D"]] += _outer(np.eye(len(model.C[n]))[None, None], part.u[n])
+        yield J
+
+
+def _times(matrix: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the product with the vector of each sample."""
+    return (matrix @ x[..., None])[..., 0]
+
+
+def _outer(left: Float[np.ndarray, "R1 T1 a q"], right: Float[np.ndarray, "R T b"]) -> np.ndarray:
+    """Return (R, T, a, q b), the outer products of rows of the left matrix and right vectors."""
+    product = left[..., None] * right[:, :, None, None, :]
+    return product.reshape(*product.shape[:3], -1)
+
+
+def _solve_starts(
+    gram: Float[np.ndarray, "R s s"], along: Float[np.ndarray, "R s columns"]
+) -> Float[np.ndarray, "R s columns"]:
+    """Return the pseudoinverse of each Gram matrix times columns."""
+    return np.linalg.pinv(gram, RANK, hermitian=True) @ along

@@ -1,0 +1,72 @@
+"""Warnings about data, by cause."""
+
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .recording import Recording, Trial
+
+
+class Finding(eqx.Module):
+    """A property of data, or of a fit to them, that makes a result worth less than it seems.
+
+    **Fields:**
+
+    - `cause`: a few words, the same for each finding of its type.
+    - `text`: what was found and where, and a remedy.
+    - `action`: "refused" for data that cannot be used as they are; "left out" for samples or trials
+      that are treated as missing; "warned" for all others.
+    """
+
+    cause: str = eqx.field(static=True)
+    text: str = eqx.field(static=True)
+    action: Literal["refused", "left out", "warned"] = eqx.field(static=True, default="warned")
+
+    def __repr__(self) -> str:
+        action = "" if self.action == "warned" else f" ({self.action})"
+        return f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
+
+
+class Inspection(eqx.Module):
+    """The result of `inspect`. Printing it shows the findings.
+
+    **Fields:** `findings`; `recording`, in which samples that are left out are missing (NaN).
+    """
+
+    findings: tuple[Finding, ...]
+    recording: Recording
+
+    def __repr__(self) -> str:
+        return print_findings(self.findings) or "Nothing was found."
+
+
+def print_findings(findings: Iterable[Finding], indent: str = "") -> str:
+    """Return the findings as text, wrapped at 100 columns."""
+    return "\n".join(
+        textwrap.fill(repr(x), 100, initial_indent=indent, subsequent_indent=f"{indent}  ")
+        for x in findings
+    )
+
+
+def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:
+    """Return the places of samples: `trial 'b', 3.10-3.42 s; and 4 more`."""
+    texts = []
+    for trial, rows in zip(trials, bad, strict=True):
+        edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
+        for a, b in edges.reshape(-1, 2):
+            texts.append(place(trial.name, trial.time[a:b]))
+    return listed(texts)
+
+
+def place(trial: str, time: Float[np.ndarray, " n"]) -> str:
+    return f"trial '{trial}', {time[0]:.2f}-{time[-1]:.2f} s"
+
+
+def listed(texts: Sequence[str]) -> str:
+    """Return the first three texts, and the number of further ones."""
+    more = f"; and {len(texts) - 3} more" if len(texts) > 3 else ""
+    return "; ".join(texts[:3]) + more

@@ -1,0 +1,183 @@
+"""Files that hold arrays in groups: HDF5 and MATLAB of all versions."""
+
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..._core import limits
+from ..._core.archive import damaged
+from ...errors import DefinitionError, FileFormatError
+from .columns import Columns, Wanted, check_declared, library, reading, split_header, with_unit
+
+
+Place = tuple[str, ...]
+"""Names of groups, from the outermost on, and of an array."""
+
+
+class Leaf(NamedTuple):
+    """An array of numbers with a shape, whose values at `[()]` may be read later."""
+
+    array: Any
+    unit: str = ""
+
+
+def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]:
+    """Read datasets by their paths, such as `imu/gyro`; an attribute `units` is their unit.
+
+    **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
+    arrays of structs, and as `_read_tree`.
+    """
+    h5py = library("h5py", "HDF5 files, and MATLAB's of version 7.3,", "mat")
+    leaves: dict[Place, Leaf] = {}
+
+    def visit(name: str, node: Any) -> None:
+        place = tuple(name.split("/"))
+        if not isinstance(node, h5py.Dataset) or name.startswith("#"):  # MATLAB's own data
+            return
+        if h5py.check_ref_dtype(node.dtype) and "MATLAB_class" not in node.attrs:
+            _refuse_structs(path, separator.join(place[:-1]), wanted)
+        # Letters of MATLAB are numbers; its empty arrays hold their shape.
+        text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
+        if node.dtype.kind in "fiu" and not text:
+            unit = node.attrs.get("units", "")
+            unit = unit.decode() if isinstance(unit, bytes) else unit
+            if not isinstance(unit, str):
+                raise FileFormatError(
+                    f"'{path}': the unit of '{name}' is {unit}, which is no text."
+                )
+            leaves[place] = Leaf(node, unit)
+
+    with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
+        file.visititems(visit)
+        size = 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values())
+        check_declared(path, size, f"arrays of {size} bytes")
+        return _read_tree(path, leaves, separator, wanted)
+
+
+def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
+    """Read variables and fields of structs, such as `imu.gyro`.
+
+    **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
+    arrays of structs, and as `_read_tree`.
+    """
+    from scipy.io import loadmat, matlab, whosmat
+
+    with reading(path, "MATLAB file"):
+        is_hdf5 = matlab.matfile_version(path)[0] == 2
+        if not is_hdf5:
+            _check_packed(path)
+            names = [name for name, _, _ in whosmat(path)]
+            chosen = [x for x in names if wanted.includes(x) or wanted.reaches(x)]
+            content = loadmat(path, simplify_cells=True, variable_names=chosen)
+    if is_hdf5:
+        return read_hdf5(path, wanted, ".")
+    variables = {name: value for name, value in content.items() if not name.startswith("__")}
+    return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
+
+
+def _leaves(path: Path, place: Place, value: Any, wanted: Wanted) -> Iterator[tuple[Place, Leaf]]:
+    """Yield arrays of numbers in a struct (a dictionary); an array of structs is a list."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from _leaves(path, (*place, name), part, wanted)
+    elif isinstance(value, list) and any(isinstance(x, dict) for x in value):
+        _refuse_structs(path, ".".join(place), wanted)
+    elif np.asarray(value).dtype.kind in "fiu":
+        yield place, Leaf(np.asarray(value))
+
+
+def _check_packed(path: Path) -> None:
+    """**Raises:** `FileFormatError` if compressed variables hold more than `limits` allow.
+
+    A file of version 5 has a header of 128 bytes, then elements with a tag of 8 bytes; type 15 is
+    compressed.
+    """
+    size = path.stat().st_size
+    room = limits.unpacked(size)
+    with open(path, "rb") as file:
+        order = "little" if file.read(128)[-2:] == b"IM" else "big"
+        while len(tag := file.read(8)) == 8:
+            kind, length = (int.from_bytes(x, order) for x in (tag[:4], tag[4:]))
+            if kind != 15:
+                file.seek(length, 1)
+                continue
+            unpacker, data = zlib.decompressobj(), file.read(min(length, size))
+            while data and not unpacker.eof:
+                room -= len(unpacker.decompress(data, 2**20))
+                data = unpacker.unconsumed_tail
+                if room < 0:
+                    raise damaged(path, "it unpacks to more than a recording of its size would")
+
+
+def _read_tree(
+    path: Path, leaves: Mapping[Place, Leaf], separator: str, wanted: Wanted
+) -> list[Columns]:
+    """Return a table for each array of times.
+
+    The times of an array are those in its own group, or else in the nearest group around it. The
+    columns of a matrix are called `name.0`, `name.1`, ... Arrays in a group `events` are times of
+    events. Single numbers are settings, and left out.
+
+    **Raises:** `DefinitionError` where there are no times for a signal; `FileFormatError` for an
+    array that is not as long as its times.
+    """
+    wanted.require(path, [separator.join(place) for place in leaves], groups=True)
+    clocks: dict[Place, Leaf] = {}
+    for place, leaf in leaves.items():
+        if separator.join(place) == wanted.time:
+            clocks[()] = leaf
+        elif wanted.is_time(place[-1]):
+            clocks[place[:-1]] = leaf
+    tables: dict[Place, Columns] = {}
+    for place, leaf in leaves.items():
+        name = separator.join(place)
+        is_event = place[-2:-1] == ("events",)
+        if any(leaf is clock for clock in clocks.values()) or not (
+            is_event or (np.prod(leaf.array.shape) > 1 and wanted.reaches(name))
+        ):
+            continue
+        around = next((place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None)
+        if around is None:
+            raise DefinitionError(
+                f"'{path}' has no times '{wanted.time}' for '{name}' in its group or one around "
+                "it: name the array that holds them by `time`, or choose `signals`."
+            )
+        if around not in tables:
+            clock = clocks[around]
+            times = np.atleast_1d(np.squeeze(clock.array[()]))
+            tables[around] = Columns({with_unit(wanted.time, clock.unit): times}, events={})
+        if is_event:
+            tables[around].events[place[-1]] = np.ravel(leaf.array[()])
+        else:
+            tables[around].values.update(_columns(path, name, leaf, tables[around]))
+    return list(tables.values())
+
+
+def _columns(
+    path: Path, name: str, leaf: Leaf, table: Columns
+) -> dict[str, Float[np.ndarray, " n"]]:
+    clock, times = next(iter(table.values.items()))
+    values = np.atleast_1d(np.squeeze(leaf.array[()]))
+    if values.ndim == 2 and len(values) != len(times):
+        values = values.T
+    if values.ndim > 2 or len(values) != len(times):
+        raise FileFormatError(
+            f"'{path}': '{name}' has {' x '.join(map(str, leaf.array.shape))} numbers, but its "
+            f"times '{split_header(clock)[0]}' {times.size}: put signals of another rate into a "
+            "group with times of their own, or choose `signals`."
+        )
+    if values.ndim == 1:
+        return {with_unit(name, leaf.unit): values}
+    return {with_unit(f"{name}.{k}", leaf.unit): x for k, x in enumerate(values.T)}
+
+
+def _refuse_structs(path: Path, name: str, wanted: Wanted) -> None:
+    if wanted.reaches(name):
+        raise FileFormatError(
+            f"'{path}': '{name}' is an array of structs: save each of them in a file of its own, "
+            "or choose other `signals`."
+        )

@@ -1,0 +1,192 @@
+"""Tables in text files: encodings, separators, names, units, numbers."""
+
+import codecs
+import csv
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ...errors import FileFormatError
+from .columns import Columns, is_unit, split_header, two_columns, with_unit
+
+
+# Bytes that no text holds, in any encoding with one byte for each ASCII character.
+_CONTROL = bytes(set(range(32)) - set(b"\t\n\v\f\r\x1a\x1b"))
+_COMMENTS = ("#", "%", "//")
+# Marks of a missing sample, in any case of letters.
+_MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
+
+
+def read_lines(path: Path) -> list[str]:
+    """Read a file in UTF-8, UTF-16 with a byte order mark, or else Latin-1, with any line ends.
+
+    **Raises:** `FileFormatError` if it is no text.
+    """
+    data = path.read_bytes()
+    utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if not utf_16 and len(data.translate(None, _CONTROL)) < len(data):
+        raise FileFormatError(f"'{path}' is not a text file.")
+    try:
+        text = data.decode("utf-16" if utf_16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        if utf_16:
+            raise FileFormatError(f"'{path}' is not a text file.") from error
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(_COMMENTS)
+
+
+def read_plain(path: Path, lines: list[str]) -> Columns:
+    """Read names in the first line that is no comment, perhaps units below, then numbers.
+
+    **Raises:** `FileFormatError` if there is no table, with the line.
+    """
+    filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
+    content = [k for k in filled if not _is_comment(lines[k])]
+    if not content:
+        raise FileFormatError(f"'{path}' has no line with the names of its columns.")
+    first = content[0]
+    below = lines[content[1]] if len(content) > 1 else ""
+    separator = _separator(lines[first], below)
+    names = split_names(lines[first], separator)
+    if all(to_number(x) is not None for x in names):
+        # As `numpy.savetxt` writes it: the names are the last comment.
+        before = [lines[k].lstrip().lstrip("#%/").strip() for k in filled if k < first]
+        separator = _separator(before[-1], lines[first]) if before else separator
+        width, names = len(names), split_names(before[-1], separator) if before else []
+        if len(names) != width or any(to_number(x) is not None for x in names):
+            raise FileFormatError(
+                f"'{path}' begins with numbers: its first line must name the columns."
+            )
+        return read_table(path, names, lines, first, separator)
+    if len(names) == 1 and max(len(split_line(below, x)) for x in ",;\t") > 1:
+        raise FileFormatError(
+            f"'{path}', line {first + 1}: '{lines[first].strip()[:40]}' names one column, but "
+            "there are more below it: begin lines before the names of the columns with '#'."
+        )
+    start, fields = first + 1, split_line(below, separator)
+    units = [x for x in fields if x]
+    if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):
+        padded = [split_header(x)[1] or x for x in fields] + [""] * len(names)
+        names = [
+            x if not x or split_header(x)[1] else with_unit(x, unit)
+            for x, unit in zip(names, padded, strict=False)
+        ]
+        start = content[1] + 1
+    return read_table(path, names, lines, start, separator)
+
+
+def _separator(names: str, below: str) -> str:
+    """Return what separates names and numbers alike, or else is most frequent between the names."""
+    counts = {x: len(split_line(names, x)) for x in "\t;,"}
+    alike = [x for x, n in counts.items() if n > 1 and n == len(split_line(below, x))]
+    if alike:
+        return alike[0]
+    if max(counts.values()) > 1:
+        return max(counts, key=lambda x: counts[x])
+    blanks = len(split_line(names, ""))
+    return "" if blanks > 1 and blanks == len(split_line(below, "")) else ","
+
+
+def split_line(line: str, separator: str) -> list[str]:
+    """Return the fields of a line, stripped; "" separates at blanks, but not before a unit."""
+    if not separator:
+        return re.split(r"\s+(?![(\[])", line.strip()) if line.strip() else []
+    if '"' not in line:
+        return [x.strip() for x in line.split(separator)] if line else []
+    try:
+        return [x.strip() for x in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:  # a field of more than 100 kB
+        return [line]
+
+
+def split_names(line: str, separator: str) -> list[str]:
+    """Return the fields of a line, without empty ones at its end."""
+    names = split_line(line, separator)
+    while names and not names[-1]:
+        names.pop()
+    return names
+
+
+def to_number(text: str) -> float | None:
+    """Return the number that a field holds, NaN for a missing sample, None for other text."""
+    try:
+        return np.nan if text.strip().lower() in _MISSING else float(text)
+    except ValueError:
+        return None
+
+
+def read_table(
+    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, separator: str
+) -> Columns:
+    """Read the numbers in `lines[start:]`, with one field for each header.
+
+    Columns without a name are left out, as are empty fields after the last column. Decimal commas
+    are understood where the separator is no comma.
+
+    **Raises:** `FileFormatError` for two columns of one name, and text that is no number, with its
+    line.
+    """
+    two_columns(path, [x for x in headers if x])
+    notes = []
+    lines = ["" if _is_comment(x) else x for x in lines[start:]]
+    if separator != "," and any("," in x for x in lines):
+        notes.append("decimal commas were read as such")
+        mixed = next((k for k, x in enumerate(lines) if "." in x), None)
+        if mixed is not None:
+            raise FileFormatError(
+                f"'{path}', line {start + mixed + 1}: there are points beside decimal "
+                "commas; export numbers with one of the two, and no separators of thousands."
+            )
+        lines = [x.replace(",", ".") for x in lines]
+    values = None
+    try:  # a number in every field
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about an empty table
+            values = np.loadtxt(
+                lines, delimiter=separator or None, ndmin=2, comments=None, quotechar='"'
+            )
+    except ValueError:
+        pass
+    if values is None or values.shape[1] != len(headers):
+        values = _by_line(path, headers, lines, start, separator)
+    if not values.size:
+        raise FileFormatError(f"'{path}' has a header, but no samples.")
+    if not all(headers):
+        notes.append("columns without a name were left out")
+    columns = zip(headers, values.T, strict=True)
+    return Columns({name: column for name, column in columns if name}, tuple(notes))
+
+
+def _by_line(
+    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, separator: str
+) -> Float[np.ndarray, "n k"]:
+    """Read files with missing fields, or with an error whose line is to be reported."""
+    rows, count = [], len(headers)
+    for number, line in enumerate(lines, start + 1):
+        fields = split_line(line, separator)
+        if not any(fields):
+            continue
+        if len(fields) < count or any(fields[count:]):
+            raise FileFormatError(
+                f"'{path}', line {number}: {len(fields)} fields, but the header names "
+                f"{count} columns."
+                + " Decimal commas need another separator, such as semicolons."
+                * (len(fields) > count and separator == ",")
+            )
+        row = [to_number(x) for x in fields[:count]]
+        if None in row:
+            k = row.index(None)
+            raise FileFormatError(
+                f"'{path}', line {number}: column '{headers[k]}' holds '{fields[k][:40]}', which "
+                "is not a number."
+            )
+        rows.append(row)
+    return np.array(rows, float).reshape(-1, count)

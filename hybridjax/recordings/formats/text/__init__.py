@@ -1,1 +1,0 @@
-"""Tables in text files, as spreadsheets and laboratories write them."""

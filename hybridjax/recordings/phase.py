@@ -1,0 +1,149 @@
+"""The phase of a recording."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+from ..errors import DefinitionError
+from .recording import Recording, Trial
+
+
+# Longest gap, in cycles, across which cycles are counted. Longer: half a turn of an angle passes
+# unnoticed, and the count is wrong. Shorter: stretches end at every missing sample of a slow rate.
+LONGEST_GAP = 0.25
+
+
+class Winding(eqx.Module):
+    """The phase of one stretch of a trial.
+
+    **Fields:** `time` (n,), `phase` (n,) in cycles: both strictly increasing. `linear`: whether
+    the phase is linear in between, or smooth. `gaps` (g, 2): start and end of the times at which
+    it was interpolated and not observed.
+    """
+
+    time: Float[np.ndarray, " n"]
+    phase: Float[np.ndarray, " n"]
+    linear: bool = eqx.field(static=True)
+    gaps: Float[np.ndarray, "g 2"] = eqx.field(default_factory=lambda: np.zeros((0, 2)))
+
+    def when(self, phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return the times at which the phase has these values, by inverse interpolation."""
+        if self.linear:
+            return np.interp(phase, self.phase, self.time)
+        return PchipInterpolator(self.phase, self.time)(phase)
+
+    def edges(self) -> Float[np.ndarray, " c1"]:
+        """Return the times at which the phase is a whole number."""
+        return self.when(np.arange(np.ceil(self.phase[0]), np.floor(self.phase[-1]) + 1))
+
+    def at(self, time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return the phase at some times; NaN outside of the stretch."""
+        return np.interp(time, self.time, self.phase, left=np.nan, right=np.nan)
+
+
+class Phase(eqx.Module):
+    """The phase of all trials of a recording, as `estimate_phase` returns it.
+
+    **Fields:**
+
+    - `stretches`: for each trial, its uninterrupted stretches.
+    - `periods`: for each trial, the durations of its cycles. `period`: their median.
+    - `n_sections`: the number N of the family that defined the phase; None for phases defined by
+      crossings, events or functions.
+    - `backwards`: fraction of samples at which the angle ran backwards (noise).
+    - `dropped`: number of events taken for doubled. `missed`: number of cycles left out because an
+      event was missed.
+    - `lead`: number of cycles by which the phase depends on the future.
+    """
+
+    stretches: tuple[tuple[Winding, ...], ...]
+    periods: tuple[Float[np.ndarray, " _"], ...]
+    period: float = eqx.field(static=True)
+    n_sections: int | None = eqx.field(static=True)
+    backwards: float = eqx.field(static=True)
+    dropped: int = eqx.field(static=True)
+    missed: int = eqx.field(static=True)
+    lead: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        stretches: Sequence[Sequence[Winding]],
+        *,
+        n_sections: int | None = None,
+        backwards: float = 0.0,
+        dropped: int = 0,
+        missed: int = 0,
+        lead: int = 0,
+    ):
+        """**Raises:** `DefinitionError` for stretches that hold fewer than two whole cycles."""
+        self.stretches = tuple(map(tuple, stretches))
+        self.periods = tuple(
+            np.concatenate([np.zeros(0), *(np.diff(w.edges()) for w in parts)])
+            for parts in self.stretches
+        )
+        every = np.concatenate(self.periods)
+        if len(every) < 2:
+            raise DefinitionError(
+                f"the recording holds {len(every)} whole cycles; at least two are needed to speak "
+                "of a period."
+            )
+        self.period = float(np.median(every))
+        self.n_sections, self.backwards, self.lead = n_sections, backwards, lead
+        self.dropped, self.missed = dropped, missed
+
+    def by_trial(self, recording: Recording) -> list[tuple[Trial, tuple[Winding, ...]]]:
+        """Return each trial with its stretches.
+
+        **Raises:** `DefinitionError` for a recording with another number of trials.
+        """
+        if len(self.stretches) != len(recording.trials):
+            raise DefinitionError(
+                f"the phase is of {len(self.stretches)} trials, the recording has "
+                f"{len(recording.trials)}."
+            )
+        return list(zip(recording.trials, self.stretches, strict=True))
+
+    @property
+    def cycles(self) -> int:
+        """Number of whole cycles."""
+        return sum(len(p) for p in self.periods)
+
+    @property
+    def drift(self) -> float:
+        """Relative change of the period per cycle: a straight line through each trial."""
+        slopes, weights = [0.0], [1e-300]
+        for p in self.periods:
+            k = np.arange(len(p)) - (len(p) - 1) / 2
+            if len(p) > 2:
+                slopes.append(float(k @ p / (k @ k)))
+                weights.append(float(k @ k))
+        return float(np.average(slopes, weights=weights)) / self.period
+
+    @property
+    def jitter(self) -> float:
+        """Relative standard deviation of the periods of each trial about their line."""
+        squares, freedom = 0.0, 0
+        for p in self.periods:
+            if len(p) > 2:
+                k = np.arange(len(p))
+                squares += float(((p - np.polyval(np.polyfit(k, p, 1), k)) ** 2).sum())
+                freedom += len(p) - 2
+        return float(np.sqrt(squares / max(freedom, 1))) / self.period
+
+    def __repr__(self) -> str:
+        notes = ""
+        if self.backwards:
+            notes += f"; {100 * self.backwards:.2g} % of samples ran backwards"
+        if self.dropped:
+            notes += f"; {self.dropped} doubled events left out"
+        if self.missed:
+            notes += f"; {self.missed} cycles with missed events left out"
+        pieces = sum(len(s) for s in self.stretches)
+        return (
+            f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
+            f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
+            f"{100 * self.drift:.2g} % per cycle{notes})"
+        )

@@ -1,1 +1,0 @@
-"""Where in its cycle a recorded system is: from an angle, crossings, or events."""

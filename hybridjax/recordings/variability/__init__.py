@@ -1,1 +1,0 @@
-"""Multipliers from natural variability: nothing is known of what disturbs the rhythm."""

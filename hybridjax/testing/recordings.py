@@ -1,0 +1,236 @@
+"""Recordings whose truth is known, to try a method before an animal is measured."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import signal
+
+from .._core.arguments import Numbers
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Count, Fraction, NonNegative, Positive, Seed, SignalNames
+from .._core.boundary.values import Reals
+from .._core.limits import PERIODS, SECTIONS
+from .._core.signal import unit_of
+from ..engine.settings import EXPERIMENT
+from ..errors import DefinitionError
+from ..experiments.response_function import ResponseFunction, response_function
+from ..orbits.cycle import LimitCycle
+from ..recordings.recording import Recording, Trial
+from ..sections.families import ClockPhase
+from ..systems.output import OutputNames
+
+
+# Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of
+# measured ones (the error grows as the root of the step). Shorter: simulations take longer.
+_STEP = 0.005
+
+
+@checked
+def random_force(
+    duration: Positive,
+    rate: Positive,
+    bandwidth: Positive,
+    *,
+    rms: NonNegative = 1.0,
+    inputs: Count = 1,
+    seed: Seed = 0,
+) -> Float[np.ndarray, "n nu"]:
+    """Return a random perturbation with power up to `bandwidth`: white noise, low-passed.
+
+    The filter is a Butterworth filter of order 4, applied forwards and backwards. The perturbation
+    is not aligned to any phase, so any hardware that plays a file can apply it.
+
+    **Arguments:** `duration` in seconds. `rate` in samples per second. `bandwidth` in Hz, where
+    half of the amplitude is left. `rms`. Default: 1. `inputs`: their number. Default: 1. `seed`.
+
+    **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
+    """
+    if bandwidth >= rate / 2:
+        raise DefinitionError(
+            f"`bandwidth` must be less than half of the {rate:g} samples per second, but is "
+            f"{bandwidth:g}."
+        )
+    transient = 4 * rate / bandwidth  # samples cut off at either end, where the filter starts
+    samples = (duration * rate + 2 * transient) * inputs
+    if not samples <= PERIODS:
+        raise DefinitionError(
+            f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples of all inputs, more "
+            f"than {PERIODS}."
+        )
+    n, pad = round(duration * rate), round(transient)
+    sos = signal.butter(4, bandwidth, fs=rate, output="sos")
+    white = np.random.default_rng(seed).normal(size=(n + 2 * pad, inputs))
+    force = signal.sosfiltfilt(sos, white, axis=0)[pad : pad + n]
+    return rms * force / np.sqrt(np.mean(force**2, axis=0))
+
+
+@checked
+def simulate_recording(
+    cycle: LimitCycle,
+    force: Annotated[Numbers, Reals("S n nu")],
+    outputs: OutputNames,
+    *,
+    rate: Positive = 500,
+    steps: Count = 4,
+    accuracy: Positive = EXPERIMENT,
+) -> Recording:
+    """Simulate the recording of a system that is perturbed by a sampled force.
+
+    The force is linear between samples. It is applied in steps of equal length, each with the
+    value at its middle; the error is of second order in their length.
+
+    **Arguments:**
+
+    - `cycle`: the limit cycle on which all trials start. `force`: samples of S trials.
+    - `outputs`: names or `Output`s to be recorded beside the inputs.
+    - `rate`: samples per unit of time, changed slightly so that a whole number of them fits into
+      a period. Default: 500. `steps`: steps of the force from sample to sample. Default: 4.
+    - `accuracy`: accuracy of the simulation, as in `run_experiments`.
+
+    **Returns:** a `Recording` with S trials. A trial that fails ends there.
+
+    **Raises:** `DefinitionError` as `response_function`.
+    """
+    cycle.structure.resolve_outputs(outputs)
+    force = np.asarray(force, float)
+    period = float(cycle.period)
+    if not 1 <= rate * period * steps <= SECTIONS:
+        raise DefinitionError(
+            f"`rate` and `steps` give {rate * period * steps:.3g} steps in a period, but they may "
+            f"be 1 to {SECTIONS}."
+        )
+    K = round(rate * period)
+    S, n, nu = force.shape
+    cycles = -(-(n - 1) // K)
+    x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
+    middle = (np.arange(steps) + 0.5) / steps
+    u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
+    response = response_function(cycle, ClockPhase(K * steps), outputs, accuracy=accuracy)
+    y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
+    s = response.placed.structure()
+    names = s.inputs + s.resolve_outputs(response.outputs).names
+    units = dict(zip(names, map(unit_of, names), strict=True))
+    time = np.arange(y.shape[1]) * period / K
+    trials = []
+    for k in range(S):
+        good = slice(0, min(n, int(np.isfinite(y[k]).all(axis=1).sum())))
+        signals = dict(zip(names, [*force[k, good].T, *y[k, good].T], strict=True))
+        trials.append(Recording(time[good], signals, units=units, name=f"trial {k}"))
+    return Recording.join(trials)
+
+
+@eqx.filter_jit
+def _respond(response: ResponseFunction, u: Float[Array, "S n nu"]) -> Float[Array, "S n ny"]:
+    return response(u).y
+
+
+@checked
+def spoil(
+    recording: Recording,
+    signals: SignalNames,
+    *,
+    noise: NonNegative = 0.0,
+    quantum: NonNegative = 0.0,
+    missing: Fraction = 0.0,
+    gap: tuple[float, float] | None = None,
+    spikes: Fraction = 0.0,
+    seed: Seed = 0,
+) -> Recording:
+    """Corrupt some signals of a recording, as poor measurements would.
+
+    **Arguments:**
+
+    - `signals`: the corrupted signals; all others stay as they are.
+    - `noise`: standard deviation of white noise. `quantum`: step to which values are rounded. Both
+      in the unit of the signals. Default: 0.
+    - `missing`: fraction of samples that are lost (NaN). Default: 0. `gap`: times of the start and
+      the end of an interval without samples. Default: None.
+    - `spikes`: fraction of samples that are off by 20 standard deviations of their signal. Default:
+      0. `seed`: seed of the random numbers.
+
+    **Raises:** `DefinitionError` for a signal that does not exist, and a gap that ends before it
+    starts.
+    """
+    if gap is not None and gap[0] >= gap[1]:
+        raise DefinitionError(f"`gap` must end after it starts, but is {gap}.")
+    rng = np.random.default_rng(seed)
+    columns, trials = [recording.column(x) for x in signals], []
+    for trial in recording.trials:
+        values, time = np.array(trial.values), trial.time
+        y = values[:, columns]
+        y = y + noise * rng.normal(size=y.shape)
+        y = np.round(y / quantum) * quantum if quantum else y
+        if spikes:
+            struck = rng.random(y.shape) < spikes
+            y += 20.0 * np.nanstd(y, axis=0) * rng.choice([-1, 1], y.shape) * struck
+        y[rng.random(len(time)) < missing] = np.nan
+        if gap is not None:
+            y[(time >= gap[0]) & (time < gap[1])] = np.nan
+        values[:, columns] = y
+        trials.append(Trial(time, values, trial.events, trial.name))
+    return eqx.tree_at(lambda r: r.trials, recording, tuple(trials))
+
+
+@checked
+def simulate_beats(
+    curve: Annotated[Numbers, Reals("n")],
+    force: Annotated[Numbers, Reals("S m")],
+    *,
+    rate: Positive = 500,
+    rhythm: Positive | Sequence[Positive] = 1.0,
+    jitter: NonNegative = 0.0,
+    seed: Seed = 0,
+) -> Recording:
+    r"""Simulate events of $d\varphi = (w + Z(\varphi)\,I)\,dt + s \sqrt{w}\,dW$.
+
+    An event happens where the phase reaches 1; the phase then restarts at 0.
+
+    **Arguments:**
+
+    - `curve`: Z at n equal steps of the phase from 0 on, in cycles per second and unit of the
+      input; linear in between.
+    - `force`: I, for S trials of m samples; linear between samples. `rate`: samples per second.
+      Default: 500.
+    - `rhythm`: w, in cycles per second, for all trials or for each. Default: 1.
+    - `jitter`: s, standard deviation that a cycle adds to the phase. Default: 0.
+
+    **Returns:** a `Recording` with S trials, the input `u` and the events `beat`.
+
+    **Raises:** `DefinitionError` for a curve without values, or not as many rhythms as trials.
+    """
+    force, table = np.asarray(force, float), np.asarray(curve, float)
+    (S, m), n = force.shape, len(table)
+    if not n:
+        raise DefinitionError("`curve` needs at least one value.")
+    if np.size(rhythm) not in (1, S):
+        raise DefinitionError(f"`rhythm` must be one number, or one for each of {S} trials.")
+    w = np.broadcast_to(np.asarray(rhythm, float), S)
+    steps = int(np.ceil(w.max() / (rate * _STEP)))
+    h, table = 1 / (rate * steps), np.append(table, table[0])
+    rng = np.random.default_rng(seed)
+
+    def at(phase):
+        place = (phase % 1.0) * n
+        low = np.minimum(place.astype(int), n - 1)
+        return table[low] + (place - low) * (table[low + 1] - table[low])
+
+    phase, events = rng.uniform(size=S), [[] for _ in range(S)]
+    for i in range((m - 1) * steps):
+        k, part = i // steps, (i % steps + 0.5) / steps
+        u = (1 - part) * force[:, k] + part * force[:, k + 1]
+        z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
+        move = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        after = np.maximum(phase + move, 0.0)
+        for trial in np.flatnonzero(after >= 1):
+            events[trial].append((i + (1 - phase[trial]) / move[trial]) * h)
+        phase = np.where(after >= 1, after - 1, after)
+    time = np.arange(m) / rate
+    trials = [
+        Recording(time, {"u": u}, events={"beat": np.array(at)}, name=f"trial {k}")
+        for k, (u, at) in enumerate(zip(force, events, strict=True))
+    ]
+    return Recording.join(trials)

@@ -1,0 +1,374 @@
+"""A good call of every public function and method; `run.py` replaces their arguments."""
+
+import functools as ft
+
+import jax.numpy as jnp
+import numpy as np
+
+import hybridjax as hj
+
+from .things import APEX, NAMES as STATES, PHASE
+
+
+BEAT = hj.AtEvent("strike")
+
+
+def positional(function):
+    """A function of the first of the values that `function` takes by position."""
+
+    @ft.wraps(function)
+    def call(values, **more):
+        return function(values, **more)
+
+    return call
+
+
+def scale(t):
+    yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
+    yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
+    yield hj.scale.Points, dict(values={"x": [1.0]})
+    good = dict(ranges={"x": (0.0, 1.0)}, count=4)
+    yield hj.scale.Points.sobol, good
+
+
+def systems(t):
+
+    def flow(time, q, u):
+        return q[0]
+
+    yield hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0, after="hit")
+    yield hj.Output, dict(name="z", function=flow)
+    ends = dict(name="hit", source="flow", target="flow", guard=flow)
+    yield hj.Transition, ends | dict(direction="falling", reset=flow)
+    yield hj.Scheduled, dict(period=1.0, offset=0.0)
+    yield hj.parameter, dict(default=1.0)
+    yield hj.models.VerticalHopper, dict(k=10.0)
+    yield hj.models.BouncingChain, dict(n=2)
+    yield hj.enable_vector_math, dict(enabled=True)
+    yield hj.enable_progress, dict(enabled=False)
+    yield hj.enable_compilation_cache, dict(folder=None)
+    yield hj.Execution, {}
+    yield hj.Settings, dict(rtol=1e-09, atol=1e-09)
+    yield (
+        hj.simulate,
+        dict(system=t.system, chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0),
+    )
+    yield t.trajectory, {}
+    yield t.trajectory.dense, {}
+
+
+def sections(t):
+    yield hj.Crossing, dict(function="y", direction="falling", value=0.0)
+    yield hj.AtEvent, dict(name="hit")
+    yield hj.ClockPhase, dict(n_sections=8, anchor=0.0)
+    turn = dict(n_sections=8, position="x", velocity="y", center=(0.0, 0.0), scale=(1.0, 1.0))
+    yield hj.KinematicPhase, turn
+    yield hj.SectionList, dict(items=[APEX])
+    yield hj.place_sections, dict(cycle=t.cycle, sections=PHASE)
+    yield t.placed.observe, dict(outputs=STATES)
+    yield hj.linearize, dict(cycle=t.cycle, sections=t.placed, outputs=STATES)
+    yield hj.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
+    yield t.map, dict(q=t.map.fixed_point)
+
+
+def cycles(t):
+    yield hj.find_limit_cycle, dict(system=t.system, guess=t.cycle)
+    yield t.cycle.trajectory, {}
+    yield hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
+    yield t.cycles.__getitem__, dict(i=0)
+    yield t.cycles.summary, {}
+    yield hj.continuation, dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05)
+    yield t.branch.__getitem__, dict(k=0)
+    yield t.branch.find, dict(kind="fold")
+    yield t.branch.largest, dict(output="x")
+
+
+def linear(t):
+    A, B, C, D = (np.asarray(x) for x in (t.model.A, t.model.B, t.model.C, t.model.D))
+    matrices = dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
+    yield hj.LDTP, matrices
+    square = [np.eye(2)] * 3
+    yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
+    u = np.ones((12, 2))
+    for name in ("states", "simulate"):
+        yield getattr(t.model, name), dict(u=u)
+    for name, v in (("periodic_state", u), ("periodic_states", u[None])):
+        yield getattr(t.model, name), dict(u=v, periods=2)
+    yield t.model.impulse_response, dict(n_lags=3)
+    yield t.model.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.model.monodromy, {}
+    yield t.model.rank, {}
+    f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
+    size = np.ones(H.shape)
+    yield (
+        hj.HTF,
+        dict(
+            f=f,
+            H=H,
+            harmonics=(-1, 0, 1),
+            n_sections=6,
+            variance=size,
+            noise_variance=size,
+            scatter=hj.Scatter(np.ones(len(f)), size),
+        ),
+    )
+    scatter = hj.Scatter(f, size)
+    yield hj.Scatter, dict(freedom=f, roundness=size)
+    yield scatter.quantile, dict(level=0.9)
+    htf = t.estimate
+    yield htf.harmonic, dict(m=0)
+    yield htf.__getitem__, dict(m=0)
+    yield htf.select, dict(harmonics=0)
+    yield htf.at, dict(f=f[:2])
+    yield htf.interpolate, dict(f=f[:2])
+    yield htf.confidence_radius, {}
+    yield htf.predict, dict(u=u)
+    for name in ("error", "harmonic_errors"):
+        yield getattr(htf, name), dict(other=t.exact)
+
+
+def designs(t):
+    lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
+    yield hj.multisine, lines | dict(experiments=8, inputs=1)
+    yield hj.paper_design, lines | dict(experiments=8)
+    yield hj.experiments.single_cosine, dict(f=0.25, n_sections=6, periods=16)
+    yield (
+        hj.Design.from_lines,
+        dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0, n_sections=6, periods=16),
+    )
+    good = {name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__}
+    yield hj.Design, good
+    yield t.design.inputs, {}
+    yield t.design.scaled, dict(rms=1.0)
+    yield t.design.realizations, dict(count=2)
+    yield t.design.expected_variance, {}
+    yield t.design.cycles, {}
+    yield hj.experiments.optimize_phases, dict(design=t.design)
+
+
+def experiments(t):
+    to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
+    yield hj.run_experiments, to_run
+    yield hj.experiments.Options, {}
+    yield hj.experiments.stream_experiments, to_run
+    yield hj.experiments.StoredExperiments, dict(store="nope")
+    yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
+    u = np.zeros((1, 8, 1))
+    yield t.response, dict(u=u)
+    yield t.response.steady_start, dict(u=u)
+    yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
+    yield hj.experiments.ProcessNoise, dict(std=0.1)
+    yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
+    y = np.ones(t.data.y.shape)
+    yield hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
+    yield t.data.windows, {}
+    yield t.data.summary, {}
+    one = t.record
+    yield hj.Record, dict(u=one.u, y=one.y, n_sections=6)
+    yield one.part, dict(first=0, stop=12)
+
+
+def estimates(t):
+    yield hj.estimate_htf, dict(data=t.data, harmonics=0)
+    yield hj.identify.missing_frequencies, dict(data=t.repeated)
+    yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
+    yield hj.fit_rational, dict(htf=t.estimate, output=0)
+    yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.rational.compare, dict(true=[0.5])
+    yield hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6)
+    yield t.structured.htf, dict(f=np.array([0.1, 0.2]))
+    true = np.asarray(t.model.multipliers)
+    yield t.structured.distance, dict(true=true)
+    yield t.structured.compare, dict(true=true)
+    yield t.structured.contains, dict(true=true)
+    yield t.structured.ellipse, {}
+    yield hj.select_order, dict(htf=t.estimate, overhang=6)
+    yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
+    yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
+    yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
+    yield hj.identify.noise_spectrum, dict(noise=t.model, f=np.array([0.1]))
+    yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
+    yield hj.identify.realize, dict(source=t.exact)
+
+
+def series(t):
+    yield hj.fit_series, dict(data=t.record, order=2)
+    yield t.fit.impulse_response, dict(n_lags=3)
+    yield t.fit.htf, dict(f=np.array([0.1, 0.2]))
+    yield hj.validate, dict(model=t.fit, data=t.record)
+    u = t.data.u
+    yield hj.identify.amplitude_sweep, dict(run=t.run, model=t.model, u=u, amplitudes=[1.0, 2.0])
+    yield t.sweep.limit, dict(misfit=1.0)
+
+
+def fitting(t):
+    both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
+    yield hj.fit_model, both
+    yield hj.fitting.identifiability, both
+    yield hj.fitting.spectral_radius, dict(model=t.model)
+    yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
+    yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
+    values = np.ones((4, 2))
+    yield (
+        hj.ObservedCycle,
+        dict(sections=PHASE, outputs=STATES, values=values, times=np.arange(4.0), period=1.0),
+    )
+    yield hj.ObservedCycle.of, dict(cycle=t.cycle, sections=PHASE, outputs=STATES)
+    for name in ("ObservedCycle", "ObservedHTF"):
+        made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
+        for method in ("residuals", "prepare"):
+            yield getattr(made, method), dict(cycle=t.cycle)
+
+
+def designs_data(t):
+    ask = hj.designs.Multipliers(harmonics=0, overhang=6)
+    window = hj.designs.Window(np.ones(6))
+    yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
+    yield hj.designs.Multipliers, {}
+    yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
+    yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
+    yield hj.designs.ImpulseResponse, dict(lags=4)
+    yield hj.designs.Order, dict(fewer=1)
+    yield hj.designs.Limits, dict(rms={"u0": 1.0})
+    yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
+    yield hj.designs.Window, dict(weights=np.ones(6))
+    yield window.seen_from_signal, dict(model=t.model)
+    yield window.pushes, dict(design=t.design)
+    yield window.with_signal, dict(data=t.data, design=t.design)
+    yield (
+        hj.designs.choose_window,
+        dict(
+            model=t.model,
+            design=t.design,
+            noise={n: 0.01 for n in t.model.outputs},
+            limit={n: 0.1 for n in t.model.inputs},
+            shortest=t.model.n_sections,
+        ),
+    )
+    yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
+    yield t.study.add, dict(data=t.block)
+    yield (
+        hj.designs.information_map,
+        dict(model=t.decaying, design=t.one_input, noise={"y": 1.0}, goal=t.study.goal),
+    )
+    yield hj.designs.draws, dict(fit=t.joint, count=1)
+    yield t.plan.sequence, dict(cycles=2)
+    yield t.plan.strides_for, dict(standard_error=1.0)
+
+
+def recordings(t):
+    x = np.arange(5.0)
+    yield hj.Recording, dict(time=x, signals={"x": x})
+    frame = {"time": x, "x": x}
+    yield hj.Recording.from_frame, dict(frame=frame)
+    yield hj.Recording.join, dict(recordings=[t.recording])
+    yield hj.Recording.beside, dict(recordings=[t.recording])
+    rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
+    yield t.recording.mark, dict(event="e", crossing=rises)
+    for name in ("column", "unit"):
+        yield getattr(t.recording, name), dict(name="x")
+    yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
+    take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
+    yield hj.recordings.section_data, take
+    yield hj.identify_recording, take | dict(order=1)
+    yield t.section_data.experiments, dict(periods=4)
+    yield hj.recordings.inspect, dict(recording=t.recording, inputs="f", outputs=("x", "v"))
+    yield hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit)
+    yield hj.recordings.choose_order, dict(data=t.section_data)
+    yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
+    yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
+    yield (
+        hj.recordings.without_drift,
+        dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
+    )
+    table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
+    yield hj.recordings.add_command, table
+    yield hj.recordings.write_design, dict(path="d.csv", design=t.one_input)
+    yield positional(hj.read_recording), dict(values="nope.csv")
+
+
+def testing(t):
+    yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
+    yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
+    force = np.zeros((1, 50, 1))
+    yield hj.testing.simulate_recording, dict(cycle=t.cycle, force=force, outputs=STATES, rate=16)
+
+
+def files(t):
+    yield hj.save, dict(path="thing.npz", thing=t.model)
+    yield hj.load, dict(path="thing.npz")
+    yield hj.write_report, dict(folder="report", found=t.found)
+
+
+def conversions(t):
+    yield hj.convert.to_lti, dict(model=t.model)
+    yield hj.convert.to_scipy, dict(model=t.model)
+    yield hj.convert.to_control, dict(thing=t.model)
+    yield hj.convert.to_xarray, dict(thing=t.model)
+    yield hj.convert.to_pandas, dict(thing=t.fit)
+    yield hj.convert.from_xarray, dict(dataset=hj.convert.to_xarray(t.model))
+
+
+def plots(t):
+    plot = hj.plot
+    yield positional(plot.bode), dict(values=t.estimate)
+    yield plot.bodes, dict(families={"a": t.estimate})
+    yield plot.harmonics, dict(families={"a": t.estimate})
+    yield positional(plot.magnitude), dict(values=t.estimate)
+    yield plot.spectrum, dict(plan=t.plan, model=t.model)
+    yield plot.information, dict(found=t.information)
+    yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
+    yield plot.cycle, dict(cycle=t.cycle)
+    yield positional(plot.branch), dict(values=t.branch)
+    yield plot.experiment, dict(data=t.data)
+    yield plot.multipliers, dict(true=np.array([0.5]))
+    yield plot.poles_zeros, dict(fits={"a": t.rational})
+    yield plot.impulse_responses, dict(found=t.found.responses)
+    yield plot.phase, dict(found=t.phase)
+    yield plot.section_data, dict(data=t.section_data)
+    yield plot.validation, dict(found=t.validation)
+    yield plot.amplitude, dict(sweep=t.sweep)
+    yield plot.save, dict(path="figure", plot=t.plot)
+
+
+def rhythms(t):
+    charts = {"up": t.system.charts()["plane"], "down": t.system.charts()["plane"]}
+
+    def surface(time, q):
+        return q[0]
+
+    yield hj.sliding, dict(charts=charts, surface=surface)
+    yield hj.orbits.coincidences, dict(cycle=t.cycle)
+    about = dict(recording=t.recording, phase=BEAT, input="f")
+    yield hj.recordings.phase_response, about
+    yield hj.plot.phase_response, dict(found=t.beats)
+    at = dict(phase=[0.1, 0.2])
+    yield t.beats, at
+    yield t.beats.interval, at
+    yield hj.recordings.natural_multipliers, dict(data=t.variability)
+    natural = hj.recordings.natural_multipliers(t.variability)
+    yield natural.interval, {}
+    yield t.structured.half_widths, {}
+    yield hj.testing.simulate_beats, dict(curve=[1.0], force=jnp.ones((1, 99)))
+
+
+PARTS = (
+    scale,
+    systems,
+    sections,
+    cycles,
+    linear,
+    designs,
+    experiments,
+    estimates,
+    series,
+    fitting,
+    designs_data,
+    recordings,
+    testing,
+    files,
+    conversions,
+    plots,
+    rhythms,
+)
