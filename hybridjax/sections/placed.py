@@ -81,9 +81,7 @@ class PlacedSections(eqx.Module):
         if is_traced(self):
             return None
         lanes = to_host(self.lanes)
-        drawn = orbit_picture(
-            self.structure(), self.cycle.trajectory(), (lanes.t, lanes.chart, lanes.q.T)
-        )
+        drawn = orbit_picture(self.cycle.trajectory(), (lanes.t, lanes.chart, lanes.q.T))
         title = f"{self.n_sections} of a {type(self.family).__name__}"
         return card("PlacedSections", title, facts(self._facts()), drawn)
 
