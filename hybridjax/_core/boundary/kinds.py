@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
-from jax.typing import ArrayLike
 
 from .. import limits
 from ..arguments import Numbers
@@ -65,13 +64,13 @@ Share = Annotated[float, Number("a number above 0, at most 1", above=0, high=1)]
 Fraction = Annotated[float, Number("a number from 0 to 1", low=0, high=1)]
 
 # The same, where one has an array of JAX at hand as often as a `float`.
-Duration = Annotated[ArrayLike, Number("a positive number", above=0)]
-Wait = Annotated[ArrayLike, Number("a number that is not negative", low=0)]
+Duration = Annotated[Numbers, Number("a positive number", above=0)]
+Wait = Annotated[Numbers, Number("a number that is not negative", low=0)]
 
 # Numbers that JAX may trace.
-Scalar = Annotated[ArrayLike, Reals("")]
-PositiveScalar = Annotated[ArrayLike, Reals("", sign="positive")]
-NonNegativeScalar = Annotated[ArrayLike, Reals("", sign="nonnegative")]
+Scalar = Annotated[Numbers, Reals("")]
+PositiveScalar = Annotated[Numbers, Reals("", sign="positive")]
+NonNegativeScalar = Annotated[Numbers, Reals("", sign="nonnegative")]
 Vector = Annotated[Numbers, Reals("n")]
 
 # Words.
