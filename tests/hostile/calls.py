@@ -171,7 +171,6 @@ def experiments(t):
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
     yield hj.identify.missing_frequencies, dict(data=t.repeated)
-    yield hj.identify.output_levels, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
@@ -271,10 +270,6 @@ def recordings(t):
     yield hj.recordings.add_command, table
     yield hj.recordings.write_design, dict(path="d.csv", design=t.one_input)
     yield positional(hj.read_recording), dict(values="nope.csv")
-    tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
-    yield hj.recordings.PhaseTracker, tracker
-    update = hj.recordings.PhaseTracker(**tracker).update
-    yield update, dict(time=0.0, position=1.0, velocity=0.0)
 
 
 def testing(t):
