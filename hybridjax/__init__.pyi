@@ -1,7 +1,6 @@
 from . import (
     convert as convert,
     designs as designs,
-    engine as engine,
     errors as errors,
     experiments as experiments,
     fitting as fitting,

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from .._core.executor import Array, namespace, on_host
+from .._core.executor import namespace, on_host
 from .._core.lanes import vmap_to_lanes
 from ..systems.structure import Structure
-from .arrays import Index, Times
+from .arrays import Array, Index, Times
 from .chain import chain
 from .lanes import Lanes, constant
 from .move import record

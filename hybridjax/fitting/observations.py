@@ -30,7 +30,6 @@ from ..sections.families import FamilyLike, as_family
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from ..systems.structure import Structure
 
 
 AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
@@ -139,7 +138,7 @@ class ObservedHTF(AbstractObservation):
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        Structure(cycle.system).resolve_outputs(self.outputs)
+        cycle.structure.resolve_outputs(self.outputs)
         unknown = [name for name in self.inputs if name not in cycle.system.inputs]
         if unknown:
             raise DefinitionError(

@@ -1,1 +1,1 @@
-from .mechanism import Constrained as Constrained, Impact as Impact, Mechanism as Mechanism
+from .mechanism import Mechanism as Mechanism

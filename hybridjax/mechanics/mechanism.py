@@ -111,8 +111,8 @@ class Mechanism(eqx.Module):
         pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
         solved = solve_positive(mass, pushes)
         free, by_force = solved[0], solved[1:].T
-        found = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
-        return Constrained(free + by_force @ found, found)
+        constraint = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
+        return Constrained(free + by_force @ constraint, constraint)
 
     def impact(
         self,

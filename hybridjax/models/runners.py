@@ -1,7 +1,7 @@
 """Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ..systems.transition import Transition
 
 Leg = Literal["hind", "front"]
 Legs = tuple[Leg, ...]
-_LEGS: Legs = get_args(Leg)
+_LEGS: Legs = ("hind", "front")
 # Charts by the legs that stand on the table.
 _CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
 
@@ -89,24 +89,18 @@ class TwoLeggedBar(HybridSystem):
         return {name: BarStanding(self, legs) for legs, name in _CHARTS.items()}
 
     def transitions(self):
-        transitions = []
-        for legs, name in _CHARTS.items():
-            for leg in _LEGS:
-                lands = leg not in legs
-                other = tuple(x for x in _LEGS if (x in legs) != (x == leg))
-                transitions.append(
-                    Transition(
-                        f"{leg} {'lands' if lands else 'lifts'} ({name})",
-                        name,
-                        _CHARTS[other],
-                        guard=lambda t, q, u, leg=leg: self.length(leg, t, q),
-                        direction="falling" if lands else "rising",
-                        reset=lambda t, q, u, leg=leg, lands=lands: (
-                            self._impact(leg, t, q) if lands else q
-                        ),
-                    )
-                )
-        return tuple(transitions)
+        return tuple(self._step(leg, legs) for legs in _CHARTS for leg in _LEGS)
+
+    def _step(self, leg: Leg, legs: Legs) -> Transition:
+        """Touchdown or liftoff of a leg, while these legs stand."""
+        lands, source = leg not in legs, _CHARTS[legs]
+        after: Legs = tuple(x for x in _LEGS if (x in legs) != (x == leg))
+        name = f"{leg} {'lands' if lands else 'lifts'} ({source})"
+        length = lambda t, q, u: self.length(leg, t, q)  # noqa: E731
+        if not lands:
+            return Transition(name, source, _CHARTS[after], length, "rising")
+        impact = lambda t, q, u: self._impact(leg, t, q)  # noqa: E731
+        return Transition(name, source, _CHARTS[after], length, "falling", impact)
 
     def _impact(self, leg, t, state):
         y, v, q, p = state

@@ -63,7 +63,7 @@ def read_recording(
     """
     if not paths:
         raise DefinitionError("there is no file to read.")
-    wanted = Wanted(time, signals)
+    wanted = Wanted(time, None if signals is None else tuple(signals))
     return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, paths)])
 
 

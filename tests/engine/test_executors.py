@@ -162,21 +162,6 @@ def test_a_class_of_the_same_name_is_another_system():
         np.testing.assert_allclose(time, np.log(0.9 / 0.5) / factor, rtol=1e-9)
 
 
-class Table(hj.HybridSystem):
-    """x' = -slope x, with a plain Python number as a field: part of the program."""
-
-    slope: float
-
-    def charts(self):
-        return {"x": Field(("x",), lambda t, q, u: (-self.slope * q[0],))}
-
-
-@pytest.mark.parametrize("slope", [1, 2.0, True])
-def test_plain_numbers_are_part_of_the_program(slope):
-    end = hj.simulate(Table(slope), "x", [1.0], 1.0).after[-1, 0]
-    np.testing.assert_allclose(end, np.exp(-float(slope)), rtol=1e-9)
-
-
 def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
     quick = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
     monkeypatch.setattr(compilation, "_WORTH_COMPILING", -1.0)
@@ -184,10 +169,3 @@ def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
     assert [e.name for e in quick.events] == [e.name for e in compiled.events]
     np.testing.assert_allclose(quick.t, compiled.t, rtol=1e-13)
     np.testing.assert_allclose(quick.after, compiled.after, rtol=1e-13)
-
-
-def test_the_host_leaves_a_long_job_to_the_compiled_program(monkeypatch):
-    """While it is at work: one call that would take it longer than compiling does."""
-    monkeypatch.setattr(compilation, "_WORTH_COMPILING", 0.1)
-    found = hj.simulate(Decay(level=0.8), "x", [0.9], 100.0)
-    assert len(found.events) == 1 + int((100 - np.log(0.9 / 0.8)) / np.log(1 / 0.8))

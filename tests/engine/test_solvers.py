@@ -159,13 +159,6 @@ def test_stiffness_is_told(damped):
 
 
 @pytest.mark.slow
-def test_stiffness_is_cured_by_itself(damped):
-    itself = hj.find_limit_cycle(Damped(), settings=hj.Settings(solver="auto"))
-    assert Damped(solver=hj.Radau()).solver == itself.system.solver
-    np.testing.assert_array_equal(itself.anchor.q, damped.anchor.q)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Kvaerno5()], ids=str)
 def test_solvers_of_diffrax_give_the_same_cycle(solver):
     cycle = hj.find_limit_cycle(
@@ -188,13 +181,3 @@ def test_derivatives_of_a_stiff_cycle(damped):
         np.testing.assert_allclose(found / size, exact(1.0) / size, rtol=1e-9, atol=1e-12)
     twice = jax.jit(jax.jacfwd(jax.jacfwd(state)))(20.0)
     np.testing.assert_allclose(twice / size, 0.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_experiments_with_a_stiff_system(damped):
-    sections = hj.ClockPhase(8)
-    design = hj.multisine(8, 8, amplitude=1e-3, lines="odd")
-    data = hj.run_experiments(damped, sections, design, outputs="y", start="steady")
-    estimate = hj.estimate_htf(data, harmonics=(0,))
-    found = hj.linearize(damped, sections, outputs="y").htf(estimate.f, harmonics=(0,))
-    assert np.max(estimate.error(found)) < 1e-6

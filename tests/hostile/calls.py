@@ -287,10 +287,6 @@ def recordings(t):
     yield hj.recordings.add_command, table
     yield hj.recordings.write_design, dict(path="d.csv", design=t.one_input)
     yield positional(hj.read_recording), dict(values="nope.csv")
-    tracker = dict(center=(0.0, 0.0), scale=(1.0, 1.0), rate=1.0)
-    yield hj.recordings.PhaseTracker, tracker
-    update = hj.recordings.PhaseTracker(**tracker).update
-    yield update, dict(time=0.0, position=1.0, velocity=0.0)
 
 
 def testing(t):

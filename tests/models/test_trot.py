@@ -6,6 +6,9 @@ import pytest
 import hybridjax as hj
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def cycle():
     return hj.find_limit_cycle(hj.models.TrottingQuadruped(thrust=1.0), throw=False)

@@ -13,7 +13,7 @@ from hybridjax.systems.check import check_system
 from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import own_fields
 
-from ..toys import Field, Switched, TwoInputs
+from ..toys import Field, Switched
 
 
 ROOM = {
@@ -134,27 +134,6 @@ def test_an_input_that_the_system_does_not_have():
 
     with pytest.raises(hj.DefinitionError, match="chart 'a' uses input 'up'"):
         check_system(Anything({"a": Bad()}))
-
-
-def test_directions_have_two_names():
-    with pytest.raises(
-        hj.DefinitionError, match="`direction` must be 'falling' or 'rising', not 'down'"
-    ):
-        hj.Transition("go", "a", "b", lambda t, q, u: q[0], "down")
-    with pytest.raises(hj.DefinitionError, match="direction.*down"):
-        hj.Crossing("x", "down")
-
-
-@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, np.inf])
-def test_a_schedule_needs_a_positive_period(period):
-    with pytest.raises(hj.DefinitionError, match="`period` must be a positive number"):
-        hj.Scheduled(period)
-
-
-def test_charts_see_their_own_inputs():
-    s = Structure(TwoInputs())
-    t, q, u = jnp.zeros(()), jnp.zeros(1), jnp.array([2.0, 3.0])
-    assert [float(s.field(a, t, q, u)[0]) for a in range(3)] == [32.0, 3.0, 0.5]
 
 
 def test_a_guard_falls_at_its_event():

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..._core.executor import Array, cond, namespace
+from ..._core.executor import cond, namespace
 from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
-from ..arrays import Index, Mask, Times
+from ..arrays import Array, Index, Mask, Times
 from ..cubic import CubicCrossing, first_crossing
 from ..events import INSTANT, width
 from ..lanes import Lanes
@@ -60,7 +60,7 @@ class Verdict(NamedTuple):
 
 
 def accurate(new: Attempt, task: Task) -> Mask:
-    """Whether the error estimate of a step is at most the tolerance (times the lane's slack)."""
+    """Test whether the error estimate is at most the tolerance (times the lane's slack)."""
     return new.error <= task.stride.slack
 
 
@@ -78,7 +78,7 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     A step is accepted if it is accurate, every watched function is resolved over it, and none
     crosses zero on the way before the zero on which it lands.
     """
-    approach, active, end = state.approach, state.active, new.seen
+    approach, active, end = state.approach, state.active, new.watched
     xp, within_error = namespace(t), accurate(new, task)
     # Which approaches succeed.
     tau = approach.tau + new.past
@@ -91,7 +91,7 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
     looked_at, moved = fresh | lands, step_length(aim, new)
-    crossing = _crossing(looked_at, state.seen, end, moved, state.ready)
+    crossing = _crossing(looked_at, state.watched, end, moved, state.ready)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
@@ -140,13 +140,15 @@ def of_row(x: Array, which: Index) -> Times:
 
 
 def _crossing(
-    some: Mask, seen: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
+    some: Mask, watched: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
 ) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
     xp = namespace(ready)
 
     def look():
-        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+        return first_crossing(
+            watched.value, end.value, moved * watched.rate, moved * end.rate, ready
+        )
 
     def none():
         no = xp.zeros_like(ready)
