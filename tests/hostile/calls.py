@@ -171,7 +171,6 @@ def experiments(t):
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
     yield hj.identify.missing_frequencies, dict(data=t.repeated)
-    yield hj.identify.output_levels, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
