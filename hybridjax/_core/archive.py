@@ -190,7 +190,7 @@ def _moderate(value: Any) -> bool:
     """Return whether no whole number in it is larger than a header may declare."""
     if isinstance(value, tuple):
         return all(map(_moderate, value))
-    return not isinstance(value, int) or abs(value) <= limits.DECLARED
+    return not isinstance(value, int) or abs(value) <= limits.PERIODS
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:

@@ -297,8 +297,9 @@ class TwoTiers:
                 return self._function(*eqx.combine(arrays, static))
 
             with _choosing, _compiling():
-                program = _lowered(key, run, leaves)
-                self._chosen[key] = program, program.choose(self.large)
+                if key not in self._chosen:  # by another thread in the meantime
+                    program = _lowered(key, run, leaves)
+                    self._chosen[key] = program, program.choose(self.large)
         program, executable = self._chosen[key]
         return program.run(executable, leaves)
 
