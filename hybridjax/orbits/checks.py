@@ -169,7 +169,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         return (
             f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
             "they come in one order or the other, and no linearization holds for both: "
-            "`hj.orbits.coincidences` of the cycle, which `throw=False` returns, has the "
+            "`hj.coincidences` of the cycle, which `throw=False` returns, has the "
             "derivatives of each. Let them happen at different times, or write them as one event."
         )
     if code == Result.SINGULAR:
