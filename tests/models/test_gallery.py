@@ -49,7 +49,8 @@ CASES = {
     # benchmarks/walkers_truth.py: multipliers by differences.
     "walker with a torso": lambda: Case(m.TorsoWalker(), hj.AtEvent("touchdown"),
         {"w1": 0.93945818569188, "w2": -0.276319085413138, "w3": 2.038552874507603},
-        0.8253089285135, [0.558921496182006, 2.129597704e-06, 5.85308700e-07, 4.9e-09, 0.0], accuracy=1e-7),
+        0.8253089285135, [0.558921496182006, 2.129597704e-06, 5.85308700e-07, 4.9e-09, 0.0],
+        accuracy=1e-7),
     "biped": lambda: Case(m.FiveLinkBiped(), hj.AtEvent("touchdown"), {"shin": -0.07545793171395,
         "torso": 0.200392979580986, "shin_rate": 4.014488848102268,
         "swing_thigh_rate": 1.64573353402656, "swing_shin_rate": 1.111805909135972},
