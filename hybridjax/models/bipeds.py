@@ -129,16 +129,8 @@ class TorsoWalker(HybridSystem):
         return {"step": TorsoStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "touchdown",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[0] - self.stride,
-                direction="rising",
-                reset=self._touchdown,
-            ),
-        )
+        angle = lambda t, q, u: q[0] - self.stride  # noqa: E731
+        return (Transition("touchdown", "step", "step", angle, "rising", self._touchdown),)
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
@@ -257,16 +249,10 @@ class FiveLinkBiped(HybridSystem):
         return {"step": BipedStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "touchdown",
-                "step",
-                "step",
-                guard=lambda t, q, u: self._swing_foot(q)[1],
-                reset=self._touchdown,
-                enabled=lambda t, q, u: self._swing_foot(q)[0] > 0,
-            ),
-        )
+        height = lambda t, q, u: self._swing_foot(q)[1]  # noqa: E731
+        ahead = lambda t, q, u: self._swing_foot(q)[0] > 0  # noqa: E731
+        landing = Transition("touchdown", "step", "step", height, "falling", self._touchdown, ahead)
+        return (landing,)
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))

@@ -97,17 +97,9 @@ class SimplestWalker(HybridSystem):
         return {"step": SimplestStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "heelstrike",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[1] - 2 * q[0],
-                direction="rising",
-                reset=_heelstrike,
-                enabled=lambda t, q, u: q[0] < 0,
-            ),
-        )
+        foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
+        ahead = lambda t, q, u: q[0] < 0  # noqa: E731
+        return (Transition("heelstrike", "step", "step", foot, "rising", _heelstrike, ahead),)
 
     def guess(self):
         """The long-period gait; `short_gait` is the other one."""
@@ -178,16 +170,12 @@ class CompassGait(HybridSystem):
         return {"step": CompassStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "heelstrike",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[0] + q[1] + 2 * self.slope,
-                reset=self._heelstrike,
-                enabled=lambda t, q, u: q[1] < 0,
-            ),
+        foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731
+        ahead = lambda t, q, u: q[1] < 0  # noqa: E731
+        strike = Transition(
+            "heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead
         )
+        return (strike,)
 
     def _heelstrike(self, t, q, u):
         """Angular momentum about the new foot, and of the new swing leg about the hip, are kept."""

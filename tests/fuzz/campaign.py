@@ -53,7 +53,7 @@ class Report:
 
     def __str__(self):
         lines = [
-            f"{self.name}: {self.compared} of {self.systems} systems compared, {self.events} events; "
+            f"{self.name}: {self.compared} of {self.systems} compared, {self.events} events; "
             f"errors {self.time_error:.1e} in time, {self.state_error:.1e} in state"
         ]
         lines += [f"excluded, {reason}: {numbers}" for reason, numbers in self.excluded.items()]
