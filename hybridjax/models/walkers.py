@@ -52,16 +52,9 @@ class RimlessWheel(HybridSystem):
         return {"swing": WheelSwing(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "impact",
-                "swing",
-                "swing",
-                guard=lambda t, q, u: q[0] - self.slope - self.alpha,
-                direction="rising",
-                reset=lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1]),
-            ),
-        )
+        angle = lambda t, q, u: q[0] - self.slope - self.alpha  # noqa: E731
+        after = lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1])  # noqa: E731
+        return (Transition("impact", "swing", "swing", angle, "rising", after),)
 
     def guess(self):
         return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))

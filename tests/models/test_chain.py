@@ -13,7 +13,7 @@ from ..conftest import DATA
 TRUTH = json.loads((DATA / "bouncing_chain.json").read_text())
 
 
-@pytest.mark.parametrize("n", [2, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5, 10))])
 def test_the_cycle_and_its_multipliers(n):
     cycle, truth = hj.find_limit_cycle(hj.models.BouncingChain(n=n)), TRUTH[str(n)]
     np.testing.assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
