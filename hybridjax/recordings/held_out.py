@@ -45,7 +45,8 @@ class Split(NamedTuple):
 
     def best_order(self, most: int = 4) -> int:
         """Choose an order; see `choose_order`."""
-        ends, fits = uninterrupted_records(self.late), []
+        ends = uninterrupted_records(self.late)
+        fits: list[SeriesFit] = []
         N = self.early.n_sections
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
