@@ -3,16 +3,19 @@
 import importlib
 from collections.abc import Collection, Iterable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy.typing as npt
 
 from ..errors import DefinitionError
 
 
-Numbers = npt.ArrayLike | Sequence | int | float
-"""What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int` and
-`float` to the promotion of static type checkers, which checks at run time do not know.)"""
+if TYPE_CHECKING:
+    Numbers: TypeAlias = Any  # users give what becomes an array, functions get an array
+else:
+    Numbers = npt.ArrayLike | Sequence | int | float
+    """What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int`
+    and `float` to the promotion of static type checkers, which checks at run time do not know.)"""
 
 
 def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ...]:

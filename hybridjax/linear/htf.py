@@ -154,7 +154,7 @@ class HTF(eqx.Module):
                 f"`H` has shape {shape}, but there are {len(self.harmonics)} harmonics and "
                 f"{self.f.shape[0]} frequencies (its first two axes)."
             )
-        if tuple(np.atleast_1d(harmonics)) != self.harmonics:
+        if tuple(np.ravel(np.asarray(harmonics))) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
         self.outputs = names("outputs", outputs, shape[2])
@@ -418,7 +418,7 @@ class HTF(eqx.Module):
         f, H = np.asarray(self.f), np.asarray(values)
         mirror = self._mirror()
         if mirror is not None:
-            f, H = np.concatenate([f, -f]), np.concatenate([H, H[mirror].conj()], axis=1)
+            f, H = np.concatenate([f, -f]), np.concatenate([H, H[np.array(mirror)].conj()], axis=1)
         f = np.mod(f, self.n_sections)
         f[self.n_sections - f < _SAME_FREQUENCY] = 0.0
         order = np.argsort(f, kind="stable")

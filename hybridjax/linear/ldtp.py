@@ -83,12 +83,12 @@ class LDTP(eqx.Module):
         A, B, C = from_host((A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
-        D = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
+        through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         expected = {
             "A": (A, (n_sections, d, d)),
             "B": (B, (n_sections, d, nu)),
             "C": (C, (n_sections, ny, d)),
-            "D": (D, (n_sections, ny, nu)),
+            "D": (through, (n_sections, ny, nu)),
         }
         for name, (array, shape) in expected.items():
             if array.shape != shape or 0 in shape:
@@ -96,18 +96,16 @@ class LDTP(eqx.Module):
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
                     f"C {C.shape} it should be {shape}, without empty axes."
                 )
-        require_x64({"A": A, "B": B, "C": C, "D": D})
-        if coordinates is not None:
-            coordinates = tuple(map(tuple, coordinates))
-            if len(coordinates) != n_sections:
-                raise DefinitionError(
-                    f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
-                )
-        self.A, self.B, self.C, self.D = A, B, C, D
+        require_x64({"A": A, "B": B, "C": C, "D": through})
+        if coordinates is not None and len(coordinates) != n_sections:
+            raise DefinitionError(
+                f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
+            )
+        self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
         self.inputs = names("inputs", inputs, nu)
         self.outputs = names("outputs", outputs, ny)
-        self.coordinates = coordinates
+        self.coordinates = None if coordinates is None else tuple(map(tuple, coordinates))
         _check_padding(self)
 
     @classmethod

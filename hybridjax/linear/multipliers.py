@@ -54,7 +54,7 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
     # (By logarithms, lest the product of some be too small or too large for a number.)
     logarithms = np.sum([np.log(np.diag(factor)) for factor in triangular], axis=0)
     eigenvalues = _pair_conjugates(np.exp(logarithms))
-    return eigenvalues[np.lexsort((-eigenvalues.imag, -np.abs(eigenvalues)))]
+    return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
 
 
 def _balanced(factors):

@@ -152,7 +152,7 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     s, t = cycle.structure, cycle.anchor.t
     a = int(cycle.anchor.chart[0])
     n = s.dims[a]
-    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.settings.scale[a, :n]
+    returned, sizes = monodromy(cycle.factors)[:n, :n], cycle.return_map.scale[a, :n]
     items = tuple(s.resolve_outputs(names).items)
     rows = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
     values, gradients = rows[:, 0], rows[:, 2 : 2 + n]

@@ -1,5 +1,4 @@
 from .advice import advise as advise
-from .angle import PhaseTracker as PhaseTracker
 from .beats.response import phase_response as phase_response
 from .design_tables import add_command as add_command, write_design as write_design
 from .held_out import choose_order as choose_order, hold_out as hold_out

@@ -118,37 +118,36 @@ class _Arrivals(NamedTuple):
 def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections, Int[Array, ""]]:
     """The sections on the cycle, and the `Result` of the flow to section 0, which lies at the
     anchor if that is a crossing."""
-    s, xp, N, period = cycle.structure, namespace(cycle.period), family.n_sections, cycle.period
+    s, xp = Structure(cycle.system), namespace(cycle.period)
+    N, period = family.n_sections, cycle.period
     settings = dataclasses.replace(
         cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
     )
 
-    def go(carry, target):
-        lanes, h, result = carry
+    def go(lanes, h, result, target):
         u = xp.zeros((s.nu, 1))
         return record(s, lanes, u, target, settings, h, result, tangents=True)
 
-    def to(carry, time, i, event, levels):
-        limit = carry[0].t + _LONGEST_WAY * period
-        return go(
-            carry,
-            Target(time[None], i[None], event[None], limit, None, levels, Result.SECTION_MISSED),
-        )
+    def to(lanes, h, result, time, i, event, levels):
+        ends = time[None], i[None], event[None], lanes.t + _LONGEST_WAY * period
+        return go(lanes, h, result, Target(*ends, None, levels, Result.SECTION_MISSED))
 
     begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
     zero = xp.zeros(1, xp.int32)[0]
     if isinstance(family.anchor, Crossing):
         target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + _LONGEST_WAY * period)
-        first, _ = go(begin, to_section(target, family.anchor))
+        first, _ = go(*begin, to_section(target, family.anchor))
         bound = _bind(s, cycle, family, first.lanes, go)
     else:
         bound = _bind(s, cycle, family, cycle.anchor, go)
-        first, _ = to(begin, bound.time[0], zero, bound.event[0], bound.levels)
+        first, _ = to(*begin, bound.time[0], zero, bound.event[0], bound.levels)
 
     def next_section(carry, k):
         i = k % N
         time = bound.time[i] + (k // N) * period
-        moved, tape = to(carry, time, i, bound.event[i], bound.levels)
+        lanes, h, result = carry
+        moved, tape = to(lanes, h, result, time, i, bound.event[i], bound.levels)
+        assert tape is not None
         return (moved.lanes, moved.h, moved.result), _Arrivals(moved.lanes, moved.result, tape)
 
     carry = first.lanes, first.h, first.result
@@ -185,7 +184,7 @@ def _bind(
     period, t, xp, M = cycle.period, anchor.t[0], namespace(cycle.period), family.points
 
     def later(carry, k):
-        moved, _ = go(carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
+        moved, _ = go(*carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
         return (moved.lanes, moved.h, moved.result), moved.lanes
 
     lanes = anchor
