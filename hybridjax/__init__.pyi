@@ -50,7 +50,7 @@ from .identify.multipliers import fit_multipliers as fit_multipliers
 from .identify.order import select_order as select_order
 from .identify.rational import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
-from .identify.validation.validate import validate as validate
+from .identify.validate import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF, Scatter as Scatter
 from .linear.ldtp import LDTP as LDTP

@@ -156,7 +156,7 @@ def optimal_design(
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
     - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
-      `FrequencyResponse`, `ImpulseResponse`, `Order`. Default: `"multipliers"`.
+      `FrequencyResponse`, `ImpulseResponse`. Default: `"multipliers"`.
     - `limit`: largest rms values by name, of inputs, outputs (their deviation from the cycle) or
       states, over all experiments: `{"u": 0.01}`; `"input"` or `"output"`: rms values of these as
       in `design`; or `hj.designs.Limits`, also of peaks, rates, strides and distortion.

@@ -10,8 +10,8 @@ from scipy import stats
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Positive
 from .._core.text import p_value
-from ..identify.validation.amplitude import AmplitudeSweep
-from ..identify.validation.validate import Validation
+from ..identify.amplitude import AmplitudeSweep
+from ..identify.validate import Validation
 from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, axis_of, label_of, letters, panels
 
 

@@ -16,7 +16,7 @@ from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refus
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validation.validate import Validation
+from ..identify.validate import Validation
 from .beats.response import PhaseResponse
 from .data import WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings

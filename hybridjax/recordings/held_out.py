@@ -9,13 +9,13 @@ from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Denominator
+from ..identify.record_simulation import can_be_compared, simulate_record
 from ..identify.series.arx import delayed_outputs, total_least_squares
 from ..identify.series.fit import SeriesFit, assemble, fit_records
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import PreparedRecords
-from ..identify.validation.simulation import can_be_compared, simulate_record
-from ..identify.validation.validate import Validation, validate
+from ..identify.validate import Validation, validate
 from .data import SectionData
 
 
@@ -45,7 +45,8 @@ class Split(NamedTuple):
 
     def best_order(self, most: int = 4) -> int:
         """Choose an order; see `choose_order`."""
-        ends, fits = uninterrupted_records(self.late), []
+        ends = uninterrupted_records(self.late)
+        fits: list[SeriesFit] = []
         N = self.early.n_sections
         for d in range(1, most + 1):
             problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)

@@ -171,7 +171,8 @@ class Recording(eqx.Module):
         recordings = list(recordings)
         if not recordings:
             raise DefinitionError("`recordings` holds no recording to join.")
-        first, trials = recordings[0], []
+        first = recordings[0]
+        trials: list[Trial] = []
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name
             if set(other.signals) != set(first.signals):

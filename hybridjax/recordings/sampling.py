@@ -114,8 +114,8 @@ def section_data(
                     f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
                 )
         sampler = _Sampler(trial.time, signals, nu, bandwidth, sampled)
-        sections = [sampler(w, N, phase.period) for w in stretches]
-        sections = [x for x in sections if x is not None]
+        sampled_parts = (sampler(w, N, phase.period) for w in stretches)
+        sections = [x for x in sampled_parts if x is not None]
         if timing is not None:
             sections = _with_times(sections, N, phase.period, timing)
         mean = _average(sections, N)

@@ -70,8 +70,6 @@ def test_a_digest_says_what_a_function_does(make):
     assert function_digest(same) != function_digest(other)
 
 
-
-
 def test_functions_that_call_each_other_are_looked_at_once():
     """Sixty of them, each calling the ten before; and two that call one another."""
     calls = (

@@ -150,32 +150,6 @@ def test_expected_variance_is_that_of_the_estimate():
     np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
 
 
-def test_distortion_stands_where_a_linear_system_is_silent(hopper):
-    design = hj.multisine(periods=8, band=(0, 2.0), lines="odd", experiments=6)
-    data = hj.experiments.simulate_experiments(hopper, design, start="periodic", discard=8)
-    linear = hj.identify.output_levels(data, repeats=2)
-    assert np.all(linear.even < 1e-15) and np.all(linear.odd < 1e-15)
-    even = hj.ExperimentData(data.u, data.y + data.u**2, n_sections=32, periods=8)
-    odd = hj.ExperimentData(data.u, data.y + data.u**3, n_sections=32, periods=8)
-    assert np.all(hj.identify.output_levels(even).even > 1e-7) and np.all(
-        hj.identify.output_levels(even).odd < 1e-15
-    )
-    assert np.all(hj.identify.output_levels(odd).odd > 1e-10) and np.all(
-        hj.identify.output_levels(odd).even < 1e-15
-    )
-    noisy = hj.identify.output_levels(hj.experiments.add_noise(data, std=0.1), repeats=2)
-    np.testing.assert_allclose(noisy.noise, noisy.even, rtol=0.1)
-    assert "excited" in repr(noisy)
-    with pytest.raises(hj.DefinitionError, match="is an even line"):
-        hj.identify.output_levels(
-            hj.experiments.simulate_experiments(hopper, hj.multisine(periods=8, band=(0, 2.0)))
-        )
-    with pytest.raises(hj.DefinitionError, match="an even number of periods"):
-        hj.identify.output_levels(
-            hj.experiments.simulate_experiments(hopper, hj.multisine(periods=5, band=(0, 2.0)))
-        )
-
-
 @pytest.mark.parametrize(
     "message, arguments",
     {

@@ -40,7 +40,6 @@ def family(request, hopper_cycle, design):
     return request.param, placed, ldtp, data
 
 
-
 def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
     name, _, ldtp, data = family
     assert data.summary() == "80/80 ok"

@@ -171,7 +171,6 @@ def experiments(t):
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
     yield hj.identify.missing_frequencies, dict(data=t.repeated)
-    yield hj.identify.output_levels, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
@@ -224,29 +223,13 @@ def fitting(t):
 
 def designs_data(t):
     ask = hj.designs.Multipliers(harmonics=0, overhang=6)
-    window = hj.designs.Window(np.ones(6))
     yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
     yield hj.designs.Multipliers, {}
     yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
     yield hj.designs.ImpulseResponse, dict(lags=4)
-    yield hj.designs.Order, dict(fewer=1)
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
-    yield hj.designs.Window, dict(weights=np.ones(6))
-    yield window.seen_from_signal, dict(model=t.model)
-    yield window.pushes, dict(design=t.design)
-    yield window.with_signal, dict(data=t.data, design=t.design)
-    yield (
-        hj.designs.choose_window,
-        dict(
-            model=t.model,
-            design=t.design,
-            noise={n: 0.01 for n in t.model.outputs},
-            limit={n: 0.1 for n in t.model.inputs},
-            shortest=t.model.n_sections,
-        ),
-    )
     yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
     yield t.study.add, dict(data=t.block)
     yield (

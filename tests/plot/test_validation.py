@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.identify.amplitude import AmplitudeSweep
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.identify.validation.amplitude import AmplitudeSweep
 
 
 @pytest.fixture(scope="module")

@@ -150,8 +150,8 @@ def _odd(name: str, answers: list[_Answer], names: tuple[str, ...]) -> Iterator[
         "recorded, a stumble, a sensor that failed.",
     }
     for cause, spans in where.items():
-        action = "refused" if cause == "another sign" else "warned"
-        yield Finding(cause, texts[cause].format(name, listed(spans)), action)
+        text = texts[cause].format(name, listed(spans))
+        yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
 
 
 def _answers(parts: list[_Part], i: int) -> list[_Answer]:

@@ -139,7 +139,7 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
     pairs = phase.by_trial(recording)
     mean = np.array([[_average(t, k, parts) for k in columns] for t, parts in pairs])
     finite = np.flatnonzero(np.isfinite(mean).all(axis=(1, 2)))
-    for s in finite if len(finite) > 1 else ():
+    for s in finite.tolist() if len(finite) > 1 else ():
         usual = np.median(mean[finite[finite != s]], axis=0)
         yield from _difference(mean[s], usual, recording.trials[s].name, outputs)
 
