@@ -6,7 +6,7 @@ import pytest
 
 import hybridjax as hj
 
-from ..toys import Blowup, Field
+from ..toys import Field
 
 
 class Balls(hj.HybridSystem):
@@ -149,12 +149,6 @@ def test_causes(system, guess, message):
     chart = next(iter(system.charts()))
     with pytest.raises(hj.ComputationError, match=message):
         hj.find_limit_cycle(system, hj.Guess(chart, guess))
-
-
-def test_a_field_that_jumps_is_told_from_one_that_blows_up():
-    jump = hj.simulate(Friction(), "slide", (0.3, 0.5), 10.0, throw=False)
-    assert jump.result == hj.Result.STEP_COLLAPSE
-    assert hj.simulate(Blowup(), "x", (1.0,), 2.0, throw=False).result == hj.Result.BLOW_UP
 
 
 def test_a_section_that_is_not_met_again_in_time():
