@@ -131,7 +131,7 @@ class TrottingQuadruped(TwoLeggedBar):
     `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both feet of a pair
     stand, a reflex adds `thrust` to the force of the legs. Without it, the order in which the feet
     land has no effect of first order, and the cycle has multipliers; with it, each order has a
-    derivative of its own (`hj.orbits.coincidences`), and `find_limit_cycle` says so.
+    derivative of its own (`hj.coincidences`), and `find_limit_cycle` says so.
 
     The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
     piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
