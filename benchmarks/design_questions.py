@@ -42,7 +42,6 @@ def goals(family, draws: int) -> None:
     asked = {
         "fit_ldtp": design.Multipliers(estimator="fit_ldtp", harmonics=HARMONICS),
         "response": design.FrequencyResponse((0.1, 1.0), harmonics=HARMONICS),
-        "order": design.Order(1),
     }
     for limit in ("input", "output"):
         for name, goal in asked.items():
@@ -51,13 +50,6 @@ def goals(family, draws: int) -> None:
     peaks = design.Limits(rms={"u": 0.01}, peak={"u": 0.02})
     plan = show(family, "goals.peak", usual, limit=peaks)
     family.show("goals.peak.price", plan.for_peaks)
-
-    N = family.model.n_sections
-    choice = design.choose_window(
-        family.model, usual, limit={"yM": 1e-3, "vM": 3e-3}, noise={"yM": 1e-4, "vM": 3e-4},
-        goal=design.Multipliers(harmonics=tuple(range(-N // 2, N // 2))),
-    )  # fmt: skip
-    family.show("goals.window.saved", choice.saved)
 
 
 def show(family, name: str, *design, **about):
@@ -155,7 +147,7 @@ def physical(family, design: hj.Design, noise: dict[str, float], free: tuple[str
         variance=np.broadcast_to(each, htf.H.shape),
     )  # fmt: skip
     system, observed = family.cycle.system, hj.ObservedHTF(htf, family.placed.family)
-    seen = hj.fitting.identifiability(system, observed, free, guess=family.cycle)
+    seen = hj.identifiability(system, observed, free, guess=family.cycle)
     slopes = []
     for name in free:
         values = [float(getattr(system, name)) * (1 + x) for x in (-_ASIDE, _ASIDE)]

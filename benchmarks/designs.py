@@ -16,8 +16,7 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
   stopping, the p-value of that number, and the standard error that was asked for, said and true.
 - `goals`: bounds of other goals, of both limits: multipliers by `fit_ldtp`, the harmonic transfer
   functions for f from 0.1 to 1, one multiplier or two. `peak`: multipliers, rms of u 0.01 and peak
-  0.02; `price`: strides that the peak costs. `window`: what pushing in the best part of the cycle
-  only saves, deviations limited, all harmonics.
+  0.02; `price`: strides that the peak costs.
 - `parameters`: stiffness and damping of the spring by `fit_model`, input limited.
 - `deviation`: deviations of both outputs limited: all lines and `fit_multipliers` against a design
   for `fit_ldtp` and that fit. Beside it bounds of the multiplier by `fit_model`.

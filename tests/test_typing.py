@@ -43,8 +43,6 @@ hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modu
 hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).sequence(64, "binary").u.shape
 hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.FrequencyResponse((0.1, 1.0))).saved
 hj.designs.Limits(distortion=hj.designs.Distortion(cycle, phase, {"yM": 1e-5})).distortion
-hj.designs.Window([1.0, 0.0]).seen_from_signal(model).multipliers.shape
-hj.designs.choose_window(model, hj.multisine(), noise={"yM": 1e-4}, limit={"u": 0.01}).saved
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
 hj.Recording.beside([recording, recording]).units
 hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)

@@ -97,7 +97,8 @@ def read_module(path: Path, kinds: Mapping[str, type], part: str | None = None) 
 def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Static fields and arrays; a module among the fields becomes a dictionary of its own static
     fields, and arrays with its name before theirs."""
-    static, arrays = {}, {}
+    static: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if field.metadata.get("static", False):
@@ -189,7 +190,7 @@ def _moderate(value: Any) -> bool:
     """Return whether no whole number in it is larger than a header may declare."""
     if isinstance(value, tuple):
         return all(map(_moderate, value))
-    return not isinstance(value, int) or abs(value) <= limits.DECLARED
+    return not isinstance(value, int) or abs(value) <= limits.PERIODS
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:

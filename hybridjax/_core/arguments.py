@@ -1,21 +1,24 @@
 """Numbers and names, as users give them, and whether things belong together."""
 
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy.typing as npt
 
 from ..errors import DefinitionError
 
 
-Numbers = npt.ArrayLike | Sequence | int | float
-"""What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int` and
-`float` to the promotion of static type checkers, which checks at run time do not know.)"""
+if TYPE_CHECKING:
+    Numbers: TypeAlias = Any  # users give what becomes an array, functions get an array
+else:
+    Numbers = npt.ArrayLike | Sequence | int | float
+    """What becomes an array: arrays, numbers, sequences of them. (numpy's `ArrayLike` leaves `int`
+    and `float` to the promotion of static type checkers, which checks at run time do not know.)"""
 
 
-def names(kind: str, given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:
+def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ...]:
     """`count` names, with units where these are given; by default `u` or `y` for one, and
     `u0, u1, ...` for several.
 
@@ -26,7 +29,7 @@ def names(kind: str, given: tuple[str, ...] | None, count: int) -> tuple[str, ..
         return (letter,) if count == 1 else tuple(f"{letter}{i}" for i in range(count))
     if len(given) != count:
         raise DefinitionError(f"{count} {kind} need {count} names, but `{kind}` is {given}.")
-    return given
+    return tuple(given)
 
 
 def require_same(

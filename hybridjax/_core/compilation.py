@@ -208,10 +208,10 @@ def quick_jit(function: Callable) -> Callable:
         say_compiling(True)
         return function(*arguments)
 
-    plain = eqx.filter_jit(traced)
+    plain: Any = eqx.filter_jit(traced)
 
     @ft.cache
-    def quick():
+    def quick() -> Any:
         options: Any = {"compiler_options": compiler_options()}  # handed on to `jax.jit`
         return eqx.filter_jit(traced, **options)
 
@@ -239,7 +239,7 @@ def host_first(function: Callable) -> Callable:
     Inside of a transformation of JAX, and on other devices than the CPU, this is `quick_jit`.
     """
     compiled = quick_jit(function)
-    spent = collections.defaultdict(float)
+    spent: dict[tuple, float] = collections.defaultdict(float)
 
     @ft.wraps(function)
     def call(*arguments):
@@ -291,10 +291,15 @@ class TwoTiers:
         arrays, static = eqx.partition(arguments, _is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
         if key not in self._chosen:
-            run = lambda x: self._function(*eqx.combine(structure.unflatten(x), static))  # noqa: E731
+
+            def run(leaves):
+                arrays = jax.tree_util.tree_unflatten(structure, leaves)
+                return self._function(*eqx.combine(arrays, static))
+
             with _choosing, _compiling():
-                program = _lowered(key, run, leaves)
-                self._chosen[key] = program, program.choose(self.large)
+                if key not in self._chosen:  # by another thread in the meantime
+                    program = _lowered(key, run, leaves)
+                    self._chosen[key] = program, program.choose(self.large)
         program, executable = self._chosen[key]
         return program.run(executable, leaves)
 
@@ -386,7 +391,7 @@ def in_turn(alone: bool) -> Iterator[None]:
         yield
 
 
-def is_left_to_lapack(program: Callable, *arguments: Any) -> bool:
+def is_left_to_lapack(program: Any, *arguments: Any) -> bool:
     """Return whether a program of `quick_jit` or `equinox.filter_jit` calls LAPACK for arguments of
     this kind."""
     key = program, kind(arguments)

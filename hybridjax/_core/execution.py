@@ -123,7 +123,7 @@ def libraries() -> list[Library]:
     """Return the libraries of NumPy and SciPy."""
     libraries = []
     for package in (np, scipy):
-        root = pathlib.Path(package.__file__).parent
+        root = pathlib.Path(str(package.__file__)).parent
         for folder in (root.with_name(f"{package.__name__}.libs"), root / ".dylibs"):
             for file in sorted(folder.glob("*openblas*")):
                 with contextlib.suppress(OSError, StopIteration):

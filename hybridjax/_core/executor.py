@@ -11,7 +11,7 @@ import contextlib
 import contextvars
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jax import core
 
 
 if TYPE_CHECKING:
-    Array = jax.Array  # what users get
+    Array: TypeAlias = Any  # of JAX or NumPy: type checkers know no array of both
 else:
     Array = jax.Array | np.ndarray | np.generic
     """An array of either executor."""

@@ -25,18 +25,21 @@ def program_digest(function: Callable, *arguments: Any) -> str:
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     real = [k for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)]
 
-    def value_and_derivative(*leaves):
-        def of_real(*values):
-            inputs = list(leaves)
-            for k, value in zip(real, values, strict=True):
-                inputs[k] = value
-            return function(*structure.unflatten(inputs))
+    def value(*leaves):
+        return function(*jax.tree_util.tree_unflatten(structure, leaves))
 
-        values = [leaves[k] for k in real]
-        return jax.jvp(of_real, values, values)
+    def value_and_derivative(*leaves):
+        def of_real(*numbers):
+            inputs = list(leaves)
+            for k, x in zip(real, numbers, strict=True):
+                inputs[k] = x
+            return value(*inputs)
+
+        numbers = [leaves[k] for k in real]
+        return jax.jvp(of_real, numbers, numbers)
 
     texts = []
-    for program in (lambda *leaves: function(*structure.unflatten(leaves)), value_and_derivative):
+    for program in (value, value_and_derivative):
         texts.append(text := jax.jit(program).lower(*leaves).as_text())
         if re.search(r"custom_call @\w*callback", text):
             raise IndescribableError("it calls back into Python")

@@ -35,7 +35,7 @@ class PerLane(eqx.Module):
         """Return the axes of lanes in the form that `jax.vmap` takes: -1 or None for each array."""
         arrays = eqx.filter(self.tree, eqx.is_array)
         structure = jax.tree_util.tree_structure(arrays)
-        return structure.unflatten([-1 if split else None for split in self.split])
+        return jax.tree_util.tree_unflatten(structure, [-1 if x else None for x in self.split])
 
 
 def shared(tree: Any) -> Any:
@@ -52,7 +52,7 @@ def one_lane(tree: Any) -> Any:
         jax.ShapeDtypeStruct(x.shape[:-1] if s else x.shape, x.dtype)
         for x, s in zip(leaves, split, strict=True)
     ]
-    return eqx.combine(structure.unflatten(shapes), static)
+    return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
 def by_lane(function: Callable, *trees: Any) -> Callable:
@@ -137,7 +137,7 @@ def _join_common(tree, mapped, size: int, L: int):
     flags = zip(leaves, mapped, split, strict=True)
     joined = [_join(x, m, s, size, L) if m or s else x for x, m, s in flags]
     either = tuple(m or s for m, s in zip(mapped, split, strict=True))
-    return PerLane(eqx.combine(structure.unflatten(joined), static), either)
+    return PerLane(eqx.combine(jax.tree_util.tree_unflatten(structure, joined), static), either)
 
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
@@ -156,10 +156,9 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     function itself would store and read again all that happens in it. And where JAX asks for
     several tangents, they all use one Jacobian.
     """
+    has_tangent = lambda x, t: t is not None and eqx.is_inexact_array(x)  # noqa: E731
     has = [
-        jax.tree_util.tree_map(
-            lambda x, t: t is not None and eqx.is_inexact_array(x), x, t, is_leaf=_none
-        )
+        jax.tree_util.tree_map(has_tangent, x, t, is_leaf=lambda x: x is None)
         for x, t in (lane, shared)
     ]
     moving, fixed_lane = eqx.partition(lane[0], has[0])
@@ -174,7 +173,8 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
     if not sizes or sum(sizes) > _JACOBIAN_COLUMNS:
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
-    basis, start = [], 0
+    basis: list[jax.Array] = []
+    start = 0
     total = sum(sizes)
     for x, size in zip([*leaves(moving), *leaves(common)], sizes, strict=True):
         directions = jnp.zeros((total, size)).at[start : start + size].set(jnp.eye(size))
@@ -185,9 +185,9 @@ def lane_jvp(function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any])
             directions = jnp.broadcast_to(directions[..., None], (total, *x.shape))
         basis.append(directions.astype(x.dtype))
         start += size
-    basis = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure((moving, common)), basis)
+    structure = jax.tree_util.tree_structure((moving, common))
     push = jax.vmap(lambda tangent: jax.jvp(of, (moving, common), tangent), out_axes=(None, 0))
-    end, columns = push(basis)
+    end, columns = push(jax.tree_util.tree_unflatten(structure, basis))
 
     # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]

@@ -1,32 +1,27 @@
 """How much one call may ask for, and how much a file may declare: more is a slip of the hand, or
-damage, or malice, and ends in a sentence before memory is taken."""
+damage, or malice, and ends in a sentence before memory is taken. Less would refuse what a large
+computer can do."""
 
 COUNT = 10**9
-"""Of anything else."""
+"""Steps, and whatever has no limit below."""
 SECTIONS = 10**5
-"""Of a family."""
+"""Sections of a family."""
 PERIODS = 10**7
-"""Cycles, periods and samples in one record or experiment."""
-EXPERIMENTS = 10**7
-"""Experiments of a design, systems of a sweep."""
+"""Cycles, periods and samples in one record or experiment; experiments of a design; systems of a
+sweep; any whole number in the header of a file."""
 ORDER = 1000
 """Multipliers of a model."""
-STEPS = 10**8
-"""Of an iteration."""
 WORKERS = 10**4
 """Threads."""
 WINDOW = 2**26
 """Samples of one input in one window of a design."""
 RECORDED = 2**29
 """Samples of all signals of one trial, on one axis of time."""
-
-DECLARED = 10**7
-"""Any whole number in the header of a file: sections, periods, experiments, chunks."""
 TEXT = 2**26
 """Bytes of a header or a manifest."""
 
 
 def unpacked(size: int) -> int:
-    """Bytes that a packed file of `size` bytes may hold. Recorded signals are packed to a half or a
-    twentieth, and only emptiness to a thousandth."""
+    """Return the bytes that a packed file of `size` bytes may hold. Recorded signals are packed to
+    a half or a twentieth, and only emptiness to a thousandth."""
     return 2**26 + 100 * size

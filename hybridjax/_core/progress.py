@@ -21,7 +21,8 @@ from .boundary.checked import checked
 
 Item = TypeVar("Item")
 
-# Seconds until the line appears, and from one look at what to show to the next.
+# Seconds until the line appears (less: it flickers in short calls), and between updates (less:
+# takes time of the call; more of either: nothing is shown for long).
 _DELAY, _PERIOD = 1.0, 0.25
 _LINE = "{desc}, {elapsed}"
 _COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"

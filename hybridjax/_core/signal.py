@@ -1,6 +1,7 @@
 """Names of signals that know their units, from where these are declared to the axes of figures."""
 
 from collections.abc import Iterable
+from typing import Any
 
 
 class Signal(str):
@@ -32,7 +33,7 @@ class Signal(str):
     def __repr__(self) -> str:
         return f"{super().__repr__()} ({self.unit})" if self.unit else super().__repr__()
 
-    def __getnewargs__(self) -> tuple[str, str]:
+    def __getnewargs__(self) -> Any:
         return str(self), self.unit
 
 

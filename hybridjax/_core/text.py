@@ -13,9 +13,11 @@ from .executor import is_traced, is_tracer
 from .signal import unit_of, with_unit
 
 
-# A module stands on one line if it is no wider than that, else each field on a line of its own.
+# Characters up to which a module stands on one line. More: lines wrap in a notebook. Fewer: short
+# modules take a screen.
 _WIDTH = 88
-# So many numbers of an array are printed; of more, only shape and range.
+# Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
+# module no longer stand on one line.
 _FEW = 4
 
 

@@ -39,7 +39,7 @@ def _number(convert: Callable[[str], Any], allowed: Callable[[Any], bool], kind:
 
 
 _count = _number(
-    int, lambda n: 1 <= n <= limits.DECLARED, f"a whole number from 1 to {limits.DECLARED}"
+    int, lambda n: 1 <= n <= limits.PERIODS, f"a whole number from 1 to {limits.PERIODS}"
 )
 _seed = _number(int, lambda n: n >= 0, "a whole number from 0 on")
 _finite = _number(float, math.isfinite, "a number")

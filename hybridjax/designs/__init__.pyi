@@ -4,10 +4,8 @@ from .goals import (
     FrequencyResponse as FrequencyResponse,
     ImpulseResponse as ImpulseResponse,
     Multipliers as Multipliers,
-    Order as Order,
     Parameters as Parameters,
 )
 from .information import information_map as information_map
 from .limits import Limits as Limits
 from .study import Study as Study
-from .window import Window as Window, choose_window as choose_window

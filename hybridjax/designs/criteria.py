@@ -12,9 +12,9 @@ from ..fitting.observations import ObservedHTF
 from ..identify.denominator import multipliers_of
 from .candidates import Candidates, Model, Noise, Powers, measured_htfs
 from .criterion import Average, Criterion, Information, LinearCriterion
-from .goals import Goal, Multipliers, Order, Parameters
+from .goals import Goal, Multipliers, Parameters
 from .matrices import ldtp_matrices, response_criterion
-from .numerators import denominator_information, order_criterion
+from .numerators import denominator_information
 
 
 # Exponents of the mean over models. Larger, for the worst one: closer to the largest criterion (of
@@ -48,8 +48,6 @@ def criterion_of(
     for model in models:
         if isinstance(goal, Multipliers):
             each.append(_multipliers(goal, model, cosines, noise, power))
-        elif isinstance(goal, Order):
-            each.append(order_criterion(goal, model, cosines, noise))
         elif isinstance(goal, Parameters):
             each.append(_parameters(goal, model, cosines, noise))
         else:

@@ -35,7 +35,7 @@ class Distortion(eqx.Module):
 
     This is the deviation of `(y(u) + y(-u)) / 2` from the cycle, including the mean, up to fourth
     order in the input. It is computed from exact second derivatives, through all events; they
-    compile at the first call, for some ten seconds. Inputs act at all sections (no `Window`); the
+    compile at the first call, for some ten seconds. Inputs act at all sections; the
     distortion is the same for all models of a design.
 
     **Arguments:**

@@ -120,28 +120,7 @@ class ImpulseResponse(eqx.Module):
         _check_harmonics(self.harmonics)
 
 
-@checked
-class Order(eqx.Module):
-    """The decision between as many multipliers as the model has, and fewer.
-
-    The misfit of the best model with fewer multipliers, in units of the noise's variance, is made
-    as large as possible (T-optimality: Atkinson and Fedorov, Biometrika 62, 1975). All numerators
-    are free, as in `fit_multipliers`. The standard error is relative to the misfit: one over its
-    root.
-
-    **Arguments:** `fewer`: number of multipliers of the rival model. `harmonics` of the fit.
-    Default: -2 to 2. `overhang`: argument of `fit_multipliers`.
-    """
-
-    fewer: Index = eqx.field(static=True)
-    harmonics: Harmonics = eqx.field(static=True, default=_FEW)
-    overhang: Index | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        _check_harmonics(self.harmonics)
-
-
-Goal = Multipliers | Parameters | FrequencyResponse | ImpulseResponse | Order
+Goal = Multipliers | Parameters | FrequencyResponse | ImpulseResponse
 
 
 def _check_harmonics(harmonics: Harmonics | None) -> None:

@@ -1,37 +1,22 @@
-r"""Criteria of `fit_multipliers`, with all numerators free: the denominator, and its order.
-
-*Order (T-optimality).* The misfit of the best model with fewer multipliers is
-$T(p) = \min_\theta \sum_k p_k t_k(\theta)$, where $t_k$ is its squared misfit at a line per unit of
-power, in units of the noise. As a minimum of linear functions T is concave, so that $\Psi = 1/T$ is
-convex, and $\Psi(tp) = \Psi(p)/t$, with $-\partial \Psi/\partial p_k = t_k / T^2$ at the best model
-(Atkinson and Fedorov 1975).
-"""
+"""The information about the denominator in `fit_multipliers`, with all numerators free."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
-from scipy.optimize import minimize
+from jaxtyping import Float, Int
 
 from ..errors import DefinitionError
 from ..identify.denominator import chi
 from ..identify.htf_errors import check_values, error_weights, require_frequencies
 from ..identify.variable_projection import powers_basis
 from ..linear.htf import HTF
-from .candidates import Candidates, Kept, Measured, Model, Noise, Powers, measured_htfs
-from .criterion import Bound, Channel, Criterion, Information, only_channels
-from .goals import Order
+from .candidates import Measured
+from .criterion import Channel, Information
 
 
 # Decimal digits to which the errors of two entries must agree (up to a factor) to be treated
 # together. One digit less: fewer channels, with errors that are off by as much.
 _EQUAL_WEIGHTS = 9
-# The misfit of the best smaller model, relative to H itself, that is rounding. Larger: models that
-# are distinguishable with little noise are rejected. Smaller: the design follows rounding errors.
-_ROUNDING = 1e-18
-# Starting points of the rival's denominator: its roots lie at these parts of the true ones, beside
-# zero. Fewer: local minima are missed, and the certificate with them.
-_STARTS = (0.0, 0.3, 0.6, 1.0)
 
 
 def coefficients(order: int, n_sections: int, overhang: int | None) -> int:
@@ -129,83 +114,3 @@ def _channels(
         )
         for basis, entries in groups.values()
     ]
-
-
-class OrderCriterion(Criterion):
-    """One over the misfit of the best model with fewer multipliers."""
-
-    names: tuple[str, ...]
-    channels: tuple[Channel, ...]
-    """H delayed by 0, 1, ... periods, and no denominator."""
-    delay: Complex[np.ndarray, " K"]
-    """z^-N of each cosine."""
-    starts: tuple[np.ndarray, ...]
-    """Denominators from which the best one is sought."""
-
-    def only(self, kept: Kept) -> "OrderCriterion":
-        channels = only_channels(self.channels, kept)
-        return OrderCriterion(self.names, channels, self.delay[kept], self.starts)
-
-    def bound(self, power: Powers) -> Bound:
-        def misfit(c: np.ndarray) -> tuple[float, np.ndarray]:
-            total, slope = 0.0, np.zeros(len(c))
-            for channel in self.channels:
-                residual, target = self._residual(channel, c, power)
-                total += (residual**2).sum()
-                z = self.delay[np.unique(channel.cosine)]
-                r, fitted = _complex(residual, len(z)), _complex(target - residual, len(z))
-                each = (r.conj() * fitted).sum(axis=(0, 2)) / chi(z, c)
-                slope += 2 * (z ** np.arange(1, len(c) + 1)[:, None] @ each).real
-            return total, slope
-
-        best = self.starts[0]
-        if len(best):
-            minima = [minimize(misfit, c, jac=True, method="BFGS") for c in self.starts]
-            best = min(minima, key=lambda minimum: minimum.fun).x
-        squares, size = np.zeros(len(power)), 0.0
-        for channel in self.channels:
-            residual, target = self._residual(channel, best, power)
-            squares += np.bincount(channel.cosine, (residual**2).sum(axis=1), len(power))
-            size += (target**2).sum()
-        T = squares.sum()
-        if not T > _ROUNDING * size:
-            raise DefinitionError(
-                "fewer multipliers explain these lines as well: the orders are indistinguishable."
-            )
-        return Bound(np.array([1 / T]), squares / power / T**2, float(1 / T))
-
-    def _residual(
-        self, channel: Channel, c: Float[np.ndarray, " d"], power: Powers
-    ) -> tuple[Float[np.ndarray, "E n"], Float[np.ndarray, "E n"]]:
-        r"""Return the part of $\chi H / |\chi|$ that numerators do not explain, and all of it."""
-        size_of_chi = np.abs(chi(self.delay[channel.cosine], c))
-        weight = (np.sqrt(power)[channel.cosine] / size_of_chi)[:, None]
-        q, _ = np.linalg.qr(weight * channel.basis)
-        delayed = channel.slopes.reshape(len(weight), len(c) + 1, -1)
-        target = weight * np.tensordot(np.concatenate([[1.0], c]), delayed, axes=(0, 1))
-        return target - q @ (q.T @ target), target
-
-
-def order_criterion(goal: Order, model: Model, cosines: Candidates, noise: Noise) -> OrderCriterion:
-    """**Raises:** `DefinitionError` for a rival with as many multipliers."""
-    multipliers, rival = np.asarray(model.multipliers, complex), goal.fewer
-    if rival >= len(multipliers):
-        raise DefinitionError(
-            f"`goal`: {rival} multipliers are not fewer than the model's {len(multipliers)}."
-        )
-    size = coefficients(rival, cosines.n_sections, goal.overhang)
-    channels = []
-    for htf, cosine, _ in measured_htfs(model, cosines, goal.harmonics, noise):
-        require_frequencies(htf, rival, size)
-        channels += _channels(htf, cosine, np.zeros(rival), size, range(rival + 1))
-    largest = np.real(multipliers[:rival])
-    starts = tuple(np.atleast_1d(np.poly(part * largest))[1:] for part in _STARTS)
-    name = f"misfit with {rival} multiplier{'s' * (rival != 1)}"
-    delay = np.exp(-2j * np.pi * cosines.f)
-    return OrderCriterion((name,), tuple(channels), delay, starts if rival else starts[:1])
-
-
-def _complex(values: Float[np.ndarray, "E n"], lines: int) -> Complex[np.ndarray, "B lines n"]:
-    """Return complex numbers from alternating blocks of real and imaginary parts."""
-    blocks = values.reshape(-1, 2, lines, values.shape[1])
-    return blocks[:, 0] + 1j * blocks[:, 1]

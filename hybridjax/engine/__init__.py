@@ -1,6 +1,1 @@
-"""Trajectories and their events."""
-
-import lazy_loader
-
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""The engine: flow of many lanes through events, its records and its derivatives."""

@@ -3,9 +3,17 @@
 Each may be an array of either executor, which share the array API.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import Array
+from .._core import executor
+
+
+if TYPE_CHECKING:
+    Array = Any  # no type says "an array of NumPy or of JAX" together with the methods of both
+else:
+    Array = executor.Array
 
 
 Times = Float[Array, " L"]

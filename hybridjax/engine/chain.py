@@ -133,7 +133,7 @@ def _moves(lanes: Lanes, tape: Tape) -> _Moves:
         np.where(first, lanes.t[lane], tape.t[last, lane]),
         np.where(first, lanes.chart[lane], tape.chart[last, lane]),
         np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
-        tape.h[row, lane], tape.code[row, lane], lane, order,
+        np.asarray(tape.h)[row, lane], np.asarray(tape.code)[row, lane], lane, order,
     )  # fmt: skip
 
 

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float
 
-from .._core.executor import Array, namespace
+from .._core.executor import namespace
 from .._core.precision import at_precision
+from .arrays import Array
 
 
 # An extremum within this part of the guard's values at the step's ends (in double and in single

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import Array, cond, namespace, on_host, put, stop_gradient
+from .._core.executor import cond, namespace, on_host, put, stop_gradient
 from .._core.lanes import put_rows
 from .._core.precision import at_precision
 from ..systems.kinds import Kind, Member
 from ..systems.structure import Structure, stacked
 from ..systems.transition import Scheduled
 from . import kernels
-from .arrays import Index, Inputs, Mask, Padded, States, Times
+from .arrays import Array, Index, Inputs, Mask, Padded, States, Times
 from .lanes import Lanes, for_each_chart, needed, only
 from .settings import ROUNDING
 from .watch import Watch
@@ -51,19 +51,19 @@ def width(t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]) -> Flo
     return (zero * span + rounding * xp.abs(t)) * xp.abs(rate)
 
 
-def arm(s: Structure, lanes: Lanes, seen: Watch, span: Times) -> Lanes:
+def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     """Arm the guards that are positive at the beginning of a piece of flow.
 
     A guard that its input, which may have jumped, makes negative is crossed by no motion: it is
     no event, and not armed until it is positive again.
     """
-    zero = width(lanes.t, span, seen.rate)
-    armed = (lanes.armed & (seen.value >= -zero)[:-1]) | (seen.value > zero)[:-1]
+    zero = width(lanes.t, span, watched.rate)
+    armed = (lanes.armed & (watched.value >= -zero)[:-1]) | (watched.value > zero)[:-1]
     return lanes._replace(armed=armed & _belongs(s, lanes.chart)[:-1])
 
 
 def _belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
-    """Whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
+    """Test whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
     source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[:, None]
     return (source == chart) | (source == -1)
 
@@ -71,7 +71,7 @@ def _belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
 def rearm(
     s: Structure,
     lanes: Lanes,
-    seen: Watch,
+    watched: Watch,
     fired: Index,
     together: Mask,
     span: Times,
@@ -85,7 +85,7 @@ def rearm(
     the old chart was at its zero, too (`together`), a guard other than the one that fired, at zero
     and falling, is still due.
     """
-    xp, value, rate = namespace(fired), seen.value[:-1], seen.rate[:-1]
+    xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
@@ -133,46 +133,46 @@ def apply_resets(
     """States and charts after the transitions `fired` (-1: none)."""
     for kind in s.kinds:
         transition = s.transitions[kind[0]]
-        here, place = _within(kind, fired)
+        chosen, place = _within(kind, fired)
         n = s.dims[s.chart_index(transition.source)]
         b = s.chart_index(transition.target)
 
-        def work(carry, kind=kind, n=n, b=b, here=here, place=place):
+        def work(carry, kind=kind, n=n, b=b, here=chosen, place=place):
             q, chart = carry
-            xp, point = namespace(q), [only(here, x) for x in (t, q[:n], u)]
+            xp, point = namespace(q), (only(here, t), only(here, q[:n]), only(here, u))
             if on_host(q):
-                new = kernels.reset(s, Member(kind, place), *point, here)[:, 0]
+                new = kernels.reset(s, Member(kind, place), *point, some=here)[:, 0]
             else:
                 reset = lambda s, t, q, u, k: s.reset(Member(kind, k), t, q, u)  # noqa: E731
                 new = needed(here, s).by_lane(reset)(*needed(here, point), place)
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
             return xp.where(here, new, q), xp.where(here, b, chart)
 
-        q, chart = cond(here.any(), work, lambda carry: carry, (q, chart))
+        q, chart = cond(chosen.any(), work, lambda carry: carry, (q, chart))
     return q, chart
 
 
 def enabled(s: Structure, t: Times, q: Padded, u: Inputs, which: Index) -> Mask:
-    """Whether the predicates of the transitions `which` hold; True where there is none."""
+    """Test whether the predicates of the transitions `which` hold; True where there is none."""
     xp = namespace(t)
     out = xp.ones(t.shape, bool)
     for kind in s.kinds:
         transition = s.transitions[kind[0]]
         if transition.enabled is not None:
-            here, place = _within(kind, which)
+            chosen, place = _within(kind, which)
             n = s.dims[s.chart_index(transition.source)]
-            point = only(here, t), only(here, q[:n]), only(here, u)
+            point = only(chosen, t), only(chosen, q[:n]), only(chosen, u)
             if on_host(t):
                 holds = kernels.enabled(s, Member(kind, place), *point)
             else:
                 of = lambda s, t, q, u, k, kind=kind: s.enabled(Member(kind, k), t, q, u)  # noqa: E731
                 holds = s.by_lane(of)(*point, place)
-            out = xp.where(here, holds, out)
+            out = xp.where(chosen, holds, out)
     return out
 
 
 def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
-    """Whether the transitions g (-1: none) are of a kind, and their indices there (else 0)."""
+    """Test whether the transitions g (-1: none) are of a kind, and their indices there (else 0)."""
     xp = namespace(g)
     if len(kind) == 1:
         return g == kind[0], xp.asarray(np.zeros(1, np.int32))

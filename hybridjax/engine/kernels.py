@@ -13,20 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.lanes import by_lane
+from .._core.lanes import PerLane, by_lane
 from ..systems.kinds import Kind, Member
 from ..systems.output import Output
 from ..systems.solver import Method, Radau, as_method
 from ..systems.structure import Structure, stacked
+from .arrays import Array
 from .runge_kutta import Step, integrated_divergence, take_step
 from .target import AbstractLevels
 
 
-Times = Float[np.ndarray, " #L"]
-States = Float[np.ndarray, "n L"]
-Inputs = Float[np.ndarray, "nu #L"]
-Expanded = Float[np.ndarray, "rows columns L"]
-Some = Bool[np.ndarray, " L"] | None
+Times = Float[Array, " #L"]
+States = Float[Array, "n L"]
+Inputs = Float[Array, "nu #L"]
+Expanded = Float[Array, "rows columns L"]
+Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
 
 # Lanes of programs that are called for many points at once, and of those that are called for single
@@ -73,11 +74,11 @@ def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -
 def watched(
     s: Structure,
     a: int,
-    levels: AbstractLevels | None,
+    levels: AbstractLevels | PerLane | None,
     t: Times,
     q: States,
     u: Inputs,
-    index: Int[np.ndarray, " #L"],
+    index: Int[Array, " #L"],
     some: Some = None,
 ) -> Expanded:
     """The guards of chart a, and the level if it has one, with their derivatives."""
@@ -92,8 +93,8 @@ def reset(s: Structure, g: Member, t: Times, q: States, u: Inputs, some: Some = 
     return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
 
 
-def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[np.ndarray, " L"]:
-    """Whether the predicates of transitions of one kind hold."""
+def enabled(s: Structure, g: Member, t: Times, q: States, u: Inputs) -> Bool[Array, " L"]:
+    """Test whether the predicates of transitions of one kind hold."""
     return s.kernel(_enabled, by_lane, g.kind)(t, q, u, g.place)
 
 
@@ -102,7 +103,7 @@ def outputs(s: Structure, a: int, items: Items, t: Times, q: States, u: Inputs) 
     return s.kernel(_outputs, _expanded, a, trees=(items,), lanes=_POINTS)(t, q, u)
 
 
-def values(s: Structure, a: int, items: Items, t: Times, q: States) -> Float[np.ndarray, "ny L"]:
+def values(s: Structure, a: int, items: Items, t: Times, q: States) -> Float[Array, "ny L"]:
     """Outputs in chart a without input, without derivatives."""
     u = np.zeros((s.nu, 1))
     return s.kernel(_outputs, by_lane, a, trees=(items,), lanes=_MANY_POINTS)(t, q, u)
@@ -110,7 +111,7 @@ def values(s: Structure, a: int, items: Items, t: Times, q: States) -> Float[np.
 
 def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
-) -> Float[np.ndarray, "N 2 L"]:
+) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
     of_all = s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=_MANY_POINTS)
     return of_all(t, q)
@@ -161,9 +162,9 @@ def _expanded(function: Callable, *trees: Any) -> Callable:
     """Lanes of a vector function of (t, q, u) and its derivatives, as columns of one array."""
 
     def expand(*x):
-        bound, (t, q, u, *others) = x[: len(trees)], x[len(trees) :]
+        bound, (t, q, u, *further) = x[: len(trees)], x[len(trees) :]
         n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
-        at = lambda t, q, u: function(*bound, t, q, u, *others)  # noqa: E731
+        at = lambda t, q, u: function(*bound, t, q, u, *further)  # noqa: E731
         split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
         push = lambda dx: jax.jvp(at, (t, q, u), split(dx))  # noqa: E731
         value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.executor import Array, cond, lane, namespace, on_host
+from .._core.executor import cond, lane, namespace, on_host
 from ..systems.structure import Structure
-from .arrays import Index, Mask, Padded, Times
+from .arrays import Array, Index, Mask, Padded, Times
 
 
 class Lanes(NamedTuple):
@@ -45,12 +45,12 @@ def for_each_chart(s: Structure, chart: Index, mask: Mask, work: Callable, out):
     also keeps XLA from computing its contents once for every use of its results.
     """
     for a in range(len(s.charts)):
-        here = mask & (chart == a)
+        within = mask & (chart == a)
 
-        def present(out, a=a, here=here):
+        def present(out, a=a, here=within):
             return work(a, here, out)
 
-        out = cond(here.any(), present, lambda out: out, out)
+        out = cond(within.any(), present, lambda out: out, out)
     return out
 
 
@@ -82,9 +82,9 @@ def needed(mask: Mask, tree):
     """
     if on_host(mask):
         return tree
-    some = mask.any()
+    present = mask.any()
 
     def cut(x):
-        return jnp.where(some, x, jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
+        return jnp.where(present, x, jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
 
     return jax.tree_util.tree_map(cut, tree)

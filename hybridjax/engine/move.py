@@ -4,11 +4,11 @@ import equinox as eqx
 import jax
 from jaxtyping import Bool
 
-from .._core.executor import Array, namespace, on_host
+from .._core.executor import namespace, on_host
 from .._core.lanes import lane_jvp, shared, vmap_to_lanes
 from .._core.results import Result
 from ..systems.structure import Structure
-from .arrays import Index, Inputs, Times
+from .arrays import Array, Index, Inputs, Times
 from .lanes import Lanes, constant
 from .replay import replay
 from .search.first_step import initial_step, stride
@@ -116,9 +116,10 @@ def _move_jvp(primals, tangents):
     s, lanes, u, target, setout, result, settings, options = primals
     closely = options.tangents is not False or not options.glide
     taped = options._replace(tape=True, glide=False, tangents=closely)
-    fixed = constant((s, lanes, u, target, setout))
-    recorded = _search(*fixed, result, settings, taped)
+    still = constant((s, lanes, u, target, setout))
+    recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
     tape = recorded.tape
+    assert tape is not None
     target, levels = target.split()
 
     def repeat(by_lane, common):

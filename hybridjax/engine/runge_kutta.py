@@ -7,16 +7,16 @@ lets XLA compute each stage once. The default method of a chart is in `systems/v
 
 import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Inexact
 
-from .._core.executor import Array, for_each_row, namespace
+from .._core.executor import for_each_row, namespace
 from ..systems.solver import Method
-from .arrays import AnyTimes, States, Times
+from .arrays import AnyTimes, Array, States, Times
 
 
 LaneField = Callable[[Array, Array], Array]
@@ -27,9 +27,6 @@ _UNROLLED_LANES = 128
 # Eliminations are unrolled up to this number of columns. Higher: they compile for longer. Lower: a
 # loop for each small system.
 _UNROLLED_COLUMNS = 4
-# Newton's iterations for the stages end after this number. Higher: longer steps where the field is
-# most nonlinear. Lower: steps are rejected there.
-_ITERATIONS = 12
 
 
 class Step(NamedTuple):
@@ -62,7 +59,7 @@ def take_step(
     if method.implicit:
         return _implicit_step(method, field, t, q, h, still)
     unroll = unroll or q.shape[1] >= _UNROLLED_LANES
-    K = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
+    K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
     weights = np.array(method.b), np.array(method.error)
     change, error = (_combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights)
     end = q + h * change
@@ -145,9 +142,9 @@ def _decoupled(method: Method) -> _Decoupled:
     if not np.any(np.triu(A, 1)):
         return _Decoupled(np.eye(len(A)), A, np.eye(len(A)))
     values, T = np.linalg.eig(A)
-    kept = values.imag >= 0  # one of each conjugate pair, twice
+    kept = np.imag(values) >= 0  # one of each conjugate pair, twice
     values, left, right = values[kept], T[:, kept], np.linalg.inv(T)[kept]
-    return _Decoupled(left * np.where(values.imag > 0, 2, 1), np.diag(values), right)
+    return _Decoupled(left * np.where(np.imag(values) > 0, 2, 1), np.diag(values), right)
 
 
 def _implicit_step(method: Method, field: LaneField, t, q, h, still: LaneField | None) -> Step:
@@ -209,7 +206,7 @@ def _increments(method, field, t, q, h):
 
     def unsettled(carry):
         *_, going, i = carry
-        return going & (i < _ITERATIONS)
+        return going & (i < 12)  # a step that needs more is rejected for its error
 
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0

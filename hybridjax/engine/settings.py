@@ -11,12 +11,13 @@ from jaxtyping import Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
 from .._core.boundary.values import Reals
-from .._core.executor import Array, namespace
+from .._core.executor import namespace
 from .._core.precision import at_precision, real
 from .._core.text import fields
 from ..errors import DefinitionError
 from ..systems.solver import Solver, solvers
 from ..systems.system import HybridSystem, integrated
+from .arrays import AnyTimes, Array, States
 from .runge_kutta import Step
 
 
@@ -41,13 +42,9 @@ STEADY_START = 1e-10
 """Starts of periodic responses, relative to the sizes of time and states."""
 
 
-# Rounding errors of a time or a state, relative to it, in double and in single precision. Twice as
-# much: events that are as near to each other are taken for one.
+# Rounding errors of a time or a state, relative to it, in double and in single precision. Higher:
+# separate events are taken for simultaneous ones. Lower: an event happens again by rounding.
 ROUNDING = 4e-15, 2e-6
-# A step may have an error of so many rounding errors of the rates at its end, as they are seen
-# there: those at its stages may be larger. Doubled, states at rounding level take fewer steps, and
-# all others may err twice as much where they are moved by large ones.
-_TIMES_ROUNDING = 10.0
 
 
 @checked
@@ -55,23 +52,23 @@ class Settings(eqx.Module):
     """Accuracy and effort of the flow.
 
     The estimated error of a step in state k of chart a is at most
-    `rtol * |q[k]| + atol * scale[a, k]`. What is not given is what the call takes by default.
+    `rtol * |q[k]| + atol * scale[a, k]`. Defaults of `rtol` and `atol` are those of the call.
     """
 
     rtol: Float[Array, ""] | None
-    """Error of a step relative to each state's own size."""
+    """Error of a step relative to the size of each state."""
     atol: Float[Array, ""] | None
     """Error of a step relative to each state's `scale`."""
     max_steps: int = eqx.field(static=True)
     """Bound on the number of iterations (steps, tried or taken) of one piece of flow."""
     scale: Float[Array, "A d"] | None
-    """Sizes that states usually have, by chart, padded to the dimension of the largest with
-    anything above zero. `None`: sizes are taken from each step (see `tolerance`), which is not
-    enough for derivatives."""
+    """Characteristic magnitudes of states, by chart, padded to the dimension of the largest with
+    any positive numbers. `None`: magnitudes are taken from each step (see `tolerance`), which is
+    not enough for derivatives."""
     solver: Any = eqx.field(static=True)
-    """How charts are integrated, if not as the system says: a Runge-Kutta method of diffrax with an
+    """Solver of the charts in place of that of the system: a Runge-Kutta method of diffrax with an
     error estimate, `hj.Radau()`, or several of them by the names of charts; or "auto", for
-    `find_limit_cycle`: an implicit one where the cycle turns out to be stiff."""
+    `find_limit_cycle`: an implicit one where the cycle is stiff."""
 
     def __repr__(self):
         return fields(self)
@@ -86,12 +83,12 @@ class Settings(eqx.Module):
         scale: Annotated[Numbers, Reals("A d", sign="nonnegative")] | None = None,
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
-        self.rtol, self.atol, self.scale = map(_kept, (rtol, atol, scale))
+        self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)
         self.max_steps = max_steps
         self.solver = solver if isinstance(solver, str) else solvers(solver)
 
     def filled(self, accuracy: float) -> "Settings":
-        """With this accuracy where none is given."""
+        """Settings with this accuracy where none is given."""
         rtol, atol = (accuracy if x is None else x for x in (self.rtol, self.atol))
         return Settings(rtol, atol, self.max_steps, self.scale)
 
@@ -107,31 +104,26 @@ class Settings(eqx.Module):
         return system if self.solver is None else integrated(system, self.solver)
 
 
-def _kept(x: Array | float | None) -> Array | None:
-    """The host's arrays as they are, for what else there is JAX's."""
+def _kept(x: Any) -> Any:
+    """Arrays of the host unchanged, other numbers as arrays of JAX."""
     kept = x is None or (isinstance(x, np.ndarray) and x.dtype == np.float64)
     return x if kept else real(x)
 
 
-def size(settings: Settings, a: int, *q: Float[Array, "n L"]) -> Float[Array, "n L"]:
-    """Sizes of states of chart a against which errors are judged: those of `q`, and where `q` is
-    small, those that the states usually have, which must be known."""
-    if settings.scale is None:
+def size(settings: Settings, a: int, *q: States) -> States:
+    """Sizes of states of chart a against which errors are judged: those of `q` or, where `q` is
+    small, the usual ones, which must be known."""
+    if settings.scale is None or settings.rtol is None:
         raise DefinitionError("derivatives of the flow need the sizes of states: give `scale`.")
     xp = namespace(q[0])
-    own = ft.reduce(xp.maximum, map(xp.abs, q))
-    usual = settings.scale[a, : len(own)].reshape(len(own), -1)
-    return own + settings.atol / settings.rtol * usual
+    largest = ft.reduce(xp.maximum, map(xp.abs, q))
+    usual = settings.scale[a, : len(largest)].reshape(len(largest), -1)
+    return largest + settings.atol / settings.rtol * usual
 
 
 def tolerance(
-    settings: Settings,
-    a: int,
-    q: Float[Array, "n L"],
-    tau: Float[Array, " #L"],
-    step: Step,
-    rounding: Float[Array, "n L"],
-) -> Float[Array, "n L"]:
+    settings: Settings, a: int, q: States, tau: AnyTimes, step: Step, rounding: States
+) -> States:
     """The error that a step over tau from states `q` of chart a may have.
 
     Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
@@ -141,8 +133,9 @@ def tolerance(
     if settings.scale is not None:
         return settings.rtol * size(settings, a, q, step.q)
     xp = namespace(q)
-    own = xp.maximum(xp.abs(q), xp.abs(step.q))
+    largest = xp.maximum(xp.abs(q), xp.abs(step.q))
     change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
-    rounding = at_precision(*ROUNDING) * own + _TIMES_ROUNDING * xp.abs(tau) * rounding
-    found = settings.rtol * own + settings.atol * xp.maximum(own, change) + rounding
-    return xp.maximum(found, xp.finfo(own.dtype).tiny)  # where all is at rest at zero
+    # Rounding errors of the rate may be ten times as large at the stages as at the end of the step.
+    rounding = at_precision(*ROUNDING) * largest + 10.0 * xp.abs(tau) * rounding
+    allowed = settings.rtol * largest + settings.atol * xp.maximum(largest, change) + rounding
+    return xp.maximum(allowed, xp.finfo(largest.dtype).tiny)  # where all is at rest at zero

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, cond, namespace, on_host, put
+from .._core.executor import cond, namespace, on_host, put
+from .arrays import Array
 from .lanes import Lanes
 
 
@@ -73,8 +74,8 @@ def log_events(log: EventLog, row: Tape) -> EventLog:
     xp, fired = namespace(row.code), row.code >= 0
 
     def write():
-        here = fired & (xp.arange(len(log.time))[:, None] == log.count)
-        time = xp.where(here, row.t, log.time)
-        return EventLog(time, xp.where(here, row.code, log.event), log.count + fired)
+        at = fired & (xp.arange(len(log.time))[:, None] == log.count)
+        time = xp.where(at, row.t, log.time)
+        return EventLog(time, xp.where(at, row.code, log.event), log.count + fired)
 
     return cond(fired.any(), write, lambda: log)

@@ -6,10 +6,11 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Float, Int
 
-from .._core.executor import Array, Definition, namespace, stop_gradient
+from .._core.executor import Definition, namespace, stop_gradient
 from .._core.lanes import PerLane
 from .._core.results import Result
 from ..systems.structure import Structure
+from .arrays import Array
 
 
 class AbstractLevels(Definition):
@@ -17,7 +18,7 @@ class AbstractLevels(Definition):
 
     @abc.abstractmethod
     def present(self, s: Structure, a: int) -> bool:
-        """Whether any of the sections can be crossed in chart a."""
+        """Test whether any of the sections can be crossed in chart a."""
 
     @abc.abstractmethod
     def level(

@@ -72,6 +72,11 @@ class Trajectory(eqx.Module):
     result: Result = eqx.field(static=True)
 
     @property
+    def structure(self) -> Structure:
+        """The system by the indices of its charts and transitions."""
+        return Structure(self.system)
+
+    @property
     def events(self) -> list[Event]:
         """The events in order of time."""
         events, charts, transitions = [], self.system.charts(), self.system.transitions()
@@ -106,7 +111,7 @@ class Trajectory(eqx.Module):
         """
         require_x64()
         t, chart, q = self.dense(per_step)
-        s = Structure(self.system)
+        s = self.structure
         items = tuple(s.resolve_outputs(names).items)
         values = np.full((len(names), t.shape[0]), np.nan)
         for a in np.unique(chart):
@@ -185,8 +190,8 @@ def simulate(
             break
     t, before, after, charts, event = (np.concatenate(x) for x in zip(*rows, strict=True))
     source = np.concatenate([charts[:1], charts[:-1]])
-    slopes = (_slopes(s, t, *x, u) for x in ((source, before), (charts, after)))
-    trajectory = Trajectory(s.system, t, charts, before, after, *slopes, event, result)
+    left, right = _slopes(s, t, source, before, u), _slopes(s, t, charts, after, u)
+    trajectory = Trajectory(s.system, t, charts, before, after, left, right, event, result)
     if throw and result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {t[-1]:.6g} in chart '{s.names[charts[-1]]}': "

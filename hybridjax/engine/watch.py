@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.executor import Array, namespace, on_host, put
+from .._core.executor import namespace, on_host, put
 from .._core.lanes import pick, put_rows, shared
 from ..systems.solver import Method
 from ..systems.structure import Structure, stacked
 from . import kernels
-from .arrays import AnyInputs, AnyTimes, Index, Inputs, Mask, Padded, States, Times
+from .arrays import AnyInputs, AnyTimes, Array, Index, Inputs, Mask, Padded, States, Times
 from .lanes import for_each_chart, only
 from .runge_kutta import LaneField, Step, short_step, take_step
 from .target import Target
@@ -58,7 +58,7 @@ class ChartFlow(NamedTuple):
     a: int
     u: Inputs
     target: Target
-    some: Mask | None = None
+    subset: Mask | None = None
     """On the host, the lanes that are needed; `None` for all."""
 
     @property
@@ -67,11 +67,11 @@ class ChartFlow(NamedTuple):
 
     @property
     def field(self) -> LaneField:
-        return chart_field(self.s, self.a, self.u, self.some)
+        return chart_field(self.s, self.a, self.u, self.subset)
 
     def only(self, some: Mask) -> "ChartFlow":
         """The flow of fewer lanes."""
-        return self._replace(some=some) if on_host(some) and not some.all() else self
+        return self._replace(subset=some) if on_host(some) and not some.all() else self
 
     @property
     def has_level(self) -> bool:
@@ -86,7 +86,7 @@ class ChartFlow(NamedTuple):
     def step(self, t: AnyTimes, q: States, h: AnyTimes, unroll: bool = False) -> Step:
         """A step from (t, q) over h (see `take_step`)."""
         if on_host(q):
-            return kernels.step(self.s, self.a, t, q, self.u, h, self.some)
+            return kernels.step(self.s, self.a, t, q, self.u, h, self.subset)
         return take_step(self.method, self.field, t, q, h, unroll)
 
     def step_along(
@@ -104,7 +104,7 @@ class ChartFlow(NamedTuple):
         """The watched functions, in the order of `rows`; f is the field there."""
         a, levels, index, has_level = self.a, self.target.levels, self.target.index, self.has_level
         if on_host(q):
-            rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.some)
+            rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
             return Watch(rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1))
         kinds = self.s.guard_kinds(a)
 

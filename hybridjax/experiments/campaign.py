@@ -206,7 +206,8 @@ class Campaign:
             parts.append((part.result, part.failed_at, part.error, part.log))
         *each, logs = zip(*parts, strict=True)
         result, failed_at, error = map(np.concatenate, each)
-        log = IntervalEvents(*map(np.concatenate, zip(*logs, strict=True))) if capacity else None
+        merge = lambda *x: np.concatenate(x)  # noqa: E731
+        log = jax.tree_util.tree_map(merge, *logs) if capacity else None
         error = error.astype(float) + stepping.rounding
         return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, log
 
@@ -230,7 +231,7 @@ class Campaign:
         silent = dataclasses.replace(self.at_sections.course, outputs=())
         flow = TwoTiers(flow_batch, large=False)
         arguments = *from_host((on_cycle(placed), u)), stepping.settings, capacity
-        return IntervalEvents(*map(np.asarray, flow(silent, stepping.plan, *arguments).log))
+        return jax.device_get(flow(silent, stepping.plan, *arguments).log)
 
     def cycle_events(self) -> EventList:
         """Return the events of one period of the limit cycle, as those of one experiment."""

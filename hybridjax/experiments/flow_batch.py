@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..engine.lanes import Lanes
-from ..engine.move import Moved, glide
+from ..engine.move import glide
 from ..engine.settings import Settings
 from ..sections.abstract import BoundSections
 from ..sections.placed import PlacedSections, observe, section_target
@@ -21,8 +21,8 @@ from ..systems.system import HybridSystem
 from .plan import Plan
 
 
-# The error that rounding alone may leave at a section, relative to the states' scales. Twice as
-# much is seen in `error` only where accuracies near 1e-13 are asked for.
+# Rounding error at a section, relative to the states' scales. Smaller: error estimates near 1e-13
+# are exceeded. Larger: accuracies near 1e-13 are not reported.
 _LEAST_ERROR = 1e-13
 
 
@@ -30,15 +30,15 @@ class IntervalEvents(NamedTuple):
     """Events of S experiments between consecutive sections, the first K of each interval."""
 
     time: Float[Array, "S n K"]
-    """Since the limit cycle passed section 0 at the start of this turn."""
+    """Time since the limit cycle passed section 0 at the start of this period."""
     event: Int[Array, "S n K"]
-    """Transitions by index; beyond `count` without meaning, as their times."""
+    """Indices of transitions; beyond `count` without meaning, as their times."""
     count: Int[Array, "S n"]
-    """How many events there were, which may be more than K."""
+    """Number of events, which may exceed K."""
 
 
 class Response(NamedTuple):
-    """What becomes of S experiments of n samples."""
+    """The response of S experiments of n samples."""
 
     y: Float[Array, "S n ny"]
     """Outputs at the sections, before the new input acts; NaN after a failure."""
@@ -56,7 +56,7 @@ class Response(NamedTuple):
 
 
 class Course(eqx.Module):
-    """What experiments need to know of sections on a limit cycle.
+    """The sections on a limit cycle, as experiments need them.
 
     **Fields:** `outputs`, what is recorded there; the others are those of `PlacedSections` and
     `LimitCycle`.
@@ -71,7 +71,7 @@ class Course(eqx.Module):
 
 
 def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
-    """The course of experiments around a limit cycle."""
+    """Return the course of experiments around a limit cycle."""
     cycle = placed.cycle
     return Course(
         cycle.system, tuple(outputs), placed.bound, placed.lanes, cycle.period, cycle.event_sequence
@@ -124,12 +124,15 @@ def flow_batch(
             (moved.lanes.t - turns * period, moved.lanes.events - turns * one_turn),
         )
         ok = result == Result.OK
+        log = moved.log
+        if log is not None:  # times since the cycle's start
+            log = IntervalEvents(log.time - first.t, log.event, log.count)
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
         return (lanes, result), (
             y,
             ok,
             jax.lax.stop_gradient(share),
-            _log(moved, first.t) if event_log else None,
+            log,
         )
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
@@ -141,8 +144,3 @@ def flow_batch(
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
     y, log = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x, -1, 0), (y, log))
     return Response(y, result, failed_at, error, end.T, log)
-
-
-def _log(moved: Moved, beginning: Float[Array, " 1"]) -> IntervalEvents:
-    """The events on the way to one section, time counted from `beginning`."""
-    return IntervalEvents(moved.log.time - beginning, moved.log.event, moved.log.count)

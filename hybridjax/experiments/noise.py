@@ -166,13 +166,13 @@ def add_noise(
     **Raises:** `DefinitionError` unless exactly one of `std` and `snr` is given, with a shape that
     fits the outputs and sections.
     """
-    if snr is not None and std is None:
+    if (std is None) == (snr is None):
+        raise DefinitionError("add_noise needs either `std` or `snr`.")
+    if snr is not None:
         if not data.ok.any():
             raise DefinitionError("no experiment ran well, so there is no signal to compare with.")
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
-    elif std is None or snr is not None:
-        raise DefinitionError("add_noise needs either `std` or `snr`.")
-    N, ny = data.n_sections, data.y.shape[2]
+    std, N, ny = np.asarray(std), data.n_sections, data.y.shape[2]
     if np.shape(std) not in ((), (ny,), (N, ny)):
         raise DefinitionError(
             f"`std` must be one number or {ny}, one for each output, or of shape ({N}, {ny}), not "

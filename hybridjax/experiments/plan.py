@@ -1,7 +1,7 @@
-"""What the limit cycle teaches about the way from each section to the next.
+"""Step schedules between sections, computed in advance on the limit cycle.
 
-A plan serves prediction, step lengths and error estimates, not control flow: lanes that go another
-way than the cycle are integrated just as well, only perhaps in more steps.
+A plan gives first steps and error estimates, not control flow: experiments that take another path
+than the cycle are integrated as accurately, perhaps in more steps.
 """
 
 import dataclasses
@@ -28,46 +28,43 @@ from ..sections.place import PATIENCE
 from ..sections.placed import PlacedSections
 
 
-# Ways to go that are tried for each section, the cheapest first: by so many equal steps, or by
-# steps whose error estimate is at most this part of the tolerance. Twice as many of either take
-# longer to try, and find ways that are a little cheaper.
+# Candidates for each section, the cheapest first: so many equal steps, or steps whose error
+# estimate is at most this part of the tolerance. Fewer: intervals take more steps than they need.
+# More: plans take longer to make.
 _EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
 _TOLERANCES = (1.0, 1e-2, 1e-4)
-# The relative tolerance of the reference to which the ways are compared. Twice as much shows where
-# accuracies near 1e-13 are asked for.
+# Relative tolerance of the reference solution. Larger: errors near 1e-13 are estimated wrongly.
+# Smaller: rounding dominates.
 _REFERENCE_RTOL = 1e-13
-# Room for the way to a level, which takes longer in some lanes than on the cycle, as a ratio of
-# times. Twice as much makes equal steps longer than they need to be.
+# Duration of the path to a level relative to that on the cycle, for which equal steps are made.
+# Smaller: experiments that take longer need one step more. Larger: steps are longer than planned.
 _ROOM = 1.25
-# A step may have up to this many times its error estimate on the cycle, where the accuracy allows
-# it. Twice as much lets lanes far from the cycle go twice as wrong before their steps get shorter.
+# A step may have up to this many times its error estimate on the cycle if the accuracy allows it.
+# Smaller: experiments far from the cycle take more steps. Larger: their errors grow.
 _MOST_SLACK = 10.0
-# Periods over which errors are followed; the rest is a geometric series. Twice as many plan for
-# longer, and matter where multipliers are near the unit circle.
+# Periods over which errors are propagated; a geometric series stands for all later ones. Fewer:
+# errors are underestimated for multipliers near the unit circle. More: plans take longer to make.
 _PERIODS = 8
-# Estimates are this many times the error that accumulates on the cycle. Twice as much doubles
-# `ExperimentData.error`.
+# Safety factor of error estimates. Smaller: experiments far from the cycle exceed their estimates.
+# Larger: `ExperimentData.error` is pessimistic.
 _CAUTION = 3.0
-# Errors of different sections cancel in part; credit for it is given up to this ratio. Twice as
-# much lets estimates be half as large where nearly everything cancels.
+# Errors of different sections cancel in part, by at most this ratio in estimates. Larger: estimates
+# are too small if they cancel on the cycle only. Smaller: estimates are pessimistic.
 _MOST_CANCELLATION = 30.0
-# Error estimates, and the room that steps have for them, are at least this part of the tolerance.
-# Twice as much counts twice the error estimate of steps that are all but exact.
+# Least error estimate of a step, relative to the tolerance. Smaller: weights of steps without error
+# overflow. Larger: the errors of accurate steps are overestimated.
 _LEAST_SHARE = 1e-6
-# Bounds on the time to the next level as a multiple of Newton's guess, beyond which the guess means
-# nothing. Twice as wide, worse guesses set the length of the last step.
-_LEAST_LEAD, _LARGEST_LEAD = 0.3, 3.0
-# Errors per section that are taken for granted, relative to the states' scales: a few units in the
-# last place. Twice as much changes nothing above accuracies of 1e-13.
-_ROUNDING = 1e-15
+# Newton's guess of the time to the next level is used if it is wrong by a smaller factor. Larger:
+# bad guesses set the length of the last step. Smaller: good ones are not used.
+_WORST_GUESS = 3.0
 
 Accuracy = Annotated[float, Number("a number from 1e-13 to 0.01", low=1e-13, high=1e-2)]
-"""Relative to the states' scales, that a plan can be made for. Below the least, rounding is larger;
-beyond the largest, the cycle tells little about lanes beside it."""
+"""Relative to the states' scales. Below the least, rounding is larger; above the largest, errors on
+the cycle differ from those of experiments beside it."""
 
 
 class Plan(eqx.Module):
-    """How to go from section k to the next, for k = 0..N-1.
+    """Step schedule from section k to the next, for k = 0..N-1.
 
     **Fields:**
 
@@ -84,7 +81,7 @@ class Plan(eqx.Module):
     weight: Float[Array, " N"]
 
     def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
-        """How `lanes` lanes set out from section k."""
+        """Return the first step and its limits at section k, for so many lanes."""
         fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
 
@@ -92,11 +89,11 @@ class Plan(eqx.Module):
 def make_plan(
     placed: PlacedSections, settings: Settings, accuracy: float, scale: Float[np.ndarray, "N n"]
 ) -> Plan:
-    """Find the cheapest way between sections that keeps the accuracy asked for.
+    """Return the cheapest schedule that keeps the accuracy.
 
-    **Arguments:** `accuracy` of (t, q) at every later section, relative to `scale`.
+    **Arguments:** `accuracy`: of (t, q) at every later section, relative to `scale`.
 
-    **Raises:** `ComputationError` where no way arrives.
+    **Raises:** `ComputationError` if no candidate reaches the next section.
     """
     N = placed.n_sections
     placed = to_host(placed)
@@ -109,7 +106,7 @@ def make_plan(
     error = np.transpose(ways.ends[:, :-1] - ways.ends[:, -1:], (1, 2, 0))
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
-    impact = np.maximum(_impact(J, error, scale), _ROUNDING)
+    impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
     impact = np.where(np.isnan(impact), np.inf, impact)
     lost = ~np.isfinite(impact).any(axis=0)
     if lost.any():
@@ -142,11 +139,10 @@ def make_plan(
 
 
 class _Ways(NamedTuple):
-    """What was tried from every section to the next."""
+    """Candidates from every section to the next."""
 
     ends: Float[Array, "n B N"]
-    """(t, q) after each of K ways to go, and after the reference; NaN for those that do not
-    arrive."""
+    """(t, q) after each of K candidates and the reference; NaN for those that do not arrive."""
     estimate: Float[Array, "K N"]
     """Error estimates of the ways to go, relative to the tolerance."""
     first: Float[Array, "K N"]
@@ -165,7 +161,7 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
     by_level = xp.isinf(placed.bound.time[following]) & (placed.bound.event[following] < 0)
     longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
-    # Ways, with a lane for every section: K candidates, and the reference.
+    # A lane for every section in each of K candidates and the reference.
     W = K + 1
     divide = np.array([*_EQUAL_STEPS, *[_EQUAL_STEPS[-1]] * len(_TOLERANCES), 2])
     slack = np.array([*[np.inf] * len(_EQUAL_STEPS), *_TOLERANCES, 1.0])
@@ -190,26 +186,27 @@ def _try_ways(placed: PlacedSections, settings: Settings) -> _Ways:
 
 
 def _cheapest(impact: Float[np.ndarray, "K N"], share: float) -> Int[np.ndarray, " N"]:
-    """The first candidate of each section whose impact is at most `share`, or the best one."""
+    """Return the first candidate of each section whose impact is at most `share`, or the best."""
     enough = impact <= share
     return np.where(enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0))
 
 
 def _lead(placed: PlacedSections, target):
-    """Time to the next level as a multiple of Newton's guess; 1 where that makes no sense."""
+    """Return the time to the next level as a multiple of Newton's guess; 1 if the guess is bad."""
     s, lanes = placed.structure(), placed.lanes
     N = placed.n_sections
     xp = namespace(lanes.t)
     everywhere = xp.ones(N, bool)
-    seen = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, everywhere)
-    value, rate = seen.value[-1], seen.rate[-1]
+    watched = watch(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, everywhere)
+    value, rate = watched.value[-1], watched.rate[-1]
     falls = (value > 0) & (rate < 0)
     lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
-    return xp.where((lead > _LEAST_LEAD) & (lead < _LARGEST_LEAD), lead, 1.0)
+    return xp.where((lead > 1 / _WORST_GUESS) & (lead < _WORST_GUESS), lead, 1.0)
 
 
 def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
-    """Where errors made on the way from section k (K, N, n) lead to, relative to the scales."""
+    """Return the largest later errors that errors of the interval after section k (K, N, n) cause,
+    relative to the scales."""
     N = len(scale)
     section, worst = np.arange(N), np.zeros((_PERIODS, *error.shape[:2]))
     for m in range(_PERIODS * N):
@@ -223,7 +220,7 @@ def _impact(J, error, scale) -> Float[np.ndarray, "K N"]:
 
 
 def _accumulated(J, error, scale) -> float:
-    """The largest error, relative to the scales, when every section makes its `error` (N, n)."""
+    """Return the largest error, relative to the scales, if all sections add `error` (N, n)."""
     N = len(scale)
     total, largest = np.zeros(scale.shape[1]), 0.0
     for m in range(_PERIODS * N):
@@ -233,11 +230,11 @@ def _accumulated(J, error, scale) -> float:
 
 
 class Stepping(eqx.Module):
-    """How lanes step from section to section, and how precise that is.
+    """Tolerances and step schedule from section to section.
 
     **Fields:**
 
-    - `plan`: how lanes set out from each section. `settings`: tolerances.
+    - `plan`: the schedule. `settings`: tolerances.
     - `scales`: of time (the period) and of states (`LimitCycle.scale`) at each section.
     - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
     - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
@@ -254,7 +251,7 @@ _made = Memory()
 
 
 def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
-    """The plan for placed sections; made once for each accuracy."""
+    """Return the plan for placed sections, made once for each accuracy."""
 
     def make() -> Stepping:
         cycle = placed.cycle

@@ -79,11 +79,11 @@ class Record(eqx.Module):
 
     @property
     def records(self) -> tuple["Record"]:
-        """Itself alone, so that a record may stand wherever data of several may."""
+        """The record itself, so that functions take one record or data of several alike."""
         return (self,)
 
     def part(self, first: Index, stop: Index) -> "Record":
-        """The samples `first`, ..., `stop - 1` as a record of their own.
+        """Return the samples `first`, ..., `stop - 1` as a record.
 
         **Raises:** `DefinitionError` if there are none.
         """
@@ -109,20 +109,20 @@ class Record(eqx.Module):
 
 @runtime_checkable
 class HasRecords(Protocol):
-    """Whatever is made of records: `Record`, `ExperimentData`, `SectionData`."""
+    """Data made of records: `Record`, `ExperimentData`, `SectionData`."""
 
     @property
     def records(self) -> Sequence[Record]: ...
 
 
 RecordedData = HasRecords | Annotated[Iterable[HasRecords], Stream(HasRecords, "data")]
-"""What fits to series take: data made of records, or several such data."""
+"""Data for fits to time series: data made of records, or several such data."""
 
 
 def uninterrupted_records(data: RecordedData) -> list[Record]:
-    """All records, cut where an input is unknown, so that no input is NaN in what is returned.
+    """Return all records, cut at unknown inputs: no input in the result is NaN.
 
-    The output just at an unknown input is not used, since it may feel it directly, nor are those
+    The output at an unknown input is not used, as it may depend on it directly, nor are those up to
     `lead` samples earlier.
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
@@ -131,26 +131,27 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
 
 
 def each_uninterrupted_record(data: RecordedData) -> Iterator[Record]:
-    """`uninterrupted_records`, one after the other."""
-    kind, found = None, False
+    """Yield `uninterrupted_records` one after the other."""
+    common, usable = None, False
     for record in _records(data):
         if not record.inputs:
             raise DefinitionError(
                 "`data` holds no input: name the signals that acted, or use what needs none "
                 "(`hj.recordings.natural_multipliers`)."
             )
-        own = (record.n_sections, record.inputs, record.outputs, record.lead, record.drift)
-        kind = own if kind is None else kind
-        if own != kind:
+        about = (record.n_sections, record.inputs, record.outputs, record.lead, record.drift)
+        common = about if common is None else common
+        if about != common:
             raise DefinitionError(
-                f"`data` holds records that do not belong together: some have {kind}, others {own}."
+                f"`data` holds records that do not belong together: some have {common}, others "
+                f"{about}."
             )
         for part in _with_known_inputs(record):
-            found = True
+            usable = True
             yield part
-    if kind is None:
+    if common is None:
         raise DefinitionError("`data` holds no experiment that ran to its end.")
-    if not found:
+    if not usable:
         raise DefinitionError("the input is NaN at every sample.")
 
 
@@ -160,8 +161,8 @@ def _records(data: RecordedData) -> Iterator[Record]:
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:
-    known = np.isfinite(record.u).all(axis=1)
-    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
+    finite = np.isfinite(record.u).all(axis=1)
+    edges = np.flatnonzero(np.diff(finite.astype(int), prepend=0, append=0))
     for first, stop in edges.reshape(-1, 2).tolist():
         part = record.part(first, stop)
         part.y[max(len(part.y) - record.lead, 0) :] = np.nan  # (`part` copies)

@@ -1,6 +1,7 @@
-"""Experiments in single precision: how far rounding errors carry them, measured on the cycle."""
+"""Experiments in single precision: the effect of rounding errors, measured on the cycle."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -21,41 +22,39 @@ from ..sections.placed import PlacedSections
 from .plan import Plan, Stepping, plan_flow
 
 
-# Lanes that leave each section. Twice as many measure for twice as long, and scatter less by a
-# factor of 1.4.
-_LANES = 32
-# Their distance from the cycle, relative to the states' scales. Twice as much shows more of the
-# curvature of section maps, which counts as if it were a rounding error.
-_DISTANCE = 1e-4
+# Lanes that leave each section, and their distance from the cycle relative to the states' scales.
+# Fewer lanes: the measured errors scatter more. Farther: the curvature of section maps counts as
+# rounding. Nearer: the fit of section maps is dominated by rounding.
+_LANES, _DISTANCE = 32, 1e-4
 # Directions in which lanes differ by less than this part of the most are left out of the fit of
-# section maps. Twice as much leaves out directions that are known twice as well.
+# section maps. Smaller: rounding is fitted. Larger: slow directions are left out.
 _INDEPENDENT = 1e-6
-# Rounding errors of a step's error estimate, in units of the last place of the state. Twice as many
-# let estimates be twice as large before a step is made shorter.
+# Rounding errors of a step's error estimate, in units of the last place of the state. Smaller:
+# steps are shortened in vain. Larger: inaccurate steps are accepted.
 _ROUNDINGS_PER_STEP = 8.0
-# Periods over which errors are followed at most, until one adds less than this share. Twice the
-# share stops earlier, by as much too small an estimate.
-_PERIODS, _GROWTH = 1024, 1e-3
-# The largest of the thousands of errors of an experiment, in standard deviations; and a factor of
-# reserve. Twice either doubles what single precision is said to cost.
-_LARGEST, _CAUTION = 4.0, 2.0
+# Errors accumulate over 2 to the power of this periods. Fewer: they are underestimated for
+# multipliers near the unit circle. More: uncertain multipliers above 1 make them infinite.
+_DOUBLINGS = 10
+# The largest of the thousands of errors of an experiment in standard deviations, times a safety
+# factor of 2. Smaller: experiments exceed their estimates. Larger: estimates are pessimistic.
+_LARGEST = 8.0
 
 
-_known = Memory()
+_measured = Memory()
 
 
 def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
-    """The plan for experiments in single precision, with what rounding adds to their errors.
+    """Return the plan for single precision, with the errors that rounding adds.
 
     **Raises:** `DefinitionError` for an accuracy that single precision cannot give here; otherwise
     as `plan_flow`.
     """
     half = plan_flow(placed, accuracy / 2)
     # No step is made shorter because of what rounding leaves in its error estimate.
-    noise = _ROUNDINGS_PER_STEP * float(jnp.finfo(jnp.float32).eps) / half.settings.rtol
+    noise = _ROUNDINGS_PER_STEP * float(jnp.finfo(jnp.float32).eps) / (accuracy / 2)
     slack = from_host(np.maximum(half.plan.slack, noise))
     rough = dataclasses.replace(half, plan=dataclasses.replace(half.plan, slack=slack))
-    rounding = _known.recall(placed, accuracy, lambda: rounding_error(placed, rough))
+    rounding = _measured.recall(placed, accuracy, lambda: rounding_error(placed, rough))
     if rounding > accuracy / 2:
         raise DefinitionError(
             f"single precision leaves errors of about {rounding:.1e} of the states' sizes in these "
@@ -66,13 +65,13 @@ def plan_single(placed: PlacedSections, accuracy: float) -> Stepping:
 
 
 def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:
-    """An estimate of the largest error of (t, q) at any section that 32 bits leave, relative to
-    the scales.
+    """Return an estimate of the largest error of (t, q) that rounding to 32 bits causes at any
+    section, relative to the scales.
 
-    Lanes near the cycle flow from every section to the next in both precisions. What differs is
-    what one section adds: a mean (parameters are rounded, for instance) and a scatter. Both are
-    followed through the section maps, which are fitted to the same lanes, until as much is
-    forgotten as is added. Infinity if lanes do not arrive.
+    Lanes near the cycle flow from every section to the next in both precisions. The differences
+    are the errors that one section adds: a mean (of rounded parameters, for instance) and a
+    scatter. Both accumulate under the section maps, which are fitted to the same lanes. Infinity if
+    lanes do not arrive.
     """
     scale = stepping.scales
     N, n = scale.shape
@@ -96,31 +95,33 @@ def rounding_error(placed: PlacedSections, stepping: Stepping) -> float:
         added[..., 0] = 0.0
     x, z = (start - start.mean(axis=0)) / scale, ends - ends.mean(axis=0)
     maps = [np.linalg.pinv(x[:, k], rcond=_INDEPENDENT) @ z[:, k] for k in range(N)]
-    return _followed(np.array(maps), added)
+    return _accumulated(np.array(maps), added)
 
 
-def _followed(maps: Float[np.ndarray, "N n n"], added: Float[np.ndarray, "L N n"]) -> float:
-    """The largest error where section k adds a draw of `added` to what its map (rows of states
-    times `maps[k]`) makes of the errors so far."""
+def _accumulated(maps: Float[np.ndarray, "N n n"], added: Float[np.ndarray, "L N n"]) -> float:
+    """Return the largest error if section k adds a draw of `added` to the image of earlier errors
+    under its map (rows of states times `maps[k]`)."""
     mean = added.mean(axis=0)
-    scatter = np.array([np.atleast_2d(np.cov(x.T)) for x in np.swapaxes(added, 0, 1)])
-    bias, cov, largest = np.zeros(mean.shape[1]), np.zeros(scatter.shape[1:]), 0.0
-    for _ in range(_PERIODS):
-        before = largest
+    scatter = [np.atleast_2d(np.cov(x.T)) for x in np.swapaxes(added, 0, 1)]
+
+    def period(bias, cov):
         for J, m, c in zip(maps, mean, scatter, strict=True):
             bias, cov = bias @ J + m, J.T @ cov @ J + c
-            size = np.abs(bias) + _LARGEST * np.sqrt(np.diag(cov))
-            largest = max(largest, float(size.max()))
-        if largest - before <= _GROWTH * largest:
-            break
-    return _CAUTION * largest
+            yield bias, cov
+
+    M = functools.reduce(np.matmul, maps)
+    *_, (bias, cov) = period(np.zeros(len(M)), np.zeros(M.shape))
+    for _ in range(_DOUBLINGS):
+        bias, cov, M = bias + bias @ M, cov + M.T @ cov @ M, M @ M
+    sizes = (2 * np.abs(b) + _LARGEST * np.sqrt(np.diag(c)) for b, c in period(bias, cov))
+    return max(float(size.max()) for size in sizes)
 
 
 @quick_jit
 def _sections(
     placed: PlacedSections, plan: Plan, settings: Settings, start: Float[Array, "n L"]
 ) -> Float[Array, "n L"]:
-    """Where lanes arrive that start by turns from section 0, 1, ... N-1; NaN if they do not."""
+    """Return the next section's (t, q) of lanes from sections 0, 1, ..., N-1, 0, ...; else NaN."""
     N, L = placed.n_sections, start.shape[1]
     k = jnp.arange(L) % N
     i = (k + 1) % N

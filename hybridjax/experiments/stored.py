@@ -12,7 +12,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Path
 from .._core.execution import Execution
-from .._core.pieces.description import array_digest, definition_digest, digest_of, versions
+from .._core.pieces.description import array_digest, digest_of, function_digest, versions
 from .._core.pieces.run import DaskClient, Workers, fill
 from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
 from .._core.results import Result
@@ -197,7 +197,7 @@ class ExperimentJob:
     def begin(self, client: DaskClient | None) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
         campaign, description = self.campaign, self.description
-        placed, here = campaign.placed, campaign.at_sections
+        placed, values = campaign.placed, campaign.at_sections
         n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
         codes = {
             "flag_values": [int(x) for x in Result],
@@ -205,15 +205,15 @@ class ExperimentJob:
         }
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
-            "y": Variable("<f8", ("sample", "output"), (n, len(here.outputs.names))),
+            "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
             "result": Variable("<i8", attributes=codes),
             "failed_at": Variable("<i8"),
             "error": Variable("<f8"),
         }
         constants: dict[str, Constant] = {
-            "input": (("input",), np.array(list(map(str, u)))),
-            "output": (("output",), np.array(list(map(str, here.outputs.names)))),
-            "cycle_outputs": (("section", "output"), here.on_cycle),
+            "input": (("input",), np.array(list(map(str, u))), {}),
+            "output": (("output",), np.array(list(map(str, values.outputs.names))), {}),
+            "cycle_outputs": (("section", "output"), values.on_cycle, {}),
         }
         if campaign.record_events:
             cycle, axis = campaign.cycle_events(), (("occurrence",), (self.event_count,))
@@ -225,9 +225,9 @@ class ExperimentJob:
                 "event_sample": Variable("<i8", *axis),
             }
             constants |= {
-                "cycle_time": (("cycle_event",), np.asarray(cycle.time[0])),
-                "cycle_event": (("cycle_event",), np.asarray(cycle.event[0])),
-                "cycle_period": ((), np.asarray(placed.cycle.period)),
+                "cycle_time": (("cycle_event",), np.asarray(cycle.time[0]), {}),
+                "cycle_event": (("cycle_event",), np.asarray(cycle.event[0]), {}),
+                "cycle_period": ((), np.asarray(placed.cycle.period), {}),
             }
         coordinates = "input", "output"
         layout = Layout(
@@ -243,20 +243,20 @@ class ExperimentJob:
 
     def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "ExperimentJob":
         """Return the job with the arrays of another process."""
-        mine, others = eqx.partition(self._computed(), eqx.is_array)
+        mine, static = eqx.partition(self._computed(), eqx.is_array)
         leaves, structure = jax.tree_util.tree_flatten(mine)
         leaves = [
             jax.numpy.asarray(new) if isinstance(old, jax.Array) else new
             for old, new in zip(leaves, arrays, strict=True)
         ]
-        placed, stepping, model = eqx.combine(structure.unflatten(leaves), others)
+        placed, stepping, model = eqx.combine(structure.unflatten(leaves), static)
         campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
         return dataclasses.replace(self, campaign=campaign)
 
     def _computed(self) -> Any:
         return self.campaign.placed, self.campaign.stepping, self.campaign.model
 
-    @functools.cached_property
+    @property
     def description(self) -> dict[str, Any]:
         """JSON from which the experiments can be told from others."""
         campaign = self.campaign
@@ -267,7 +267,7 @@ class ExperimentJob:
             "versions": versions(),
             "model": describe(placed.cycle.system),
             "cycle": rough(placed.cycle),
-            "family": definition_digest(placed.family),
+            "family": function_digest(placed.family),
             "design": _design(inputs.source),
             "start": campaign.start,
             "process_noise": None if noise is None else dataclasses.asdict(noise),
@@ -286,7 +286,7 @@ class ExperimentJob:
                 "label": placed.family.label,
                 "transitions": [t.name for t in z.structure.transitions],
             },
-            "outputs": [x if isinstance(x, str) else definition_digest(x) for x in z.items],
+            "outputs": [x if isinstance(x, str) else function_digest(x) for x in z.items],
         }
 
 

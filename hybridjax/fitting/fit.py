@@ -21,7 +21,6 @@ from ..engine.describe import describe
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..orbits.find import find_limit_cycle
-from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuesses, diagnose
 from .observations import AbstractObservation
@@ -164,7 +163,7 @@ def _anchored(cycle: LimitCycle) -> LimitCycle:
     room = np.where(charts != charts[:, None], apart, len(charts)).min(axis=1)
     if not cycle.clocked or room[0] == room.max():
         return cycle
-    k, s = int(np.argmax(room)), Structure(cycle.system)
+    k, s = int(np.argmax(room)), cycle.structure
     a, q = int(charts[k]), cycle.legs.q[:, k]
     return find_limit_cycle(
         cycle.system, Guess(s.names[a], q[: s.dims[a]], cycle.legs.t[k]),
@@ -261,7 +260,7 @@ class Guesses:
             "cost": Variable("<f8"),
             **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
         }
-        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names))}
+        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names), {})}
         blocks, about = Blocks((S,), (1,)), self.description
         return self, Layout(("guess",), blocks, variables, constants, ("parameter",), about)
 

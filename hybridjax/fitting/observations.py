@@ -30,7 +30,6 @@ from ..sections.families import FamilyLike, as_family
 from ..sections.linearize import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from ..systems.structure import Structure
 
 
 AnyNames = Annotated[str | Sequence[str], Names(empty=True)]
@@ -52,7 +51,7 @@ class AbstractObservation(eqx.Module):
     have no derivative where two meet):
 
     ```python
-    class ObservedMultipliers(hj.fitting.AbstractObservation):
+    class ObservedMultipliers(hj.AbstractObservation):
         seen: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
@@ -76,7 +75,7 @@ class AbstractObservation(eqx.Module):
         `legs` and `factors` have derivatives by the free parameters, and so have results of
         `linearize` and `place_sections`. Functions that need concrete values raise an error, such
         as `cycle.multipliers`: use `linearize(...).monodromy()`, `characteristic_polynomial()`, or
-        `hj.fitting.spectral_radius`.
+        `hj.spectral_radius`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.
@@ -139,7 +138,7 @@ class ObservedHTF(AbstractObservation):
         return jnp.concatenate([error.real.ravel(), error.imag.ravel()])
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":
-        Structure(cycle.system).resolve_outputs(self.outputs)
+        cycle.structure.resolve_outputs(self.outputs)
         unknown = [name for name in self.inputs if name not in cycle.system.inputs]
         if unknown:
             raise DefinitionError(

@@ -2,7 +2,6 @@
 
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
@@ -10,8 +9,6 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, Probability
 from .._core.precision import require_x64
 from ..errors import DefinitionError
-from ..experiments.data import ExperimentData
-from ..experiments.design.partition import line_class
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF, Scatter
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
@@ -245,74 +242,3 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
             "random phases."
         )
     return ""
-
-
-class OutputLevels(eqx.Module):
-    """Rms of one line of the output spectrum, by the kind of line; NaN where there is none.
-
-    A linear periodic system responds only at lines whose class (distance of f from the nearest
-    integer) is excited. The output at the other lines is noise or nonlinear distortion: of even
-    order at even j, of odd order at odd j. The excited lines hide as much distortion.
-
-    **Fields**, one entry per output: `excited`, `odd`, `even`; `noise`, from repeated windows, of
-    their mean; `outputs`, names.
-    """
-
-    excited: Float[np.ndarray, " ny"]
-    odd: Float[np.ndarray, " ny"]
-    even: Float[np.ndarray, " ny"]
-    noise: Float[np.ndarray, " ny"]
-    outputs: tuple[str, ...] = eqx.field(static=True)
-
-    def __repr__(self) -> str:
-        rows = [f"{'output':>12}  {'excited':>9}  {'odd':>9}  {'even':>9}  {'noise':>9}"]
-        levels = np.stack([self.excited, self.odd, self.even, self.noise], axis=1)
-        for name, row in zip(self.outputs, levels, strict=True):
-            rows.append(f"{name:>12}  " + "  ".join(f"{x:9.2e}" for x in row))
-        return "\n".join(rows)
-
-
-@checked
-def output_levels(data: ExperimentData, repeats: Count = 1) -> OutputLevels:
-    """Return the rms of the output at excited lines, and at odd and even ones that are not.
-
-    Only where P is even and all excited lines are odd (`multisine(lines="odd")`) are the two kinds
-    of distortion separated. Integer f are left out: they hold the error of the limit cycle.
-    Transients appear at all lines: remove them first.
-
-    **Arguments:** `repeats`: windows that are averaged; two or more give the noise. Default: 1.
-
-    **Raises:** `DefinitionError` for excited lines that are not odd, an odd P, records that are
-    too short, or no good experiment.
-    """
-    N, P = data.n_sections, data.periods
-    if P % 2 or not data.ok.any():
-        raise DefinitionError(
-            f"output_levels needs an even number of periods (P = {P}) and a good experiment."
-        )
-    windows = data.windows(repeats)
-    u, y = data.u[data.ok], data.y[data.ok]
-    size = np.abs(np.fft.rfft(u[:, windows[-1]], axis=1)).max(axis=2)
-    experiment, line = np.nonzero(size > SILENT_LINE * size.max(axis=1, keepdims=True))
-    if (line % 2 == 0).any():
-        raise DefinitionError(
-            f"f = {line[line % 2 == 0][0] / P:.10g} is an even line (j = f P), which hides even "
-            "distortion: use a design of odd lines (multisine(lines='odd'))."
-        )
-    spectra = np.stack([np.fft.rfft(y[:, w], axis=1) for w in windows]) / (N * P / 2)
-    Y = spectra.mean(axis=0)
-    classes = line_class(np.arange(Y.shape[1]), P)
-    excited = np.zeros((len(u), P // 2 + 1), bool)
-    excited[experiment, line_class(line, P)] = True
-    excited, odd = excited[:, classes], classes % 2 == 1
-
-    def level(kind):
-        power = np.abs(Y[kind & (classes > 0)]) ** 2
-        return np.sqrt(power.mean(axis=0)) if len(power) else np.full(Y.shape[2], np.nan)
-
-    noise = np.full(Y.shape[2], np.nan)
-    if repeats > 1:
-        noise = np.sqrt(np.mean(np.var(spectra, axis=0, ddof=1), axis=(0, 1)) / repeats)
-    return OutputLevels(
-        level(excited), level(~excited & odd), level(~excited & ~odd), noise, data.outputs
-    )

@@ -43,11 +43,11 @@ class OrderSelection(eqx.Module):
       deviations, and `threshold` the value that noise alone exceeds in 1 % of cases.
     - `cost`, `freedom`: the misfit of the best fit, and its expected value (somewhat larger where
       the variances were estimated).
-    - `aic`, `mdl`: Akaike's and Rissanen's criteria, which penalize each real coefficient, those of
-      the numerators too, by 2 and by the logarithm of the number of data. The smallest is best.
-    - `by_rank`, `by_aic`, `by_mdl`: the order that each criterion selects.
+    - `mdl`: Rissanen's criterion, which penalizes each real coefficient, those of the numerators
+      too, by the logarithm of the number of data. The smallest is best.
+    - `by_rank`, `by_mdl`: the order that each criterion selects.
     - `order`: `by_rank` where variances were given: a longer denominator adds many coefficients
-      of numerators, which the other two penalize, so that they select too few multipliers where
+      of numerators, which `mdl` penalizes, so that it selects too few multipliers where
       noise is strong. Without variances `by_mdl`, which small errors that are not random do not
       mislead.
     """
@@ -58,7 +58,6 @@ class OrderSelection(eqx.Module):
     threshold: Float[np.ndarray, " k"]
     cost: Float[np.ndarray, " k"]
     freedom: Int[np.ndarray, " k"]
-    aic: Float[np.ndarray, " k"]
     mdl: Float[np.ndarray, " k"]
     variances: bool = eqx.field(static=True)
 
@@ -66,10 +65,6 @@ class OrderSelection(eqx.Module):
     def by_rank(self) -> int:
         small = self.deviation <= self.threshold
         return int(np.argmax(small)) if small.any() else int(self.orders[-1])
-
-    @property
-    def by_aic(self) -> int:
-        return int(np.argmin(self.aic))
 
     @property
     def by_mdl(self) -> int:
@@ -80,17 +75,14 @@ class OrderSelection(eqx.Module):
         return self.by_rank if self.variances else self.by_mdl
 
     def __repr__(self) -> str:
-        rows = ["order  left/noise  deviations (1 %)   cost/expected          AIC          MDL"]
+        rows = ["order  left/noise  deviations (1 %)   cost/expected          MDL"]
         for k, d in enumerate(self.orders):
             rows.append(
                 f"{d:5d}  {self.strength[k]:10.4g}  {self.deviation[k]:10.3g} "
                 f"({self.threshold[k]:.1f})  {self.cost[k] / self.freedom[k]:14.4g} "
-                f"{self.aic[k]:12.5g} {self.mdl[k]:12.5g}"
+                f"{self.mdl[k]:12.5g}"
             )
-        rows.append(
-            f"by rank: {self.by_rank}, by AIC: {self.by_aic}, by MDL: {self.by_mdl}; "
-            f"order: {self.order}"
-        )
+        rows.append(f"by rank: {self.by_rank}, by MDL: {self.by_mdl}; order: {self.order}")
         return "\n".join(rows)
 
 
@@ -110,8 +102,7 @@ def select_order(
     independent components as there are multipliers (D at most), and otherwise only noise, whose
     covariance is known up to a factor. The generalized singular values are compared with
     those of noise alone, from the smallest on.
-    *AIC and MDL*: criteria of fits of every order, with numerators of the degree that belongs to
-    it.
+    *MDL*: a criterion of fits of every order, with numerators of the degree that belongs to it.
 
     **Arguments:** as in `fit_multipliers`. Without variances the misfit of the largest order is
     taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors
@@ -163,7 +154,6 @@ def select_order(
         threshold=np.array([_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]),
         cost=cost,
         freedom=freedom,
-        aic=likelihood + 2 * count,
         mdl=likelihood + np.log(data) * count,
         variances=htf.variance is not None,
     )

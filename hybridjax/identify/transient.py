@@ -9,16 +9,13 @@ that d multipliers are left (variable projection: Golub and Pereyra 1973).
 """
 
 import dataclasses
-from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order
-from .._core.boundary.values import Complexes
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
@@ -29,9 +26,8 @@ from .spectral_sums import SILENT_LINE
 # The largest number of multipliers that is tried. Larger: records need 8 more cycles for each one
 # to be separated from all that repeats; smaller: slow modes of larger systems are missed.
 _LARGEST_ORDER = 4
-# Change of the input after P periods, relative to its largest value, and imaginary part of
-# coefficients, that are rounding.
-_REPEATS, _REAL = 1e-6, 1e-9
+# Change of the input after P periods, relative to its largest value, that is rounding.
+_REPEATS = 1e-6
 # Scale of steps for coefficients that start near zero. Smaller: they hardly move.
 _SMALLEST_SCALE = 0.1
 
@@ -63,7 +59,6 @@ def remove_transient(
     data: ExperimentData,
     order: Order | None = None,
     *,
-    multipliers: Annotated[Numbers, Complexes("d")] | None = None,
     skip: Index = 1,
 ) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
@@ -78,7 +73,6 @@ def remove_transient(
 
     - `order`: d, the number of non-zero multipliers. Default: the one of 1 to 4 with the
       shortest description (Rissanen 1978).
-    - `multipliers`: the multipliers, if they are known, conjugates in pairs. Default: fitted.
     - `skip`: periods at the start in which zero multipliers vanish; they are cut off. Default: 1.
 
     **Returns:** `TransientFit`, whose `data` are the argument of `estimate_htf`.
@@ -101,9 +95,6 @@ def remove_transient(
     if not data.ok.any():
         raise DefinitionError(f"no experiment ran well: {data.summary()}.")
     _require_periodic(data)
-    c = None if multipliers is None else _polynomial(np.asarray(multipliers))
-    if c is not None:
-        order = len(c)
 
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
     good = np.flatnonzero(data.ok).tolist()
@@ -122,12 +113,11 @@ def remove_transient(
             "transient from the response: record more cycles, or excite half of the lines "
             "(`multisine(lines='odd')`)."
         )
-    if c is None:
-        tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
-        blocks = _compressed(free, left, everything)
-        count = sum(z.size for z in left)
-        fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
-        c = min(fits, key=lambda fit: fit[0])[1]
+    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
+    blocks = _compressed(free, left, everything)
+    count = sum(z.size for z in left)
+    fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
+    c = min(fits, key=lambda fit: fit[0])[1]
 
     basis = _decays(c, cycles)
     clean, removed = data.y[:, skip * N :].copy(), np.full((S, ny), np.nan)
@@ -154,15 +144,6 @@ def _require_periodic(data: ExperimentData) -> None:
             f"{data.periods} periods over all of the record, so that response and transient cannot "
             "be told apart."
         )
-
-
-def _polynomial(multipliers: np.ndarray) -> Float[np.ndarray, " d"]:
-    if len(multipliers) == 0:
-        raise DefinitionError("`multipliers` must hold one or more.")
-    c = np.poly(multipliers)[1:]
-    if np.abs(np.imag(c)).max() > _REAL:
-        raise DefinitionError(f"`multipliers` must be real or in conjugate pairs: {multipliers}.")
-    return np.real(c)
 
 
 def _classes(data: ExperimentData, s: int) -> np.ndarray:
@@ -210,7 +191,7 @@ def _compressed(free, left, everything: bool):
     """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
     if everything:
         free, left = free[:1], [np.concatenate(left, axis=1)]
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T for z in left]
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in left]
     return list(zip(free, fewer, strict=True))
 
 

@@ -27,11 +27,11 @@ from .multipliers import product_eigenvalues, product_rank
 Matrix = Annotated[Numbers, Reals("rows columns")]
 Signals = Annotated[Numbers, Reals("n nu")]
 
-# Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier
-# that is carried by so weak a direction counts as zero.
+# Singular values of a factor below this part of its largest one are zero. Smaller: rounding is
+# taken for multipliers. Larger: multipliers of weak directions count as zero.
 _RANK_TOLERANCE = 1e-12
-# Distance of z^N from a multiplier, below which less than half of the digits are left of a
-# response. Doubled: responses twice as far from the resonance are refused.
+# Distance of z^N from a multiplier at which a response is refused. Smaller: responses keep less
+# than half of their digits. Larger: accurate ones are refused.
 _RESONANCE = 1e-8
 
 
@@ -83,12 +83,12 @@ class LDTP(eqx.Module):
         A, B, C = from_host((A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
-        D = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
+        through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         expected = {
             "A": (A, (n_sections, d, d)),
             "B": (B, (n_sections, d, nu)),
             "C": (C, (n_sections, ny, d)),
-            "D": (D, (n_sections, ny, nu)),
+            "D": (through, (n_sections, ny, nu)),
         }
         for name, (array, shape) in expected.items():
             if array.shape != shape or 0 in shape:
@@ -96,18 +96,16 @@ class LDTP(eqx.Module):
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
                     f"C {C.shape} it should be {shape}, without empty axes."
                 )
-        require_x64({"A": A, "B": B, "C": C, "D": D})
-        if coordinates is not None:
-            coordinates = tuple(map(tuple, coordinates))
-            if len(coordinates) != n_sections:
-                raise DefinitionError(
-                    f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
-                )
-        self.A, self.B, self.C, self.D = A, B, C, D
+        require_x64({"A": A, "B": B, "C": C, "D": through})
+        if coordinates is not None and len(coordinates) != n_sections:
+            raise DefinitionError(
+                f"`coordinates` names {len(coordinates)} sections, but there are {n_sections}."
+            )
+        self.A, self.B, self.C, self.D = A, B, C, through
         self.dims = _dimensions(dims, n_sections, d)
         self.inputs = names("inputs", inputs, nu)
         self.outputs = names("outputs", outputs, ny)
-        self.coordinates = coordinates
+        self.coordinates = None if coordinates is None else tuple(map(tuple, coordinates))
         _check_padding(self)
 
     @classmethod
@@ -183,9 +181,9 @@ class LDTP(eqx.Module):
         if is_traced(self):
             return None
         names = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
-        known = facts({**names, "dimension": self._dimension()})
+        lines = facts({**names, "dimension": self._dimension()})
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        return card("LDTP", f"{self.n_sections} sections", known, *multipliers)
+        return card("LDTP", f"{self.n_sections} sections", lines, *multipliers)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
@@ -292,7 +290,7 @@ class LDTP(eqx.Module):
     def periodic_states(
         self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
-        """As `periodic_state`, for S inputs (S, P N, nu) at once."""
+        """States as of `periodic_state`, for S inputs (S, P N, nu) at once."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(

@@ -15,11 +15,13 @@ from ..errors import ComputationError
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# Rounds of balancing. Doubled, units that differ by more are evened out.
+# Rounds of balancing. Fewer: units that differ by much remain. More: nothing changes any more.
 _BALANCING = 8
-# QR sweeps for one eigenvalue; two or three are usual. Doubled: failure is noticed later.
+# QR sweeps for one eigenvalue; two or three are usual. Fewer: rare ones fail. More: failure takes
+# longer.
 _MOST_SWEEPS = 60
-# After so many sweeps in vain the shift is chosen otherwise. Doubled: a cycle of shifts ends later.
+# Sweeps after which an exceptional shift breaks a cycle of shifts. Fewer: convergence is disturbed.
+# More: a cycle of shifts ends later.
 _EXCEPTIONAL_EVERY = 10
 
 
@@ -54,7 +56,7 @@ def product_eigenvalues(factors: Sequence[Matrix], rtol: float) -> Complex[np.nd
     # (By logarithms, lest the product of some be too small or too large for a number.)
     logarithms = np.sum([np.log(np.diag(factor)) for factor in triangular], axis=0)
     eigenvalues = _pair_conjugates(np.exp(logarithms))
-    return eigenvalues[np.lexsort((-eigenvalues.imag, -np.abs(eigenvalues)))]
+    return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
 
 
 def _balanced(factors):

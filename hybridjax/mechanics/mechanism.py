@@ -53,7 +53,7 @@ class Mechanism(eqx.Module):
     def kinetic(q, v):
         return 0.5 * m * l**2 * v[0] ** 2
 
-    pendulum = hj.mechanics.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
+    pendulum = hj.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
     acceleration = pendulum.acceleration(q, v, force)  # in the field of a chart
     ```
 
@@ -111,8 +111,8 @@ class Mechanism(eqx.Module):
         pushes = jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
         solved = solve_positive(mass, pushes)
         free, by_force = solved[0], solved[1:].T
-        found = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
-        return Constrained(free + by_force @ found, found)
+        constraint = solve_positive(jacobian @ by_force, -(drift + jacobian @ free))
+        return Constrained(free + by_force @ constraint, constraint)
 
     def impact(
         self,

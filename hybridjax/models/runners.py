@@ -1,7 +1,7 @@
 """Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from ..systems.transition import Transition
 
 Leg = Literal["hind", "front"]
 Legs = tuple[Leg, ...]
-_LEGS: Legs = get_args(Leg)
+_LEGS: Legs = ("hind", "front")
 # Charts by the legs that stand on the table.
 _CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
 
@@ -89,24 +89,18 @@ class TwoLeggedBar(HybridSystem):
         return {name: BarStanding(self, legs) for legs, name in _CHARTS.items()}
 
     def transitions(self):
-        transitions = []
-        for legs, name in _CHARTS.items():
-            for leg in _LEGS:
-                lands = leg not in legs
-                other = tuple(x for x in _LEGS if (x in legs) != (x == leg))
-                transitions.append(
-                    Transition(
-                        f"{leg} {'lands' if lands else 'lifts'} ({name})",
-                        name,
-                        _CHARTS[other],
-                        guard=lambda t, q, u, leg=leg: self.length(leg, t, q),
-                        direction="falling" if lands else "rising",
-                        reset=lambda t, q, u, leg=leg, lands=lands: (
-                            self._impact(leg, t, q) if lands else q
-                        ),
-                    )
-                )
-        return tuple(transitions)
+        return tuple(self._step(leg, legs) for legs in _CHARTS for leg in _LEGS)
+
+    def _step(self, leg: Leg, legs: Legs) -> Transition:
+        """Touchdown or liftoff of a leg, while these legs stand."""
+        lands, source = leg not in legs, _CHARTS[legs]
+        after: Legs = tuple(x for x in _LEGS if (x in legs) != (x == leg))
+        name = f"{leg} {'lands' if lands else 'lifts'} ({source})"
+        length = lambda t, q, u: self.length(leg, t, q)  # noqa: E731
+        if not lands:
+            return Transition(name, source, _CHARTS[after], length, "rising")
+        impact = lambda t, q, u: self._impact(leg, t, q)  # noqa: E731
+        return Transition(name, source, _CHARTS[after], length, "falling", impact)
 
     def _impact(self, leg, t, state):
         y, v, q, p = state
@@ -137,7 +131,7 @@ class TrottingQuadruped(TwoLeggedBar):
     `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both feet of a pair
     stand, a reflex adds `thrust` to the force of the legs. Without it, the order in which the feet
     land has no effect of first order, and the cycle has multipliers; with it, each order has a
-    derivative of its own (`hj.orbits.coincidences`), and `find_limit_cycle` says so.
+    derivative of its own (`hj.coincidences`), and `find_limit_cycle` says so.
 
     The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
     piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
@@ -215,24 +209,14 @@ class SLIPRunner(HybridSystem):
         return {"flight": RunnerFlight(self), "stance": RunnerStance(self)}
 
     def transitions(self):
-        attack = lambda u: self.angle + u[0]  # noqa: E731
+        height = lambda t, q, u: q[0] - self.l0 * jnp.sin(self.angle + u[0])  # noqa: E731
+        landed = lambda t, q, u: (-self.l0 * jnp.cos(self.angle + u[0]), *q)  # noqa: E731
+        down = lambda t, q, u: q[2] < 0  # noqa: E731
+        stretch = lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0  # noqa: E731
+        lifted = lambda t, q, u: q[1:]  # noqa: E731
         return (
-            Transition(
-                "touchdown",
-                "flight",
-                "stance",
-                guard=lambda t, q, u: q[0] - self.l0 * jnp.sin(attack(u)),
-                reset=lambda t, q, u: (-self.l0 * jnp.cos(attack(u)), *q),
-                enabled=lambda t, q, u: q[2] < 0,
-            ),
-            Transition(
-                "liftoff",
-                "stance",
-                "flight",
-                guard=lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0,
-                direction="rising",
-                reset=lambda t, q, u: q[1:],
-            ),
+            Transition("touchdown", "flight", "stance", height, reset=landed, enabled=down),
+            Transition("liftoff", "stance", "flight", stretch, "rising", lifted),
         )
 
     def guess(self):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .._core.compilation import is_left_to_lapack, quick_jit, uncollected
 from .._core.execution import in_threads
@@ -107,7 +107,7 @@ class Programs(NamedTuple):
 
 # For few systems, and for many.
 QUICK = Programs(*map(quick_jit, (_turn, _verdict, _settled)))
-FULL = Programs(*map(eqx.filter_jit, (_turn, _verdict, _settled)))
+FULL = Programs(eqx.filter_jit(_turn), eqx.filter_jit(_verdict), eqx.filter_jit(_settled))
 
 
 class Rounds(NamedTuple):
@@ -181,7 +181,8 @@ class Tiles(NamedTuple):
             if out is not None:
                 cycles = Known(None, out.anchor, out.period, out.turn.jacobian, out.result)
                 sources.insert(0, (parameters[order[: len(out.result)]], cycles))
-            return self._by_neighbors(*_join(*sources), parameters[rows], moved)
+            near, cycles = _join(*sources)
+            return self._by_neighbors(near, cycles, parameters[rows], moved)
 
         with working("cycles", S) as call:
             if self.known is None:
@@ -194,9 +195,10 @@ class Tiles(NamedTuple):
                 call.done = done
                 more = slice(done, max(2 * done, self.size))
                 rows = order[more]
-                rows = rows[cKDTree(parameters[rows]).indices]  # systems of one call are neighbors
+                rows = rows[KDTree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
-                begin = self._first_step(rows, *neighbors(rows, out))
+                anchor, period, jacobian = neighbors(rows, out)
+                begin = self._first_step(rows, anchor, period, jacobian)
                 part = self._newton(rows, *begin, _USUAL)
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
@@ -229,7 +231,8 @@ class Tiles(NamedTuple):
         if not arrived.any():
             return out
         failed, begin = failed[arrived], _pick(begin, arrived)
-        return _replace(out, failed, self._newton(rows[failed], *begin, _NEWTON))
+        anchor, period = begin
+        return _replace(out, failed, self._newton(rows[failed], anchor, period, _NEWTON))
 
     def _by_neighbors(self, parameters, cycles: Known, wanted, moved: bool):
         """The cycle of the nearest system, `moved` as the cycles around it in the same chart
@@ -241,7 +244,7 @@ class Tiles(NamedTuple):
             return *self._given(len(wanted)), blank
         parameters = parameters[ok]
         terms = _powers(parameters[:1]).shape[1]
-        _, near = cKDTree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
+        _, near = KDTree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
         near = near.reshape(len(wanted), -1)
         first = near[:, 0]
         anchor, period, jacobian = _pick((cycles.anchor, cycles.period, cycles.jacobian), ok)
@@ -337,7 +340,7 @@ class Tiles(NamedTuple):
         return _join(*in_threads(run, range(0, len(rows), self.size), 1 if alone else self.workers))
 
 
-def _numbers(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
+def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:
     """The numbers of systems, one row for each."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
     return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)

@@ -88,7 +88,7 @@ class Branch(eqx.Module):
 
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
-        """Whether each cycle is stable. At a marked point itself rounding decides."""
+        """True for each stable cycle. At a marked point itself rounding decides."""
         return np.array([self[k].stable for k in range(len(self))])
 
     def largest(self, output: str) -> Float[np.ndarray, " K"]:

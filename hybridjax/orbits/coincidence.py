@@ -104,7 +104,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
 
 
 def commutes(cycle: LimitCycle) -> bool:
-    """Whether the orders of all events that coincide on a cycle commute; False if none do."""
+    """True if the orders of all events that coincide on a cycle commute; False if none do."""
     groups = coincidences(cycle)
     return bool(groups) and all(group.commute for group in groups)
 
@@ -161,14 +161,14 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
 
 
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
-    """Whether scheduled event g happens at t."""
+    """True if scheduled event g happens at t."""
     schedule = s.transitions[g].guard
     turns = (t - float(schedule.offset)) / float(schedule.period)
     return abs(turns - round(turns)) * float(schedule.period) <= within
 
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:
-    """Whether all orders lead from chart a to the same state, with the same derivative."""
+    """True if all orders lead from chart a to the same state, with the same derivative."""
     if len(orders) < 2:  # in the other order an event does not happen
         return False
     first = orders[0]
@@ -195,6 +195,7 @@ def _multipliers(cycle, t, a, orders, chart: int, state) -> Iterator[np.ndarray]
     settings = dataclasses.replace(cycle.settings, max_steps=LEGS * cycle.settings.max_steps)
     with at_ease():
         moved, tape = record(s, lanes, u, target, settings, tangents=True)
+        assert tape is not None
         around, _ = chain(s, lanes, target, tape, of_states=True)
     before = moved.lanes.q[:n]
     field = kernels.field(s, a, np.array([last]), before, u)[:, 2 : 2 + n, 0]

@@ -4,7 +4,7 @@ H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problem
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -157,8 +157,9 @@ class _Trace(NamedTuple):
             last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
             point = self.curve.step(last, length)
-            over = isinstance(point, Point) and not low <= point.value <= high
-            if over:
+            over = False
+            if isinstance(point, Point) and not low <= point.value <= high:
+                over = True
                 point = self.curve.land(last, point, np.clip(point.value, low, high))
             if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
                 point = Failure(Result.NOT_CONVERGED)
@@ -225,7 +226,8 @@ class _Trace(NamedTuple):
             return points[where].tests[kind]
 
         try:
-            where = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=1e-14, maxiter=60)
+            root = brentq(test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60)
+            where = cast(float, root)
             test(where)
         except (KeyError, RuntimeError):
             return None

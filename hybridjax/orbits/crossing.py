@@ -70,11 +70,12 @@ class Crossing(Definition):
             s.resolve_outputs(self.function)
 
     def in_chart(self, s: Structure, a: int) -> bool:
-        """Whether it can be crossed in chart a."""
+        """True if it can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
-        by_name = isinstance(self.function, str | Output)
-        return s.resolve_outputs(self.function).defined(a) if by_name else True
+        if isinstance(self.function, str | Output):
+            return s.resolve_outputs(self.function).defined(a)
+        return True
 
     def level(
         self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]

@@ -38,9 +38,6 @@ _FLOOR, _SHARE = 1e-3, 0.02
 # Nothing moves if the largest move is at most this part of the largest state, all in sizes.
 # Smaller: an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e-6
-# A multiplier is complex, and two are conjugate, up to these differences. Larger: real pairs with
-# the product 1 that are close are taken for a Neimark-Sacker point. Smaller: rounding hides one.
-_COMPLEX, _CONJUGATE = 1e-9, 1e-6
 
 
 @dataclasses.dataclass
@@ -113,9 +110,9 @@ class Point:
         }
 
     def has_pair_on_circle(self) -> bool:
-        """Whether the pair of multipliers whose product is closest to 1 is a complex one."""
+        """True if the pair of multipliers whose product is closest to 1 is a complex one."""
         x, y = min(self.pairs, key=lambda pair: abs(pair[0] * pair[1] - 1))
-        return bool(abs(x.imag) > _COMPLEX and abs(x - np.conj(y)) < _CONJUGATE)
+        return bool(x.imag != 0 and x == np.conj(y))
 
 
 class Curve:
@@ -233,11 +230,11 @@ class Curve:
     def _settled(self, point: Point) -> Point | Failure:
         """The point with sizes and a tangent of its own."""
         moves, largest = self._extent(point)
-        rest = np.max(moves) <= _REST * np.max(largest)
-        if rest and self.map.base is not None:
+        still = np.max(moves) <= _REST * np.max(largest)
+        if still and self.map.base is not None:
             return Failure(Result.EQUILIBRIUM)
         floor = np.maximum(_FLOOR * np.max(moves), _SHARE * largest)
-        moves = np.ones_like(moves) if rest else np.maximum(moves, floor)
+        moves = np.ones_like(moves) if still else np.maximum(moves, floor)
         sizes = self._sizes(point)
         point = dataclasses.replace(point, size=np.append(moves * sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
@@ -248,8 +245,8 @@ class Curve:
         return np.asarray(dataclasses.replace(self.map, anchor=point.anchor).sizes)
 
     def _extent(self, point: Point) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-        """By how much each state of the anchor's chart moves on the cycle, in all charts that have
-        a state of its name, and its largest modulus, both in sizes of the states."""
+        """The range of each state of the anchor's chart on the cycle, over all charts that have a
+        state of its name, and its largest modulus, both in sizes of the states."""
         s, legs, sizes = self.structure, point.turn.legs, self._sizes(point)
         moves, largest = np.zeros(s.d), np.zeros(s.d)
         for k, name in enumerate(s.charts[int(point.anchor.chart[0])].states):

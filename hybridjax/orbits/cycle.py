@@ -94,11 +94,11 @@ class LimitCycle(eqx.Module):
         """The size of each state on the cycle, by name, unless it was given: errors are judged
         relative to it."""
         _require_values(self, "scale")
-        return sizes_of(self.structure, self.settings.scale)
+        return sizes_of(self.structure, self.return_map.scale)
 
     @property
     def clocked(self) -> bool:
-        """Whether a clock drives the system."""
+        """True if a clock drives the system."""
         return self.system.period() is not None
 
     @property
@@ -134,8 +134,8 @@ class LimitCycle(eqx.Module):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
             values = np.where(lost, 0.0, values)
             if lost.sum() == 1 and not self.event_sequence:  # it follows from the product of all
-                rest = np.prod(values[~lost]).real
-                values[lost] = np.exp(log_determinant(self.return_map)) / rest
+                resolved = np.prod(values[~lost]).real
+                values[lost] = np.exp(log_determinant(self.return_map)) / resolved
         values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
@@ -156,7 +156,7 @@ class LimitCycle(eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """Whether all multipliers lie inside the unit circle, but for those of exactly 1 that
+        """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
@@ -264,7 +264,7 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    s, turn = Structure(orbit.system), orbit.dense()
+    s, turn = orbit.structure, orbit.dense()
     names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
     if not names:
         return ""
@@ -285,7 +285,8 @@ def orbit_picture(
         k = k[thinned(len(k), len(k) / len(t))]
         curves.append(Curve(x[k], y[k], name, COLORS[a % len(COLORS)]))
     if sections is not None:
-        curves.append(Curve(*axes(*sections), color="currentColor", points=True))
+        x, y = axes(*sections)
+        curves.append(Curve(x, y, color="currentColor", points=True))
     labels = [with_unit(x, unit_of(x)) for x in names]
     if len(names) == 1:
         labels.insert(0, with_unit("t", orbit.system.time_unit))

@@ -182,9 +182,8 @@ def _find_with_auto(system, guess, settle, max_period, settings, options) -> Lim
         integrated(system, Radau()), guess, settle=settle, max_period=max_period,
         settings=settings, **options,
     )  # fmt: skip
-    stiff = stiff_charts(
-        Structure(integrated(system, None)), to_host(cycle.legs), float(cycle.period)
-    )
+    explicit = dataclasses.replace(cycle, system=integrated(system, None))
+    stiff = stiff_charts(explicit.structure, to_host(cycle.legs), float(cycle.period))
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
@@ -198,7 +197,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
     s, period, rough = (
         map.structure,
         solution.turn.period,
-        sizes_of(map.structure, map.settings.scale),
+        sizes_of(map.structure, map.scale),
     )
     sizes = sizes_on(s, solution.turn.legs, float(period))
     sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given

@@ -22,7 +22,6 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.check import check_system
-from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .batches import FULL, QUICK, Programs, Rounds, Tiles
 from .coincidence import commutes
@@ -32,13 +31,13 @@ from .return_map import ReturnMap, turn_product
 from .scale import given_sizes, scale_of
 
 
-# Up to so many systems, programs that are compiled in half the time run at most 3 s longer.
-# Doubled, it is 6 s.
+# Largest number of systems for programs that are compiled in half the time and run longer. Larger:
+# they run more than 3 s longer. Smaller: compiling takes longer than they run.
 _SMALL = 2000
-# Of cycles on which events coincide, so many are looked at for whether the order of these matters,
-# and all others if it does in one of them. Doubled, that takes twice as long.
+# Cycles, among those on which events coincide, that are tested for whether the events commute; all
+# are, if they do not in one of these. More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
-# Systems per compiled call. Doubled: fewer calls, whose arrays leave the cache.
+# Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
 BATCH = 250
 
 
@@ -75,9 +74,9 @@ class LimitCycles(eqx.Module):
     def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
         pick = lambda tree: jax.tree_util.tree_map(lambda x: jnp.asarray(x[i]), tree)  # noqa: E731
-        arrays, rest = eqx.partition(self.systems, eqx.is_array)
+        arrays, static = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
-            eqx.combine(pick(arrays), rest), self.base, pick(self.period), pick(self.anchor),
+            eqx.combine(pick(arrays), static), self.base, pick(self.period), pick(self.anchor),
             pick(self.legs), pick(self.factors), pick(self.residual), pick(self.iterations),
             pick(self.result),
             tuple(int(g) for g in self.codes[i] if g >= 0), self.settings,
@@ -86,12 +85,12 @@ class LimitCycles(eqx.Module):
 
     @property
     def scale(self) -> dict[str, float]:
-        """What counts as 1 in each state of every cycle, by name."""
+        """The size of each state on every cycle, by name."""
         return self[0].scale
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:
-        """Which cycles were found."""
+        """True for each cycle that was found."""
         return self.result == Result.OK
 
     @property
@@ -101,15 +100,15 @@ class LimitCycles(eqx.Module):
 
     @remembered
     def multipliers(self) -> Complex[np.ndarray, "S d"]:
-        """Floquet multipliers, the largest first; NaN where there is no cycle.
+        """Floquet multipliers, by decreasing modulus; NaN for systems without a cycle.
 
-        Eigenvalues of the product of the factors, filled up with zeros: those far below the
-        largest are lost in rounding. `cycles[i].multipliers` sees them, too.
+        Eigenvalues of the product of the factors, padded with zeros: those far below the largest
+        are lost in rounding. `cycles[i].multipliers` has them.
         """
         return _multipliers(np.asarray(self.factors), self.ok)
 
     def summary(self, limit: Index = 5) -> str:
-        """`10000/10000 found`, or why the first `limit` of the others were not."""
+        """`10000/10000 found`, or the reasons of the first `limit` failures. Default: 5."""
         text = [f"{self.ok.sum()}/{len(self)} found"]
         text += [f"#{i}: {Result(int(self.result[i])).message}" for i in self.failed[:limit]]
         if len(self.failed) > limit:
@@ -120,7 +119,6 @@ class LimitCycles(eqx.Module):
         return f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})"
 
     def _repr_html_(self) -> str:
-        """(Of very many only some are looked at.)"""
         k = thinned(len(self))
         largest = np.abs(_multipliers(np.asarray(self.factors)[k], self.ok[k])[:, 0])
         shown = {"period": np.asarray(self.period)[k], "largest modulus": largest}
@@ -147,9 +145,9 @@ def find_limit_cycles(
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    Newton starts from the guess for some of them, side by side, and then for as many again from
-    the cycles of their neighbors, until all are done. Systems for which that fails flow freely
-    for some periods, and Newton starts again from where they are then.
+    Newton's method starts from the guess for a few of them, side by side, then for as many again
+    from the cycles of their neighbors, until all are done. Systems for which it fails are simulated
+    for 40 periods, and Newton's method starts again from the end.
 
     **Arguments:**
 
@@ -157,10 +155,10 @@ def find_limit_cycles(
         axis, as `equinox.filter_vmap` makes it:
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
-    - `scale`: sizes of states by name, by default those of the guess.
-    - `settings`: accuracy of the flow; by default 1e-9 per step; and its `solver`.
-    - `execution`: how it is run: systems per compiled call (`batch`, by default 250), threads
-        (`workers`). Always in double precision.
+    - `scale`: sizes of states by name. Default: those of the guess.
+    - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
+    - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`). The
+        precision is always double.
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
@@ -174,9 +172,9 @@ def find_limit_cycles(
     require_x64(systems)
     settings = Settings() if settings is None else settings
     systems = settings.system(systems)
-    arrays, rest = eqx.partition(systems, eqx.is_array)
+    arrays, static = eqx.partition(systems, eqx.is_array)
     S = len(jax.tree_util.tree_leaves(arrays)[0])
-    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), rest))
+    check_system(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
     map = map_for_sweep(guess, scale, settings)
     size = min(execution.batch or BATCH, S)
     tiles = Tiles(systems, map, size, execution.threads, programs_for(S))
@@ -186,32 +184,32 @@ def find_limit_cycles(
 def map_for_sweep(
     guess: LimitCycle, scale: Mapping[str, float] | None, settings: Settings | None
 ) -> ReturnMap:
-    """The return map of `guess`, for the search of the cycles of many systems."""
-    settings = (Settings() if settings is None else settings).filled(SWEEP)
-    s = Structure(guess.system)
-    known = guess.settings.scale if settings.scale is None else settings.scale
-    settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), known))
+    """The return map of `guess`, with the settings of a sweep."""
+    settings, s = (Settings() if settings is None else settings).filled(SWEEP), guess.structure
+    rough = guess.settings.scale if settings.scale is None else settings.scale
+    settings = dataclasses.replace(settings, scale=scale_of(s, given_sizes(s, scale), rough))
     return dataclasses.replace(guess.return_map, settings=settings)
 
 
 def programs_for(S: int) -> Programs:
-    """What solves so many systems in all."""
+    """The compiled functions for S systems in all."""
     return QUICK if S <= _SMALL else FULL
 
 
-def as_cycles(tiles: Tiles, found: Rounds) -> LimitCycles:
-    """The cycles that were found."""
-    turn, map = found.turn, tiles.map
+def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
+    """The last rounds of Newton's method as cycles."""
+    turn, map = rounds.turn, tiles.map
     cycles = LimitCycles(
-        tiles.systems, map.base, found.period, found.anchor, turn.legs, turn.factors,
-        turn.distance, found.steps, found.result, found.codes, map.settings, map.conserved,
+        tiles.systems, map.base, rounds.period, rounds.anchor, turn.legs, turn.factors,
+        turn.distance, rounds.steps, rounds.result, rounds.codes, map.settings, map.conserved,
         map.multiplicity,
     )  # fmt: skip
-    return without_coincidences(cycles, found.together)
+    return without_coincidences(cycles, rounds.together)
 
 
 def without_coincidences(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
-    """Cycles of which those are none on which events coincide (`together`) whose order matters."""
+    """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
+    commute."""
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if all(commutes(cycles[i]) for i in few):
@@ -227,7 +225,7 @@ def _multipliers(
     """See `LimitCycles.multipliers`."""
     product = np.where(ok[:, None, None], turn_product(factors), 0.0)
     values = np.linalg.eigvals(product).astype(complex)
-    order = np.lexsort((-values.imag, -np.round(np.abs(values), 12)), axis=-1)
+    order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
     values = np.take_along_axis(values, order, axis=-1)
     values[~ok] = np.nan
     return values

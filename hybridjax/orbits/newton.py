@@ -41,7 +41,7 @@ class Solution(NamedTuple):
 
     @property
     def is_fixed_point(self) -> bool:
-        """Whether the turn closes, on an isolated cycle or on one of a family."""
+        """True if the turn closes, on an isolated cycle or on one of a family."""
         return int(self.result) in (Result.OK, Result.SINGULAR)
 
 

@@ -69,17 +69,17 @@ class Turn(NamedTuple):
     """As in `Return`."""
     jacobian: Float[Array, "d d"]
     """Derivative of the residual with respect to the state."""
-    by_parameter: Float[Array, " d"] | None
-    """Derivative of the residual along a direction of the parameters, if one was given."""
+    by_parameter: Float[Array, " d"]
+    """Derivative of the residual along a direction of the parameters; None if none was given."""
     legs: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
     """Jacobians of the flow over the pieces; for an autonomous system on the states modulo the
     direction of the flow."""
-    codes: Int[Array, "K R"] | None
-    """Events of each piece, by index of the transition; negative for none."""
-    times: Float[Array, "K R"] | None
-    """Times of these events."""
+    codes: Int[Array, "K R"]
+    """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
+    times: Float[Array, "K R"]
+    """Times of these events. (None in sweeps.)"""
     period: Float[Array, ""]
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
@@ -89,7 +89,7 @@ class Turn(NamedTuple):
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
-        """Whether the turn ends at its beginning (also of many turns at once, on the host)."""
+        """True if the turn ends at its beginning (also of many turns at once, on the host)."""
         return self.distance <= _CLOSED
 
 
@@ -122,9 +122,15 @@ class ReturnMap(eqx.Module):
         return Structure(self.system)
 
     @property
+    def scale(self) -> Float[Array, "A d"]:
+        """Sizes of the states by chart, padded."""
+        assert self.settings.scale is not None
+        return self.settings.scale
+
+    @property
     def sizes(self) -> Float[Array, " d"]:
         """Sizes of the states of the anchor's chart."""
-        return self.settings.scale[self.anchor.chart][0]
+        return self.scale[self.anchor.chart][0]
 
     @property
     def valid(self) -> Bool[Array, " d"]:
@@ -135,8 +141,8 @@ class ReturnMap(eqx.Module):
     @property
     def event(self) -> int:
         """Index of the transition with which every turn begins and ends; -1 for none."""
-        at_event = isinstance(self.base, AtEvent)
-        return self.structure.transition_index(self.base.name) if at_event else -1
+        base = self.base
+        return self.structure.transition_index(base.name) if isinstance(base, AtEvent) else -1
 
     def at_phase_of(self, system: HybridSystem) -> "ReturnMap":
         """The map of another system; a clocked one begins at the same phase of its own clock."""
@@ -195,7 +201,7 @@ class ReturnMap(eqx.Module):
         def flow(lanes, target, h, result):
             jacobian, moved, tape = flow_jacobian(
                 s, lanes, target, self.settings, h, result,
-                of_states=True, new_input=False, wanted=wanted,
+                new_input=False, wanted=wanted,
             )  # fmt: skip
             factor = jacobian[0, 1 : n + 1]
             if direction is not None:
@@ -305,7 +311,8 @@ class ReturnMap(eqx.Module):
 
         def leg(carry, end):
             lanes, h, result = carry
-            target = Target(*(x[None] for x in end), None, ends.levels, ends.missed)
+            time, index, event, limit = (x[None] for x in end)
+            target = Target(time, index, event, limit, None, ends.levels, ends.missed)
             moved, extra = flow(lanes, target, h, result)
             return (moved.lanes, moved.h, moved.result), extra
 
@@ -333,7 +340,7 @@ class ReturnMap(eqx.Module):
         Nothing contracts along the flow of an autonomous system. Projected out of every factor,
         that direction cannot drown a strong contraction across it.
         """
-        xp, sizes = namespace(factors), self.settings.scale[legs.chart]
+        xp, sizes = namespace(factors), self.scale[legs.chart]
         f = self.slopes(legs).T / sizes
         f = f / xp.linalg.norm(f, axis=1, keepdims=True)
         project = np.eye(f.shape[1]) - f[:, :, None] * f[:, None, :]

@@ -121,8 +121,8 @@ def scale_of(
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     """Sizes by name, from `Settings.scale`."""
-    scale, charts = np.asarray(scale), list(enumerate(s.charts))
-    return {n: float(scale[a, k]) for a, c in reversed(charts) for k, n in enumerate(c.states)}
+    by_chart, charts = np.asarray(scale), list(enumerate(s.charts))
+    return {n: float(by_chart[a, k]) for a, c in reversed(charts) for k, n in enumerate(c.states)}
 
 
 def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
@@ -140,18 +140,18 @@ def fastest(
     s: Structure, a: int, t: Float[np.ndarray, " P"], q: Float[np.ndarray, "n P"]
 ) -> Float[np.ndarray, " P"]:
     """The rates at which the fastest modes of chart a decay; 0 if none does."""
-    rates = -_modes(s, a, t, q).real
+    rates = -np.real(_modes(s, a, t, q))
     return np.maximum(rates.max(axis=1, initial=0.0), 0.0)
 
 
 def is_implicit(s: Structure, a: int) -> bool:
-    """Whether chart a is integrated by an implicit method."""
+    """True if chart a is integrated by an implicit method."""
     method = s.method(a)
     return method is not None and method.implicit
 
 
 def has_implicit(s: Structure) -> bool:
-    """Whether some chart is integrated by an implicit method."""
+    """True if some chart is integrated by an implicit method."""
     return any(is_implicit(s, a) for a in range(len(s.charts)))
 
 
@@ -210,7 +210,8 @@ class _Fields(NamedTuple):
 
 
 def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
-    out = _Fields(*np.zeros((2, *q.shape)), np.zeros((s.d, *q.shape)), np.zeros(q.shape))
+    zeros = np.zeros(q.shape)
+    out = _Fields(zeros, zeros.copy(), np.zeros((s.d, *q.shape)), zeros.copy())
     for a in np.unique(chart):
         rows = np.flatnonzero(chart == a)
         parts = _fields_of_chart(s, int(a), t[rows], q[: s.dims[a], rows])

@@ -70,7 +70,7 @@ def _pieces(map: ReturnMap, measure: Callable, tangents: bool = False) -> list:
 
 
 def _frame(map: ReturnMap, move: Link) -> tuple[Matrix, Matrix]:
-    """From (t, q), padded, at the start of a move to coordinates in sizes, and back."""
+    """Matrices from (t, q), padded, at the start of a move to coordinates in sizes, and back."""
     n, clocked = map.structure.dims[move.chart], map.base is None
     size = np.append(map.expected, np.asarray(map.settings.scale)[move.chart, :n])
     basis = np.eye(1 + n)

@@ -57,12 +57,12 @@ def cycle(
 
     **Raises:** `DefinitionError` for a name that does not exist, or sections of another system.
     """
-    s = Structure(cycle.system)
+    s = cycle.structure
     x, y = _plane(s, x, y)
-    for what, own in (("sections", sections), ("perturbed", perturbed)):
-        system = None if own is None else (own.cycle.system if what == "sections" else own.system)
-        if system is not None and Structure(system).names != s.names:
-            raise DefinitionError(f"`{what}` and the cycle belong to different systems.")
+    others = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    for name, other in others.items():
+        if other is not None and other.structure.names != s.names:
+            raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
     orbit = cycle.trajectory(_TURN)
     with panels(ax, height=3.0) as axes:
         panel = axes[0, 0]

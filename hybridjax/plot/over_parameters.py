@@ -10,7 +10,6 @@ from .._core.boundary.checked import checked
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..orbits.branch import KINDS, Branch
-from ..systems.structure import Structure
 from ..systems.system import unit_of_parameter
 from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
 
@@ -67,7 +66,7 @@ def branch(
         panel.plot([], [], "--", color=gray, label="unstable")
         system = branches[0][0].system
         parameter = Signal(b.parameter, unit_of_parameter(system, b.parameter))
-        (output_name,) = Structure(system).resolve_outputs(name).names
+        (output_name,) = branches[0][0].structure.resolve_outputs(name).names
         panel.set(
             xlabel=axis_of(parameter, labels), ylabel=f"largest {axis_of(output_name, labels)}"
         )
@@ -78,7 +77,7 @@ def branch(
 
 def _first_state(branch: Branch) -> str:
     cycle = branch[0]
-    return Structure(cycle.system).charts[int(cycle.anchor.chart[0])].states[0]
+    return cycle.structure.charts[int(cycle.anchor.chart[0])].states[0]
 
 
 def _parts(branch: Branch) -> list[tuple[slice, bool]]:

@@ -1,5 +1,4 @@
 from .advice import advise as advise
-from .angle import PhaseTracker as PhaseTracker
 from .beats.response import phase_response as phase_response
 from .design_tables import add_command as add_command, write_design as write_design
 from .held_out import choose_order as choose_order, hold_out as hold_out
@@ -7,4 +6,4 @@ from .impulse import impulse_responses as impulse_responses
 from .inspection.inspect import inspect as inspect
 from .natural import natural_multipliers as natural_multipliers
 from .phase_estimation import estimate_phase as estimate_phase
-from .sampling import section_data as section_data, without_drift as without_drift
+from .sampling import section_data as section_data

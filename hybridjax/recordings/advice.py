@@ -16,9 +16,9 @@ from ..identify.series.arx import delayed_outputs, ordinary_least_squares, refus
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.validation.validate import Validation
+from ..identify.validate import Validation
 from .beats.response import PhaseResponse
-from .data import SectionData, input_band, input_spectrum
+from .data import WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import Finding, print_findings
 
 
@@ -35,9 +35,6 @@ _MANY_MISSING = 0.2
 # Correlation of two outputs at a section that makes them redundant. Larger: nearly equal ones
 # pass. Smaller: outputs that share most of a response are reported.
 _SAME_OUTPUTS = 0.98
-# Fraction of the Nyquist frequency up to which an input must have power. Larger: the edge of every
-# band is reported. Smaller: transfer functions without power behind them pass.
-_WHOLE_BAND = 0.9
 # Numbers of strides for which standard errors are predicted.
 _STRIDES = (100, 300, 1000, 3000)
 
@@ -86,11 +83,22 @@ def advise(
     of an inspection, which come first. `curve`: the phase response curve of events alone, whose
     warnings come last. Default: None.
     """
+    return collect_advice(data, PreparedRecords(data), fit, validation, findings, curve)
+
+
+def collect_advice(
+    data: SectionData,
+    records: PreparedRecords,
+    fit: SeriesFit,
+    validation: Validation | None,
+    findings: Sequence[Finding],
+    curve: PhaseResponse | None,
+) -> Advice:
+    """Collect the advice on a fit to the data; `records`: those of the data."""
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    parts = PreparedRecords(data)
-    problem = OutputErrorProblem.from_data(parts, d, R - 1 - fit.lead - d * N, free_start=True)
-    delayed, grid = delayed_outputs(problem, d), parts.whole()
+    problem = OutputErrorProblem.from_data(records, d, R - 1 - fit.lead - d * N, free_start=True)
+    delayed, grid = delayed_outputs(problem, d), records.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
     unknowns = R * nu + len(grid.y) * (d + 1)
     plain = ordinary_least_squares(delayed)
@@ -157,7 +165,7 @@ def _about_excitation(data: SectionData, fit: SeriesFit, band: list[float]) -> I
                 f"{name} has power only up to {edge:.2g} cycles per period, so that responses at "
                 "different phases can hardly be told apart.",
             )
-        elif edge < _WHOLE_BAND * fit.n_sections / 2:
+        elif edge < WHOLE_BAND * fit.n_sections / 2:
             yield Finding(
                 "band",
                 f"transfer functions are determined up to f = {edge:.3g} cycles per period only, "
@@ -180,10 +188,10 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
 
 def _correlation(x: Float[np.ndarray, "S T N"], y: Float[np.ndarray, "S T N"]) -> float:
     """Return the median over sections of the modulus of the correlation."""
-    known = np.isfinite(x) & np.isfinite(y)
-    both = np.where(known, [x, y], 0.0)
-    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(known.sum(axis=(0, 1)), 1)
-    x, y = np.where(known, both - mean, 0.0)
+    finite = np.isfinite(x) & np.isfinite(y)
+    both = np.where(finite, [x, y], 0.0)
+    mean = both.sum(axis=(1, 2), keepdims=True) / np.maximum(finite.sum(axis=(0, 1)), 1)
+    x, y = np.where(finite, both - mean, 0.0)
     xy, xx, yy = ((a * b).sum(axis=(0, 1)) for a, b in ((x, y), (x, x), (y, y)))
     return float(np.median(np.abs(xy) / np.sqrt(np.maximum(xx * yy, np.finfo(float).tiny))))
 

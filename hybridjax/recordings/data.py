@@ -19,6 +19,9 @@ from ..experiments.record import Record, uninterrupted_records
 # Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
 # where transfer functions are still identified. Smaller: rounding counts as power.
 _LEAST_POWER = 0.01
+# Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
+# Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
+WHOLE_BAND = 0.9
 
 
 class SectionData(eqx.Module):
@@ -90,13 +93,7 @@ class SectionData(eqx.Module):
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
-        records = tuple(
-            Record(
-                r.u, r.y, n_sections=r.n_sections, first_section=r.first_section, inputs=r.inputs,
-                outputs=r.outputs, lead=r.lead, drift=float(cycles),
-            )
-            for r in self.records
-        )  # fmt: skip
+        records = tuple(replace(r, drift=float(cycles)) for r in self.records)
         return replace(self, records=records)
 
     @checked
@@ -155,9 +152,7 @@ class SectionData(eqx.Module):
         )
 
 
-def input_spectrum(
-    data: SectionData,
-) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
+def input_spectrum(data: SectionData) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Return frequencies in cycles per period, and power spectral densities of the inputs (Welch
     1967) from windows of up to 16 cycles."""
     records, N = uninterrupted_records(data), data.n_sections

@@ -93,11 +93,11 @@ def add_command(recording: Recording, phase: Phase, path: str | os.PathLike) -> 
         added = np.full((len(trial.time), len(command)), np.nan)
         for w in stretches[:1]:
             now = w.at(trial.time)
-            known = np.isfinite(now)
-            k = np.floor((now[known] - np.ceil(w.phase[0])) * N).astype(int)
+            during = np.isfinite(now)
+            k = np.floor((now[during] - np.ceil(w.phase[0])) * N).astype(int)
             for i, values in enumerate(command.values()):
                 row = np.pad(values[s], (1, 1))  # zero before and after the experiment
-                added[known, i] = row[np.clip(k + 1, 0, len(row) - 1)]
+                added[during, i] = row[np.clip(k + 1, 0, len(row) - 1)]
         signals = dict(zip(command, added.T, strict=True))
         told = Recording(trial.time, signals, name=trial.name)
         trials.append(Recording.beside([recording.with_trials([trial]), told]))

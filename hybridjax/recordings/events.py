@@ -25,18 +25,16 @@ _ENOUGH = 20
 _COMMON = 0.1
 
 
-def from_crossings(
-    recording: Recording, crossing: Crossing, bandwidth: float | None, causal: bool
-) -> Phase:
+def from_crossings(recording: Recording, crossing: Crossing, bandwidth: float | None) -> Phase:
     """Return a phase with one cycle per crossing; `bandwidth` of the signal's spline in Hz."""
     event = AtEvent(str(crossing))
     if bandwidth is None:  # noise adds crossings of the samples themselves
-        rough = from_events(recording.mark(event.name, crossing), event, causal=False)
+        rough = from_events(recording.mark(event.name, crossing), event)
         bandwidth = _CROSSING_HARMONICS / rough.period
-    return from_events(recording.mark(event.name, crossing, bandwidth=bandwidth), event, causal)
+    return from_events(recording.mark(event.name, crossing, bandwidth=bandwidth), event)
 
 
-def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
+def from_events(recording: Recording, event: AtEvent) -> Phase:
     """Return a phase with one cycle per event."""
     name, times = event.name, []
     for trial in recording.trials:
@@ -66,11 +64,8 @@ def from_events(recording: Recording, event: AtEvent, causal: bool) -> Phase:
         wide = np.flatnonzero((np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])) + 1
         missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
         parts = [part for part in np.split(t, wide) if len(part) > 1]
-        if causal:
-            stretches.append([_extrapolated(p) for p in parts if len(p) > 2])
-        else:
-            stretches.append([Winding(p, np.arange(len(p), dtype=float), True) for p in parts])
-    return Phase(stretches, dropped=dropped, missed=missed, lead=0 if causal else 1)
+        stretches.append([Winding(p, np.arange(len(p), dtype=float), True) for p in parts])
+    return Phase(stretches, dropped=dropped, missed=missed, lead=1)
 
 
 def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
@@ -86,7 +81,7 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
     below = np.flatnonzero(np.diff(length[: middle + 1]) > 0.1)
     longest = length[middle + above[0]] if len(above) else length[-1]
     shortest = length[below[-1] + 1] if len(below) else length[0]
-    missed, doubled = max(_MISSED, 1.01 * longest), min(_DOUBLED, 0.99 * shortest)
+    missed, doubled = max(_MISSED, 1.01 * float(longest)), min(_DOUBLED, 0.99 * float(shortest))
     if (length > missed).mean() > _COMMON:
         missed = np.inf
     if (length < doubled).mean() > 2 * _COMMON:
@@ -97,12 +92,3 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
 def _period(intervals: Float[np.ndarray, " n"]) -> float:
     """Return the median of the intervals without short ones, of which a doubled event makes one."""
     return float(np.median(intervals[intervals > np.median(intervals) / 4]))
-
-
-def _extrapolated(t: Float[np.ndarray, " n"]) -> Winding:
-    """Return the causal phase: in each cycle the rate that would make it right at the next event,
-    if the cycle lasted as long as the one before, but at least a tenth of that rate."""
-    phase = [1.0]
-    for k, (before, now) in enumerate(zip(np.diff(t[:-1]), np.diff(t[1:]), strict=True), 1):
-        phase.append(phase[-1] + max(k + 1 - phase[-1], 0.1) * now / before)
-    return Winding(t[1:], np.array(phase), True)

@@ -9,13 +9,13 @@ from .._core.boundary.kinds import Order, Probability
 from ..errors import DefinitionError
 from ..experiments.record import Record, uninterrupted_records
 from ..identify.denominator import Denominator
+from ..identify.record_simulation import can_be_compared, simulate_record
 from ..identify.series.arx import delayed_outputs, total_least_squares
-from ..identify.series.fit import SeriesFit, assemble, fit_series
+from ..identify.series.fit import SeriesFit, assemble, fit_records
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import PreparedRecords
-from ..identify.validation.simulation import can_be_compared, simulate_record
-from ..identify.validation.validate import Validation, validate
+from ..identify.validate import Validation, validate
 from .data import SectionData
 
 
@@ -37,6 +37,46 @@ class HeldOut(NamedTuple):
     validation: Validation
 
 
+class Split(NamedTuple):
+    """Records to be fitted, prepared once for all fits, and records that are held out."""
+
+    early: PreparedRecords
+    late: list[Record]
+
+    def best_order(self, most: int = 4) -> int:
+        """Choose an order; see `choose_order`."""
+        ends = uninterrupted_records(self.late)
+        fits: list[SeriesFit] = []
+        N = self.early.n_sections
+        for d in range(1, most + 1):
+            problem = OutputErrorProblem.from_data(self.early, d, N, free_start=True)
+            c = total_least_squares(delayed_outputs(problem, d))
+            solution = linearize(problem, c)
+            if (solution.freedom <= 2 * d).any():
+                break
+            fit = assemble(problem, solution, Denominator.of_unknown_accuracy(c))
+            long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
+            if not long:
+                break
+            fits, ends = [*fits, fit], long
+        if not fits:
+            raise DefinitionError(
+                f"{self.early.cycles} cycles are too few for one multiplier with {N} sections: "
+                "record more, or take fewer sections."
+            )
+        misfits = []
+        for fit in fits:
+            error = [simulate_record(fit, r, free_start=True) - r.y for r in ends]
+            square = np.nanmean(np.concatenate(error) ** 2, axis=0)
+            misfits.append(float(np.log(square).mean()) / 2)
+        return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+
+    def fit(self, order: int) -> HeldOut:
+        """Fit the early part and validate the fit on the late part."""
+        fit = fit_records(self.early, order, check=False)
+        return HeldOut(fit, validate(fit, self.late))
+
+
 @checked
 def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) -> int:
     """Return the number of multipliers that predicts best what it was not fitted to.
@@ -47,29 +87,7 @@ def choose_order(data: SectionData, most: Order = 4, share: Probability = 0.25) 
 
     **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
     """
-    early, late = split(data, share)
-    parts, ends, fits = PreparedRecords(early), uninterrupted_records(late), []
-    for d in range(1, most + 1):
-        problem = OutputErrorProblem.from_data(parts, d, parts.n_sections, free_start=True)
-        c = total_least_squares(delayed_outputs(problem, d))
-        linearization = linearize(problem, c)
-        if (linearization.freedom <= 2 * d).any():
-            break
-        fit = assemble(problem, linearization, Denominator.of_unknown_accuracy(c))
-        long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
-        if not long:
-            break
-        fits, ends = [*fits, fit], long
-    if not fits:
-        raise DefinitionError(
-            f"{data.cycles:.0f} cycles are too few for one multiplier with {data.n_sections} "
-            "sections: record more, or take fewer sections."
-        )
-    misfits = []
-    for fit in fits:
-        error = np.concatenate([simulate_record(fit, r, free_start=True) - r.y for r in ends])
-        misfits.append(float(np.log(np.nanmean(error**2, axis=0)).mean()) / 2)
-    return 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+    return split(data, share).best_order(most)
 
 
 @checked
@@ -81,13 +99,11 @@ def hold_out(data: SectionData, order: Order, share: Probability = 0.25) -> Held
 
     **Raises:** `DefinitionError` if too few cycles are left for either.
     """
-    early, late = split(data, share)
-    fit = fit_series(early, order, check=False)
-    return HeldOut(fit, validate(fit, late))
+    return split(data, share).fit(order)
 
 
-def split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
-    """Return the parts of the records to be fitted, and to be held out."""
+def split(data: SectionData, share: float = 0.25) -> Split:
+    """Split the records into a part to be fitted, and a part to be held out."""
     enough = min(1.0, _ENOUGH / data.cycles)
     ends = [round(len(r.u) * enough) for r in data.records]
     short = [k for k, n in enumerate(ends) if n * share < _SHORTEST_END * data.n_sections]
@@ -99,4 +115,4 @@ def split(data: SectionData, share: float) -> tuple[list[Record], list[Record]]:
         cut = 0 if k in held_out else end if k in fitted else round(end * (1 - share))
         early += [r.part(0, cut)] if cut else []
         late += [r.part(cut, end)] if cut < end else []
-    return early, late
+    return Split(PreparedRecords(early), late)

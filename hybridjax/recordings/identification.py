@@ -9,12 +9,13 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.html import card, text
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from ..identify.series.fit import SeriesFit, fit_series
-from .advice import Advice, advise
+from ..identify.series.fit import SeriesFit, fit_records
+from ..identify.series.records import PreparedRecords
+from .advice import Advice, collect_advice
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import Finding
-from .held_out import HeldOut, choose_order, hold_out
+from .held_out import HeldOut, split
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import inspect, inspect_cycles, refuse
 from .phase import Phase
@@ -106,11 +107,12 @@ def identify_recording(
     findings = (*inspection.findings, *inspect_cycles(recording, phase, data))
     refuse(findings)
     say("order")
-    order = choose_order(data) if order is None else order
+    parts, records = split(data), PreparedRecords(data)
+    order = parts.best_order() if order is None else order
     say("fit to the first three quarters")
-    held = hold_out(data, order)
+    held = parts.fit(order)
     say("fit to all")
-    fit = fit_series(data, order, check=False)
+    fit = fit_records(records, order, check=False)
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
@@ -124,5 +126,5 @@ def identify_recording(
         held_out=held,
         responses=impulse_responses(fit, data),
         curve=curve,
-        advice=advise(data, fit, held.validation, findings, curve),
+        advice=collect_advice(data, records, fit, held.validation, findings, curve),
     )

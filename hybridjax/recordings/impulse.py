@@ -13,12 +13,9 @@ from .._core.boundary.values import Number
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit
-from .data import SectionData, input_band
+from .data import WHOLE_BAND, SectionData, input_band
 
 
-# Fraction of the Nyquist frequency from which on the band of an input needs no smoothing of the
-# push. Larger: every push is smoothed. Smaller: responses contain unexcited frequencies.
-_WHOLE_BAND = 0.9
 # Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
 # More: wide pushes. Fewer: power beyond the band.
 _SPECTRUM_REACH = 2.5
@@ -87,7 +84,7 @@ def impulse_responses(
     N, R = fit.numerators.shape[:2]
     if width is None:
         edge = min(input_band(data))
-        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < _WHOLE_BAND * N / 2 else 0.0
+        width = _SPECTRUM_REACH / (2 * np.pi * edge) if edge < WHOLE_BAND * N / 2 else 0.0
     if cycles is None:
         cycles = max(3.0, 2 * _PUSH_REACH * width)
     lags = round(cycles * N) + 1

@@ -33,17 +33,16 @@ _DRAWS = 1000
 # Fewest cycles of a block (else the third root of their number), and of blocks in a record, below
 # which whole records are drawn. More: few blocks. Fewer: memory of disturbances is cut.
 _SHORTEST_BLOCK, _BLOCKS = 4, 3
-# Sections of a state and of its instruments, and sections between them. Further apart: weaker
-# instruments. Nearer: smoothing correlates their noise.
-_STATE, _INSTRUMENTS, _APART = 2, 3, 2
-# Combinations of the instruments per dimension of the state, and in addition. More: the first stage
-# follows noise. Fewer: it misses directions of the state.
-_PER_STATE, _MORE = 2, 2
+# Number of sections of a state, of sections between a state and its instruments, and of
+# combinations of the instruments per dimension of the state. More: weak instruments, and a first
+# stage that follows noise. Fewer: smoothing correlates their noise, and directions are missed.
+_EACH = 2
 # Limits of warnings: explained fraction of the states' variance below which instruments are weak,
 # and cycles per record below which there are few. Larger: every result comes with warnings.
 # Smaller: a user trusts biased multipliers.
 _WEAK, _FEW = 0.5, 50
 
+Draws = Complex[np.ndarray, "B d"]
 MultiplierCount = Annotated[int, Whole(1, 12)]
 
 
@@ -64,8 +63,8 @@ class NaturalMultipliers(eqx.Module):
 
     multipliers: Complex[np.ndarray, " d"]
     plain: Complex[np.ndarray, " d"]
-    draws: Complex[np.ndarray, "B d"]
-    plain_draws: Complex[np.ndarray, "B d"]
+    draws: Draws
+    plain_draws: Draws
     strength: float = eqx.field(static=True)
     cycles: int = eqx.field(static=True)
     records: int = eqx.field(static=True)
@@ -163,11 +162,11 @@ def natural_multipliers(
     # The first weights are those of all cycles, the others draws.
     drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
     weights = np.stack([np.ones(K), *drawn])
-    state, forward, square, seen, ahead = (_summed(weights, x) for x in moments[:5])
-    first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(seen, 2, 3)
-    by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(seen @ first)), length)
+    state, forward, square, cross, ahead = (_summed(weights, x) for x in moments[:5])
+    first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
+    by_instruments = _corrected(_multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length)
     plain = _multipliers(forward @ np.linalg.inv(state))
-    explained = seen[0] @ np.linalg.solve(square[0], np.swapaxes(seen[0], 1, 2))
+    explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
     shares = np.trace(explained, axis1=1, axis2=2) / np.trace(state[0], axis1=1, axis2=2)
     return NaturalMultipliers(
         multipliers=by_instruments[0],
@@ -190,7 +189,7 @@ class _Moments(NamedTuple):
     """Products of the next state with the state."""
     square: Float[np.ndarray, "N K r r"]
     """Products of the instruments with themselves."""
-    seen: Float[np.ndarray, "N K d r"]
+    cross: Float[np.ndarray, "N K d r"]
     """Products of the state with the instruments."""
     ahead: Float[np.ndarray, "N K d r"]
     """Products of the next state with the instruments."""
@@ -206,10 +205,10 @@ def _moments(data: SectionData, order: int) -> _Moments:
     N = data.n_sections
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
     y = [r.y / size for r in data.records]
-    before, width = _STATE + _APART + _INSTRUMENTS, len(size)
-    if order > _STATE * width:
+    before, width = 3 * _EACH + 1, len(size)  # of instruments there is one section more
+    if order > _EACH * width:
         raise DefinitionError(
-            f"`order` is {order}, but the state at a section has {_STATE * width} numbers."
+            f"`order` is {order}, but the state at a section has {_EACH * width} numbers."
         )
     rows = []  # (record, cycle, section, sample)
     for s, r in enumerate(data.records):
@@ -218,7 +217,7 @@ def _moments(data: SectionData, order: int) -> _Moments:
         rows.append(np.stack([np.full(len(at), s), place // N, place % N, at], axis=1))
     rows = np.concatenate(rows)
     names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
-    K, needed = len(names), 2 * (_PER_STATE * order + 2)
+    K, needed = len(names), 2 * (_EACH * order + 2)
     if K < needed:
         raise DefinitionError(
             f"{K} cycles that are followed by another one are too few for {order} multipliers: "
@@ -228,14 +227,14 @@ def _moments(data: SectionData, order: int) -> _Moments:
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
         return np.array([y[s][at - shift - np.arange(count)].ravel() for s, _, _, at in rows])
 
-    state, after = values(0, _STATE), values(-N, _STATE)
-    instruments = values(_STATE - 1 + _APART, _INSTRUMENTS)
-    known = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(axis=1)
-    r = min(_PER_STATE * order + _MORE, instruments.shape[1])
+    state, after = values(0, _EACH), values(-N, _EACH)
+    instruments = values(2 * _EACH - 1, _EACH + 1)
+    finite = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(axis=1)
+    r = min(_EACH * (order + 1), instruments.shape[1])
     shapes = ((order, order), (order, order), (r, r), (order, r), (order, r))
     parts = [np.zeros((N, K, *shape)) for shape in shapes]
     for n in range(N):
-        at = np.flatnonzero(known & (rows[:, 2] == n))
+        at = np.flatnonzero(finite & (rows[:, 2] == n))
         if len(at) <= r + 1:
             raise DefinitionError(f"section {n} was seen in {len(at)} cycles only: too few.")
         x, z = _principal(state[at], after[at], order)
@@ -264,25 +263,25 @@ def _principal(
     return (x - mean) @ onto, (other - other.mean(axis=0)) @ onto
 
 
-def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Complex[np.ndarray, "B d"]:
+def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     """Return roots of the mean characteristic polynomial over the sections, the largest first."""
     values = np.linalg.eigvals(maps)
     c = np.ones((*values.shape[:2], 1), complex)
     for k in range(values.shape[2]):
         later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
         c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    c = c.real.mean(axis=1)[:, 1:]
+    c = np.real(c).mean(axis=1)[:, 1:]
     companion = np.zeros((len(c), c.shape[1], c.shape[1]))
     companion[:, 0] = -c
     companion[:, np.arange(1, c.shape[1]), np.arange(c.shape[1] - 1)] = 1.0
     return _largest_first(np.linalg.eigvals(companion).astype(complex))
 
 
-def _largest_first(z: Complex[np.ndarray, "B d"]) -> Complex[np.ndarray, "B d"]:
+def _largest_first(z: Draws) -> Draws:
     return np.take_along_axis(z, np.argsort(-np.abs(z), axis=1, kind="stable"), axis=1)
 
 
-def _corrected(z: Complex[np.ndarray, "B d"], length: float) -> Complex[np.ndarray, "B d"]:
+def _corrected(z: Draws, length: float) -> Draws:
     """Remove the bias of first order that the unknown mean of each record, and regression on the
     past, make in records of so many cycles (Pope 1990, for disturbances along the eigenvectors; for
     one multiplier Kendall's (1 + 3 z) / length)."""

@@ -4,24 +4,20 @@ from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
-from .angle import AngleFunction, from_angles, function_angles, kinematic_angles
+from .angle import from_angles, kinematic_angles
 from .events import from_crossings, from_events
 from .phase import Phase
 from .recording import Recording, signal_of
 from .smoothing import Bandwidth
 
 
-PhaseDefinition = KinematicPhase | Crossing | AtEvent | AngleFunction
+PhaseDefinition = KinematicPhase | Crossing | AtEvent
 """Definition of the phase of a recording; see `estimate_phase`."""
 
 
 @checked
 def estimate_phase(
-    recording: Recording,
-    definition: PhaseDefinition,
-    *,
-    bandwidth: Bandwidth | None = None,
-    causal: bool = False,
+    recording: Recording, definition: PhaseDefinition, *, bandwidth: Bandwidth | None = None
 ) -> Phase:
     """Estimate the phase of every trial.
 
@@ -40,13 +36,8 @@ def estimate_phase(
           all lengths, these limits are the first gaps in the distribution of intervals. A crossing
           in a gap counts as missed. This phase, and that of a `Crossing`, depends on the next
           event, and so do the outputs sampled at it.
-        - a function of the times (n,) and the signals by name, which returns an angle (n,) in rad,
-          with or without whole turns, NaN where it is unknown.
     - `bandwidth`: bandwidth in Hz of the splines through the signals. Default: 32 harmonics of the
       cycle for a `KinematicPhase`, 16 for a `Crossing`.
-    - `causal`: whether to use the past only, as hardware in real time does: a `PhaseTracker` for an
-      angle; the duration of the last cycle for events, which remembers three cycles (fit with
-      `overhang=2 * n_sections`). Default: False.
 
     Angles that run backwards in noise are replaced by the mean of the two monotone envelopes, one
     from below and one from above. Stretches end at gaps longer than a quarter of a cycle: in the
@@ -57,17 +48,13 @@ def estimate_phase(
     cycles.
     """
     if isinstance(definition, Crossing):
-        return from_crossings(recording, definition, bandwidth, causal)
+        return from_crossings(recording, definition, bandwidth)
     if isinstance(definition, KinematicPhase):
-        if causal and bandwidth is not None:
-            raise DefinitionError("an angle from the past only is not smoothed: no `bandwidth`.")
-        angles = kinematic_angles(recording, definition, bandwidth, smooth=not causal)
-        return from_angles(angles, definition.n_sections, causal)
+        angles = kinematic_angles(recording, definition, bandwidth)
+        return from_angles(angles, definition.n_sections)
     if bandwidth is not None:
-        raise DefinitionError("events, and functions, are not smoothed: no `bandwidth`.")
-    if isinstance(definition, AtEvent):
-        return from_events(recording, definition, causal)
-    return from_angles(function_angles(recording, definition), None, causal)
+        raise DefinitionError("events are not smoothed: no `bandwidth`.")
+    return from_events(recording, definition)
 
 
 def signals_of(definition: PhaseDefinition) -> set[str]:

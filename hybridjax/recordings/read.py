@@ -63,7 +63,7 @@ def read_recording(
     """
     if not paths:
         raise DefinitionError("there is no file to read.")
-    wanted = Wanted(time, signals)
+    wanted = Wanted(time, None if signals is None else tuple(signals))
     return Recording.join([_recording(x, wanted, dict(units or {})) for x in map(Path, paths)])
 
 
@@ -99,13 +99,15 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
 
 def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
-    parts, events, names = [], {}, []
+    parts, names = [], []
+    events: dict[str, np.ndarray] = {}
     for columns in read_tables(path, wanted):
         clock = _column_of_times(path, list(columns.values), wanted)
         unit = time_unit(clock)
         scale = seconds(f"'{path}'", clock, unit)
         time = columns.values[clock] * scale
-        notes = () if unit else (f"the times in '{clock}' have no unit: taken as seconds",)
+        assumed = f"the times in '{clock}' have no unit: taken as seconds"
+        notes = columns.notes if unit else (*columns.notes, assumed)
         events |= {name: at * scale for name, at in columns.events.items()}
         chosen = {}
         for header, values in columns.values.items():
@@ -127,7 +129,6 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
             read = {name: unit for name, (_, unit) in chosen.items() if unit} | {
                 name: unit for name, unit in units.items() if name in chosen
             }
-            notes = columns.notes + notes
             parts.append(Recording(time, signals, units=read, name=path.stem, notes=notes))
     two_columns(path, names)
     wanted.require(path, names)
@@ -146,7 +147,10 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
         inside = (at >= trial.time[0] - step) & (at <= trial.time[-1] + step)
         events[name] = at[inside | np.isnan(at)]
         if lost := len(at) - len(events[name]):
-            notes += (f"{lost} events '{name}' outside of the recording were left out",)
+            notes = (
+                *notes,
+                f"{lost} events '{name}' outside of the recording were left out",
+            )
     return Recording(
         trial.time,
         dict(zip(whole.signals, trial.values.T, strict=True)),

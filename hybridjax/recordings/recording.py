@@ -15,7 +15,7 @@ from .._core.signal import with_unit
 from ..errors import DefinitionError, HybridJaxError
 from ..orbits.crossing import Crossing
 from .formats.columns import seconds, split_header, time_unit
-from .smoothing import Bandwidth, bridgeable, spline, without_spikes
+from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
 # Relative difference of sampling steps (or rates) that is reported as irregular. Larger: jitter of
@@ -34,7 +34,7 @@ class Trial(eqx.Module):
     - `name`: name for messages and figures.
     """
 
-    time: Float[np.ndarray, " n"]
+    time: Series
     values: Float[np.ndarray, "n k"]
     events: dict[str, Float[np.ndarray, " _"]]
     name: str = eqx.field(static=True)
@@ -171,7 +171,8 @@ class Recording(eqx.Module):
         recordings = list(recordings)
         if not recordings:
             raise DefinitionError("`recordings` holds no recording to join.")
-        first, trials = recordings[0], []
+        first = recordings[0]
+        trials: list[Trial] = []
         for other in recordings:
             a, b = first.trials[0].name, other.trials[0].name
             if set(other.signals) != set(first.signals):
@@ -365,7 +366,7 @@ def signal_of(crossing: Crossing) -> str:
 def check_events(
     where: str,
     name: str,
-    at: Float[np.ndarray, " n"],
+    at: Series,
     time: Float[np.ndarray, " m"],
     margin: float = 0.0,
     error: type[HybridJaxError] = DefinitionError,
@@ -380,7 +381,7 @@ def check_events(
         )
 
 
-def _numbers(where: str, name: str, values: Any) -> Float[np.ndarray, " n"]:
+def _numbers(where: str, name: str, values: Any) -> Series:
     try:
         values = np.asarray(values)
     except ValueError:  # rows of different lengths

@@ -20,6 +20,7 @@ from .recording import Recording, Trial
 from .smoothing import (
     FEWEST,
     Bandwidth,
+    Series,
     bridgeable,
     gaps,
     input_spikes,
@@ -89,6 +90,7 @@ def section_data(
     **Raises:** `DefinitionError` for unknown names, constant signals, another number of sections
     than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
+    inputs, outputs = tuple(inputs), tuple(outputs)
     _refuse_constant(recording, inputs, outputs)
     if not outputs and timing is None:
         timing = "duration"
@@ -112,8 +114,8 @@ def section_data(
                     f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
                 )
         sampler = _Sampler(trial.time, signals, nu, bandwidth, sampled)
-        sections = [sampler(w, N, phase.period) for w in stretches]
-        sections = [x for x in sections if x is not None]
+        sampled_parts = (sampler(w, N, phase.period) for w in stretches)
+        sections = [x for x in sampled_parts if x is not None]
         if timing is not None:
             sections = _with_times(sections, N, phase.period, timing)
         mean = _average(sections, N)
@@ -167,10 +169,7 @@ def _refuse_constant(
 
 
 def _without_spikes(
-    time: Float[np.ndarray, " n"],
-    signals: Float[np.ndarray, "n nuy"],
-    nu: int,
-    stretches: Sequence[Winding],
+    time: Series, signals: Float[np.ndarray, "n nuy"], nu: int, stretches: Sequence[Winding]
 ) -> tuple[Float[np.ndarray, "n nuy"], Int[np.ndarray, " nuy"]]:
     """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
     signals, counts = signals.copy(), []
@@ -179,12 +178,12 @@ def _without_spikes(
         times.append(w.time)
         phases.append(w.phase - np.floor(w.phase[0]) + cycle)
         cycle = np.ceil(phases[-1][-1])
-    known, phase = np.concatenate(times), np.concatenate(phases)
+    time_of, phase = np.concatenate(times), np.concatenate(phases)
     for i, x in enumerate(signals.T):
         heights = (input_spikes if i < nu else spike_heights)(x)
         at = np.flatnonzero(heights)
-        if len(at) and len(known):
-            phase_there = np.interp(time[at], known, phase)
+        if len(at) and len(time_of):
+            phase_there = np.interp(time[at], time_of, phase)
             at = at[~recurring(heights[at], phase_there, np.ptp(phase))]
         x[at] = np.nan
         counts.append(len(at))
@@ -195,7 +194,7 @@ class _Sections(NamedTuple):
     """Samples of one stretch at sections k[0], k[0] + 1, ...; whether the phase was observed."""
 
     k: Int[np.ndarray, " n"]
-    t: Float[np.ndarray, " n"]
+    t: Series
     observed: Bool[np.ndarray, " n"]
     values: Float[np.ndarray, "n nuy"]
 
@@ -205,7 +204,7 @@ class _Sampler:
 
     def __init__(
         self,
-        time: Float[np.ndarray, " n"],
+        time: Series,
         signals: Float[np.ndarray, "n nuy"],
         nu: int,
         bandwidth: float,
@@ -227,16 +226,16 @@ class _Sampler:
         observed = ~inside(unobserved, start, start)
         values = np.zeros((len(start), len(self.signals)))
         for i, x in enumerate(self.signals):
-            known = np.isfinite(x)
-            holes = gaps(self.time, known, bridgeable(self.time, known, section))
+            finite = np.isfinite(x)
+            holes = gaps(self.time, finite, bridgeable(self.time, finite, section))
             if i >= self.nu:
                 values[:, i] = self.curves[i - self.nu](start)
                 values[inside(holes, start, start) | ~observed, i] = np.nan
                 continue
             if self.sampled == "middle":
-                time = self.time[known]
+                time = self.time[finite]
                 nearest = np.searchsorted((time[:-1] + time[1:]) / 2, (start + end) / 2)
-                values[:, i] = x[known][nearest]
+                values[:, i] = x[finite][nearest]
             else:
                 values[:, i] = means(self.time, x, t)
             values[inside(holes, start, end), i] = np.nan
@@ -317,13 +316,13 @@ def without_drift(
 
 
 def cycle_means(
-    trial: Trial, x: Float[np.ndarray, " n"], stretches: Sequence[Winding], period: float
+    trial: Trial, x: Series, stretches: Sequence[Winding], period: float
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the middle of each cycle without a long gap, and the mean of a signal over it."""
     holes = gaps(trial.time, np.isfinite(x), LONGEST_GAP * period)
     middles, levels = [np.zeros(0)], [np.zeros(0)]
     for edges in (w.edges() for w in stretches):
-        known = ~inside(holes, edges[:-1], edges[1:])
-        middles.append(((edges[:-1] + edges[1:]) / 2)[known])
-        levels.append(means(trial.time, x, edges)[known])
+        whole = ~inside(holes, edges[:-1], edges[1:])
+        middles.append(((edges[:-1] + edges[1:]) / 2)[whole])
+        levels.append(means(trial.time, x, edges)[whole])
     return np.concatenate(middles), np.concatenate(levels)

@@ -12,6 +12,8 @@ from .._core.boundary.values import Number
 from ..errors import DefinitionError
 
 
+Series = Float[np.ndarray, " n"]
+"""Samples of one signal, or their times."""
 Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
 """In Hz; infinite: nothing is smoothed."""
 
@@ -49,9 +51,9 @@ _SMOOTH_INPUT = 0.3
 class Spline(eqx.Module):
     """A natural cubic spline: its values and second derivatives at the knots."""
 
-    time: Float[np.ndarray, " n"]
-    values: Float[np.ndarray, " n"]
-    curvature: Float[np.ndarray, " n"]
+    time: Series
+    values: Series
+    curvature: Series
 
     def __call__(self, t: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
@@ -62,9 +64,7 @@ class Spline(eqx.Module):
         return line - before * after * bend / 6
 
 
-def spline(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], bandwidth: int | float
-) -> Spline:
+def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
     r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
@@ -73,10 +73,10 @@ def spline(
     $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
     this is one half at b.
     """
-    known = np.isfinite(values)
-    if known.sum() < FEWEST:
-        raise DefinitionError(f"{int(known.sum())} samples are too few for a spline.")
-    time, values = time[known], values[known]
+    finite = np.isfinite(values)
+    if finite.sum() < FEWEST:
+        raise DefinitionError(f"{int(finite.sum())} samples are too few for a spline.")
+    time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step
     weight = (2 * np.pi * bandwidth * step) ** -4.0
@@ -94,27 +94,23 @@ def spline(
     return Spline(time, smooth, np.pad(curvature, 1) / step**2)
 
 
-def bridgeable(
-    time: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"], longest: int | float = 0.0
-) -> float:
+def bridgeable(time: Series, finite: Bool[np.ndarray, " n"], longest: int | float = 0.0) -> float:
     """Return the longest gap that a spline bridges: `longest`, but not less than three samples."""
-    return max(longest, 3.001 * float(np.median(np.diff(time[known]))))
+    return max(longest, 3.001 * float(np.median(np.diff(time[finite]))))
 
 
 def gaps(
-    time: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"], longest: int | float
+    time: Series, finite: Bool[np.ndarray, " n"], longest: int | float
 ) -> Float[np.ndarray, "g 2"]:
     """Return the intervals without samples that are longer than `longest`, from the one before all
     samples, which starts at -inf, to the one after them."""
-    edges = np.concatenate([[-np.inf], time[known], [np.inf]])
+    edges = np.concatenate([[-np.inf], time[finite], [np.inf]])
     wide = np.flatnonzero(np.diff(edges) > longest)
     return np.stack([edges[wide], edges[wide + 1]], axis=1)
 
 
 def inside(
-    intervals: Float[np.ndarray, "g 2"],
-    start: Float[np.ndarray, " n"],
-    end: Float[np.ndarray, " n"],
+    intervals: Float[np.ndarray, "g 2"], start: Series, end: Series
 ) -> Bool[np.ndarray, " n"]:
     """Return which intervals from start to end touch any of the given ones (disjoint, sorted)."""
     before: Int[np.ndarray, " n"] = np.searchsorted(intervals[:, 0], end, side="left")
@@ -122,12 +118,10 @@ def inside(
     return before > over
 
 
-def means(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m1"]
-) -> Float[np.ndarray, " m"]:
+def means(time: Series, values: Series, edges: Float[np.ndarray, " m1"]) -> Float[np.ndarray, " m"]:
     """Return means of a signal between successive edges; it is linear between its samples."""
-    known = np.isfinite(values)
-    time, values = time[known], values[known]
+    finite = np.isfinite(values)
+    time, values = time[finite], values[finite]
     area = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
     at = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
     since = edges - time[at]
@@ -136,12 +130,12 @@ def means(
     return np.diff(whole) / np.diff(edges)
 
 
-def without_spikes(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def without_spikes(values: Series) -> Series:
     """Return a signal in which the samples of isolated spikes are missing (NaN)."""
     return np.where(spike_heights(values) != 0, np.nan, values)
 
 
-def spike_heights(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def spike_heights(values: Series) -> Series:
     r"""Return the signed height of each sample of an isolated spike, and zero elsewhere.
 
     Spikes of up to three samples are what an opening (or closing) of a signal removes: the largest
@@ -154,8 +148,8 @@ def spike_heights(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     **Arguments:** `values`: the signal; NaN where a sample is missing.
     """
     heights = np.zeros(len(values))
-    known = np.isfinite(values)
-    x = values[known]
+    finite = np.isfinite(values)
+    x = values[finite]
     if len(x) <= _NEIGHBORHOOD:
         return heights
     top = x - ndimage.grey_opening(x, _LONGEST + 1)
@@ -172,11 +166,11 @@ def spike_heights(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     large = large[np.abs(out[large]) > _RANGES * closest_half]
     near = np.searchsorted(large, large + _NEAR + 1) - np.searchsorted(large, large - _NEAR)
     large = large[near <= _CROWD]
-    heights[np.flatnonzero(known)[large]] = out[large]
+    heights[np.flatnonzero(finite)[large]] = out[large]
     return heights
 
 
-def noise_of(x: Float[np.ndarray, " n"]) -> float:
+def noise_of(x: Series) -> float:
     """Return the standard deviation of what changes from sample to sample, without few spikes."""
     missed = np.abs(np.convolve(x, _PREDICTION, "valid"))
     normal = 0.6745  # median of the modulus of a standard normal variable
@@ -200,7 +194,7 @@ def recurring(
     return recurs
 
 
-def input_spikes(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def input_spikes(values: Series) -> Series:
     """Return `spike_heights` of an input, only where it is smooth otherwise and a spike lies far
     beyond its usual range: the perturbation itself must stay."""
     heights = spike_heights(values)

@@ -94,7 +94,7 @@ class Draws:
     def begin(self, client: DaskClient | None) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
         variables = call(self, "first", client)
-        number = {"draw": (("draw",), np.arange(self.blocks.shape[0]))}
+        number = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout
 

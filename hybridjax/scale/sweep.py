@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -75,7 +75,7 @@ def sweep(
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
     - `over`: values of each parameter by name, of which all combinations are taken; or
-        `hj.scale.Points`.
+        `hj.Points`.
     - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
         chart), "multipliers", "spectral_radius" (their largest modulus), "events" (at most four
         times as many as cycles of the coarse pass have), "residual"; and functions of a
@@ -145,12 +145,12 @@ class Begun(NamedTuple):
 
     map: ReturnMap
     index: tuple[np.ndarray, ...]
-    known: Known
+    coarse: Known
 
     def parts(self) -> Any:
         """Return all arrays but those that follow from the model."""
         x = self.map
-        return (x.anchor, x.expected, x.settings.scale, x.conserved), self.index, self.known
+        return (x.anchor, x.expected, x.settings.scale, x.conserved), self.index, self.coarse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +174,7 @@ class SweepJob:
         begun = self._blank()
         say("a coarse pass")
         coarse = dataclasses.replace(self, begun=begun, guess=None)
-        known, cycles = call(coarse, "coarse", client)
+        solved, cycles = call(coarse, "coarse", client)
         variables = self.wanted.variables(cycles)
         units = self.family.units(self.system)
         points, states = self.space.constants(units), self.wanted.constants()
@@ -182,7 +182,7 @@ class SweepJob:
             self.space.dims, self.blocks, variables, {**points, **states}, (*points, *states),
             self.description,
         )  # fmt: skip
-        begun = begun._replace(known=known)
+        begun = begun._replace(coarse=solved)
         return dataclasses.replace(self, begun=begun, variables=variables), layout
 
     def arrays(self) -> list[np.ndarray]:
@@ -194,8 +194,8 @@ class SweepJob:
         """Return the job with the beginning that another process computed."""
         blank = self._blank()
         structure = jax.tree_util.tree_structure(blank.parts())
-        of_map, index, known = jax.tree_util.tree_unflatten(structure, arrays)
-        begun = Begun(_with(blank.map, *of_map), index, known)
+        of_map, index, solved = jax.tree_util.tree_unflatten(structure, arrays)
+        begun = Begun(_with(blank.map, *of_map), index, solved)
         return dataclasses.replace(self, begun=begun, variables=layout.variables)
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
@@ -205,7 +205,7 @@ class SweepJob:
         index = np.meshgrid(*(np.arange(x.start, x.stop) for x in place), indexing="ij")
         tiles = self._tiles(tuple(x.ravel() for x in index), workers)
         coarse = self.family.systems(self.space.at(self.begun.index))
-        tiles = tiles._replace(known=self.begun.known._replace(systems=coarse))
+        tiles = tiles._replace(known=self.begun.coarse._replace(systems=coarse))
         cycles = as_cycles(tiles, tiles.solve(index[0].size))
         values = self.wanted.values(cycles, self.variables)
         return {name: x.reshape(*index[0].shape, *x.shape[1:]) for name, x in values.items()}
@@ -217,8 +217,9 @@ class SweepJob:
         tiles = self._tiles(index, None)
         rounds = tiles.solve(len(index[0]))
         jacobian, result = np.asarray(rounds.turn.jacobian), np.asarray(rounds.result)
-        known = Known(None, rounds.anchor, rounds.period, jacobian, result)
-        return known, as_cycles(tiles, rounds)
+        return Known(cast(Any, None), rounds.anchor, rounds.period, jacobian, result), as_cycles(
+            tiles, rounds
+        )
 
     def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
         assert self.begun is not None
@@ -236,8 +237,8 @@ class SweepJob:
         index = tuple(np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T)
         n, d = len(index[0]), map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor)
-        known = Known(None, anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
-        return Begun(map, index, known)
+        blank = Known(cast(Any, None), anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
+        return Begun(map, index, blank)
 
     def _guess(self) -> LimitCycle:
         if self.guess is not None:

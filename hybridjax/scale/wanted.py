@@ -77,7 +77,10 @@ class Wanted:
             return {}
         names = np.array([str(x) for x in self._all_states])
         units = np.array([str(unit_of(x)) for x in self._all_states])
-        return {"state_name": (("state_name",), names), "state_unit": (("state_name",), units)}
+        return {
+            "state_name": (("state_name",), names, {}),
+            "state_unit": (("state_name",), units, {}),
+        }
 
     def values(
         self, cycles: LimitCycles, variables: Mapping[str, Variable]

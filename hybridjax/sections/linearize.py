@@ -56,8 +56,8 @@ def linearize(
     placed = as_placed(cycle, sections)
     s, traced, charts = placed.structure(), is_traced(placed), range(len(cycle.system.charts()))
     if outputs is None:
-        known = s.state_names()
-        outputs = [x for x in known if all(s.state_function(x, a) is not None for a in charts)]
+        states = s.state_names()
+        outputs = [x for x in states if all(s.state_function(x, a) is not None for a in charts)]
     z = s.resolve_outputs(outputs)
     for a in charts if traced else np.unique(placed.lanes.chart):
         z.require(int(a))
@@ -80,16 +80,15 @@ def linearize(
 
 
 def inputs_of(
-    s: Structure, inputs: tuple[str, ...] | None
+    s: Structure, inputs: SignalNames | None
 ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
     """Names of inputs (Default: all) and their indices."""
-    known = s.inputs
-    names = known if inputs is None else inputs
+    names = s.inputs if inputs is None else inputs
     for name in names:
-        if name not in known:
-            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(known)}.")
-    columns = np.array([known.index(n) for n in names], int)
-    return tuple(known[k] for k in columns), columns
+        if name not in s.inputs:
+            raise DefinitionError(f"there is no input '{name}'; inputs are {', '.join(s.inputs)}.")
+    columns = np.array([s.inputs.index(n) for n in names], int)
+    return tuple(s.inputs[k] for k in columns), columns
 
 
 def _section_jacobians(

@@ -30,15 +30,12 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .abstract import AbstractSections, BoundSections, Orbit
 from .families import FamilyLike, as_family
-from .placed import PlacedSections, SectionsLike
+from .placed import GRACE, PlacedSections, SectionsLike
 
 
 # Least bound on the steps of the flow from one section to the next. Smaller: cycles with many
 # events between two sections fail. Larger: failures last longer.
 PATIENCE = 1024
-# Periods after which the flow to a section gives up. Less than 1: sections are missed. Larger: a
-# section that does not exist takes longer to notice.
-_LONGEST_WAY = 1.5
 # Rounding errors of the clock's phase, and the least distance of two sections, in periods. Smaller:
 # rounding moves a section into the next period. Larger: sections that are distinct are rejected.
 _SAME = 1e-9
@@ -118,37 +115,36 @@ class _Arrivals(NamedTuple):
 def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections, Int[Array, ""]]:
     """The sections on the cycle, and the `Result` of the flow to section 0, which lies at the
     anchor if that is a crossing."""
-    s, xp, N, period = cycle.structure, namespace(cycle.period), family.n_sections, cycle.period
+    s, xp = Structure(cycle.system), namespace(cycle.period)
+    N, period = family.n_sections, cycle.period
     settings = dataclasses.replace(
         cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
     )
 
-    def go(carry, target):
-        lanes, h, result = carry
+    def go(lanes, h, result, target):
         u = xp.zeros((s.nu, 1))
         return record(s, lanes, u, target, settings, h, result, tangents=True)
 
-    def to(carry, time, i, event, levels):
-        limit = carry[0].t + _LONGEST_WAY * period
-        return go(
-            carry,
-            Target(time[None], i[None], event[None], limit, None, levels, Result.SECTION_MISSED),
-        )
+    def to(lanes, h, result, time, i, event, levels):
+        ends = time[None], i[None], event[None], lanes.t + (1 + GRACE) * period
+        return go(lanes, h, result, Target(*ends, None, levels, Result.SECTION_MISSED))
 
     begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
     zero = xp.zeros(1, xp.int32)[0]
     if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + _LONGEST_WAY * period)
-        first, _ = go(begin, to_section(target, family.anchor))
+        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + (1 + GRACE) * period)
+        first, _ = go(*begin, to_section(target, family.anchor))
         bound = _bind(s, cycle, family, first.lanes, go)
     else:
         bound = _bind(s, cycle, family, cycle.anchor, go)
-        first, _ = to(begin, bound.time[0], zero, bound.event[0], bound.levels)
+        first, _ = to(*begin, bound.time[0], zero, bound.event[0], bound.levels)
 
     def next_section(carry, k):
         i = k % N
         time = bound.time[i] + (k // N) * period
-        moved, tape = to(carry, time, i, bound.event[i], bound.levels)
+        lanes, h, result = carry
+        moved, tape = to(lanes, h, result, time, i, bound.event[i], bound.levels)
+        assert tape is not None
         return (moved.lanes, moved.h, moved.result), _Arrivals(moved.lanes, moved.result, tape)
 
     carry = first.lanes, first.h, first.result
@@ -185,7 +181,7 @@ def _bind(
     period, t, xp, M = cycle.period, anchor.t[0], namespace(cycle.period), family.points
 
     def later(carry, k):
-        moved, _ = go(carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
+        moved, _ = go(*carry, toward(anchor.t + period * k / M, -1, anchor.t + 2 * period))
         return (moved.lanes, moved.h, moved.result), moved.lanes
 
     lanes = anchor

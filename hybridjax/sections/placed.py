@@ -25,7 +25,7 @@ from .families import FamilyLike
 
 # Periods after the arrival of the cycle itself at which a flow to a section gives up. Smaller: late
 # arrivals are lost. Larger: failures take longer.
-_GRACE = 0.5
+GRACE = 0.5
 
 
 @checked_methods
@@ -101,7 +101,7 @@ class PlacedSections(eqx.Module):
 
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions, made anew."""
-        return self.cycle.structure
+        return Structure(self.cycle.system)
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
         """Outputs of the cycle at the sections, without input; NaN where a chart does not define
@@ -114,7 +114,7 @@ class PlacedSections(eqx.Module):
 
     @property
     def time_is_state(self) -> Bool[Array, " N"]:
-        """Whether the time of crossing is a coordinate: on state-based sections of a clocked
+        """True if the time of crossing is a coordinate: on state-based sections of a clocked
         system."""
         return namespace(self.bound.time).isinf(self.bound.time) & self.cycle.clocked
 
@@ -153,7 +153,7 @@ class PlacedSections(eqx.Module):
         return section_target(self.bound, self.lanes, self.cycle.period, i, t, turns)
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
-        """For each section, the next one, how many turns later it comes, and the target on it."""
+        """The section after each, the turns until it, and the target on it."""
         xp = namespace(self.lanes.t)
         following = (xp.arange(self.n_sections) + 1) % self.n_sections
         turns = (following == 0).astype(np.int32)
@@ -171,7 +171,7 @@ def section_target(
     """The target of lanes that flow to section i, `turns` periods after the first turn."""
     xp, arrival = namespace(t), lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
-    limit = xp.maximum(arrival, t) + _GRACE * period
+    limit = xp.maximum(arrival, t) + GRACE * period
     return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
 
 

@@ -21,20 +21,20 @@ from .place import as_placed
 from .placed import PlacedSections, observe
 
 
-# Complex numbers in the largest array of responses to pairs of cosines. Doubled: twice the memory,
-# hardly less time.
+# Complex numbers in the largest array of responses to pairs of cosines. More: more memory. Fewer:
+# more passes.
 _NUMBERS = 2**21
 
 
 class Quadratic(NamedTuple):
-    """Derivatives by the m deviations of states and inputs at each of N sections."""
+    """Derivatives with respect to the m deviations of states and inputs at each of N sections."""
 
     step: Float[np.ndarray, "N n m"]
-    """Of the states at the next section."""
+    """First derivatives of the states at the next section."""
     bend: Float[np.ndarray, "N n m m"]
-    """The second ones."""
+    """Their second derivatives."""
     show: Float[np.ndarray, "N ny m"]
-    """Of the outputs."""
+    """First derivatives of the outputs."""
     show_bend: Float[np.ndarray, "N ny m m"]
 
     @property
@@ -42,7 +42,7 @@ class Quadratic(NamedTuple):
         return self.step[:, :, : self.step.shape[1]]
 
     def second_order(self, u: Float[np.ndarray, "S time nu"]) -> Float[np.ndarray, "S time ny"]:
-        """What inputs that repeat after their whole number of periods cause in second order."""
+        """The response of second order to inputs that repeat after a whole number of periods."""
         N, n, _ = self.step.shape
         S, steps, _ = u.shape
         A, folded = self._states, (S, steps // N, N, -1)
@@ -53,66 +53,66 @@ class Quadratic(NamedTuple):
         unit = np.tile(np.eye(n), (N, 1, 1))
         second = np.asarray(periodic_states(A, unit, forcing.reshape(folded)))
         x = self._run(second, forcing, 0 * u)
-        seen = np.einsum("toi,sti->sto", self.show[section][:, :, :n], x)
-        return seen + _bent(self.show_bend[section], w) / 2
+        linear = np.einsum("toi,sti->sto", self.show[section][:, :, :n], x)
+        return linear + _bent(self.show_bend[section], w) / 2
 
     def _run(self, x, forcing, u) -> Float[np.ndarray, "S time n"]:
-        """States from a start, with what is added to them and with inputs."""
-        found = []
+        """States from a start, with a forcing and inputs."""
+        states = []
         for k in range(u.shape[1]):
-            found.append(x)
+            states.append(x)
             step = self.step[k % len(self.step)]
             x = np.concatenate([x, u[:, k]], axis=1) @ step.T + forcing[:, k]
-        return np.stack(found, axis=1)
+        return np.stack(states, axis=1)
 
     def waves(
         self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]
     ) -> Complex[np.ndarray, "N m K"]:
         """Linear responses to $e^{2 \\pi i f n/N}$ at an input, divided by it, with that input."""
         N, n, m = self.step.shape
-        own = (np.arange(m - n)[:, None] == channel).astype(complex)
-        u = np.broadcast_to(own, (N, *own.shape))
+        unit = (np.arange(m - n)[:, None] == channel).astype(complex)
+        u = np.broadcast_to(unit, (N, *unit.shape))
         return np.concatenate([self._steady(self.step[:, :, n:] @ u, f), u], axis=1)
 
     def _steady(
         self, forcing: Complex[np.ndarray, "N n K"], f: Float[np.ndarray, " K"]
     ) -> Complex[np.ndarray, "N n K"]:
-        """States that are moved by $e^{2 \\pi i f n/N}$ times something periodic, divided by it."""
+        """States for a periodic forcing times $e^{2 \\pi i f n/N}$, divided by it."""
         A, back = self._states, np.exp(-2j * np.pi * f / len(self.step))
         x = np.zeros(forcing.shape[1:], complex)
         for step, push in zip(A, forcing, strict=True):
             x = (step @ x + push) * back
         turn = np.exp(-2j * np.pi * f)[:, None, None] * monodromy(A)
         x = np.linalg.solve(np.eye(A.shape[-1]) - turn, x.T[:, :, None])[:, :, 0].T
-        found = []
+        states = []
         for step, push in zip(A, forcing, strict=True):
-            found.append(x)
+            states.append(x)
             x = (step @ x + push) * back
-        return np.stack(found)
+        return np.stack(states)
 
     def products(self, f: Float[np.ndarray, " K"], channel: Int[np.ndarray, " K"]) -> "Products":
-        """Of all pairs of cosines."""
+        """Responses of second order to all pairs of cosines."""
         N, n, _ = self.step.shape
         K, ny = len(f), self.show.shape[1]
         w = self.waves(f, channel)
         squares, mean = np.zeros((2, ny, K, K)), np.zeros((ny, N, K))
         rows = max(_NUMBERS // (2 * N * max(n, ny, 1) * K), 1)
         for begin in range(0, K, rows):
-            some = np.arange(begin, min(begin + rows, K))
-            others = w[:, :, begin:]
-            forcing = _pairs(self.bend, w[:, :, some], others)
-            f_here, f_others = f[some][:, None], f[begin:]
-            sums = np.concatenate([f_here + f_others, f_here - f_others], axis=1)
+            first = np.arange(begin, min(begin + rows, K))
+            second = w[:, :, begin:]
+            forcing = _pairs(self.bend, w[:, :, first], second)
+            f_first, f_second = f[first][:, None], f[begin:]
+            sums = np.concatenate([f_first + f_second, f_first - f_second], axis=1)
             x = self._steady(forcing.reshape(N, n, -1), sums.ravel())
             y = self.show[:, :, :n] @ x
-            y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, some], others)
-            both = y.reshape(N, ny, len(some), 2, -1)
-            mean[:, :, some] = np.moveaxis(both.real, 0, 1)[
-                :, :, np.arange(len(some)), 1, np.arange(len(some))
+            y = y.reshape(N, ny, *sums.shape) + _pairs(self.show_bend, w[:, :, first], second)
+            both = y.reshape(N, ny, len(first), 2, -1)
+            mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[
+                :, :, np.arange(len(first)), 1, np.arange(len(first))
             ]
             size = np.moveaxis(np.mean(np.abs(both) ** 2, axis=0), 2, 0)
-            squares[:, :, some, begin:] = size
-            squares[:, :, begin:, some] = size.swapaxes(2, 3)
+            squares[:, :, first, begin:] = size
+            squares[:, :, begin:, first] = size.swapaxes(2, 3)
         return Products(squares[0], squares[1], mean)
 
 
@@ -123,11 +123,11 @@ class Products(NamedTuple):
     """Mean squares over the sections, at the sum of their frequencies."""
     difference: Float[np.ndarray, "ny K K"]
     mean: Float[np.ndarray, "ny N K"]
-    """Of a cosine with itself, at the difference."""
+    """The response to a cosine with itself, at the difference."""
 
     def gaussian(self) -> Float[np.ndarray, "ny K K"]:
-        """G: mean square of the part of second order, $p^T G p$, for random inputs with powers p
-        about the lines, or many lines with random phases."""
+        """G: the mean square of the part of second order is $p^T G p$, for random inputs with
+        powers p about the lines, or many lines with random phases."""
         return (self.sum + self.difference) / 4 + self._shift()
 
     def cosines(self) -> Float[np.ndarray, "ny K K"]:
@@ -138,7 +138,7 @@ class Products(NamedTuple):
         return pairs + self._shift()
 
     def _shift(self) -> Float[np.ndarray, "ny K K"]:
-        """Of the mean over time at each section."""
+        """The part of the mean over time at each section."""
         return np.einsum("onk,onl->okl", self.mean, self.mean) / (4 * self.mean.shape[1])
 
 
@@ -147,29 +147,29 @@ def _bent(bend, w):
     return np.einsum("toij,sti,stj->sto", bend, w, w, optimize=True)
 
 
-def _pairs(bend, one, other) -> Complex[np.ndarray, "N rows some both"]:
-    """Second derivatives along each of some waves (N, m, some) and each of others, which come
-    twice: as they are, and conjugate."""
-    along = np.einsum("noij,nis->nosj", bend, one, optimize=True)
-    N, rows, some, m = along.shape
-    along = along.reshape(N, rows * some, m)
-    both = np.concatenate([along @ other, along @ other.conj()], axis=2)
-    return both.reshape(N, rows, some, -1)
+def _pairs(bend, first, second) -> Complex[np.ndarray, "N rows some both"]:
+    """Second derivatives along pairs of waves (N, m, some), the second of which come twice: as
+    they are, and conjugate."""
+    along = np.einsum("noij,nis->nosj", bend, first, optimize=True)
+    N, rows, count, m = along.shape
+    along = along.reshape(N, rows * count, m)
+    both = np.concatenate([along @ second, along @ second.conj()], axis=2)
+    return both.reshape(N, rows, count, -1)
 
 
-# Second derivatives in units of the states' sizes, relative to the first ones, that are left to
-# rounding. A hundred times more: what is nearly linear counts as linear; less: rounding counts.
+# Second derivatives in units of the states' sizes, relative to the first ones, that are rounding
+# errors. Larger: small curvature is lost. Smaller: rounding counts.
 _ROUNDING = 1e-11
 
 
 def second_order(
     cycle: LimitCycle, sections: FamilyLike, outputs: tuple[str, ...], inputs: tuple[str, ...]
 ) -> Quadratic:
-    """First and second derivatives by time and state at each section and by the inputs that are
-    held from there on: exact, through all events.
+    """First and second derivatives with respect to time and state at each section and to the inputs
+    that are held from it on: exact, through all events.
 
-    States are (t, q) in full: where a section is curved, no coordinates on it have to be. Without
-    a clock time is left out.
+    States are (t, q) in full, since no coordinates on a curved section are needed. Without a clock
+    the derivatives with respect to time are zero.
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or an input that does not exist; `ComputationError` as `place_sections`.
@@ -189,9 +189,9 @@ def second_order(
         first[:, 0], second[:, 0] = 0.0, 0.0
     after = np.roll(size[:, :n], -1, axis=0)
     unit = np.abs(first[:, :n] * size[:, None]).max(axis=2) / after
-    own = after * np.maximum(unit.max(axis=1, keepdims=True), 1.0)
+    largest = after * np.maximum(unit.max(axis=1, keepdims=True), 1.0)
     shown = np.abs(first[:, n:] * size[:, None]).max(axis=2)
-    least = _ROUNDING * np.concatenate([own, shown], axis=1)
+    least = _ROUNDING * np.concatenate([largest, shown], axis=1)
     bend = second * size[:, None, :, None] * size[:, None, None, :]
     second = np.where(np.abs(bend) > least[:, :, None, None], second, 0.0)
     return Quadratic(first[:, :n], second[:, :n], first[:, n:], second[:, n:])
@@ -206,9 +206,9 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
     z, lanes, n = s.resolve_outputs(items), placed.lanes, 1 + s.d
 
     def work(x):
-        here = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
-        t, q = replay(s, here, x[n:], target, placed.tape)
-        return jnp.concatenate([t[None], q, observe(s, z, here, x[n:])])
+        begin = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
+        t, q = replay(s, begin, x[n:], target, placed.tape)
+        return jnp.concatenate([t[None], q, observe(s, z, begin, x[n:])])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])
     m = len(x)
@@ -217,9 +217,9 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
         tangent = jnp.broadcast_to(direction[:, None], x.shape)
         return lambda x: jax.jvp(work, (x,), (tangent,))[1]
 
-    def twice(one, other):
-        tangent = jnp.broadcast_to(other[:, None], x.shape)
-        return jax.jvp(along(one), (x,), (tangent,))
+    def twice(first, second):
+        tangent = jnp.broadcast_to(second[:, None], x.shape)
+        return jax.jvp(along(first), (x,), (tangent,))
 
     i, j = np.triu_indices(m)
     first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])
@@ -229,11 +229,11 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
 
 
 def _sizes(placed: PlacedSections, s: Structure, step) -> np.ndarray:
-    """(N, m): of time, states and inputs at each section; an input of size one moves some state by
-    its size."""
+    """Sizes (N, m) of time, states and inputs at each section; an input of size one moves some
+    state by its size."""
     scale = np.asarray(placed.cycle.settings.scale)[placed.lanes.chart]
-    own = np.concatenate([np.full((len(scale), 1), placed.cycle.period), scale], axis=1)
-    moved = np.abs(step[:, :, own.shape[1] :]) / np.roll(own, -1, axis=0)[:, :, None]
+    sizes = np.concatenate([np.full((len(scale), 1), placed.cycle.period), scale], axis=1)
+    moved = np.abs(step[:, :, sizes.shape[1] :]) / np.roll(sizes, -1, axis=0)[:, :, None]
     most = moved.max(axis=(0, 1))
     of_inputs = 1 / np.where(most > 0, most, 1.0)
-    return np.concatenate([own, np.broadcast_to(of_inputs, (len(own), s.nu))], axis=1)
+    return np.concatenate([sizes, np.broadcast_to(of_inputs, (len(sizes), s.nu))], axis=1)

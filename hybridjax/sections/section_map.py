@@ -74,10 +74,12 @@ class SectionMap(eqx.Module):
                 f"starts and states have the shape {self.dims[:1]}; got {q.shape}."
             )
         nu = len(self.placed.cycle.system.inputs)
-        u = np.zeros(nu) if u is None else u
-        if u.shape not in ((), (nu,)):
-            raise DefinitionError(f"`u` must be {nu} numbers, one for each input; got {u.shape}.")
-        arrival = _map(self, q, u, t)
+        held = np.zeros(nu) if u is None else u
+        if held.shape not in ((), (nu,)):
+            raise DefinitionError(
+                f"`u` must be {nu} numbers, one for each input; got {held.shape}."
+            )
+        arrival = _map(self, q, held, t)
         if not is_traced(arrival) and (code := Result(int(arrival.result))) != Result.OK:
             raise ComputationError(
                 f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "

@@ -40,7 +40,7 @@ def kinds(transitions: Sequence[Transition]) -> list[Kind]:
     return [tuple(kind) for kind in groups.values()]
 
 
-def member_of(alike: Sequence[Any], place: Int[Array, ""]) -> Any:
+def member_of(alike: Sequence[Any], place: Any) -> Any:
     """The pytree with this index among pytrees that differ in numbers only."""
     leaves, structures = zip(*map(jax.tree_util.tree_flatten, alike), strict=True)
 
@@ -54,11 +54,11 @@ def member_of(alike: Sequence[Any], place: Int[Array, ""]) -> Any:
 
 
 def counts_alike(program: jex.Jaxpr) -> bool:
-    """Whether a program computes with integers as Python does. (JAX evaluates integer powers by the
-    bits of the exponent: a negative or too large exponent would give another number.)"""
+    """Test whether a program computes with integers as Python does. (JAX evaluates integer powers
+    by the bits of the exponent: a negative or too large one would give another number.)"""
     return not any(
         (eqn.primitive.name.startswith("shift") or eqn.primitive.name == "pow")
-        and all(jnp.issubdtype(getattr(v.aval, "dtype", None), jnp.integer) for v in eqn.invars)
+        and all(jnp.issubdtype(getattr(v.aval, "dtype", object), jnp.integer) for v in eqn.invars)
         or not all(map(counts_alike, jaxprs(eqn.params)))
         for eqn in program.eqns
     )

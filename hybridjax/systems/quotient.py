@@ -1,4 +1,4 @@
-"""Systems modulo a symmetry: legs that trade their names, a place that does not matter."""
+"""Systems modulo a symmetry: legs that are relabeled, a position that has no effect."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -14,21 +14,18 @@ from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .output import Output
-from .system import Guess, HybridSystem
+from .structure import as_vector
+from .system import Derived, Guess, HybridSystem
 from .transition import Scheduled, Transition
 
 
-# States at which symmetry is looked for. Twice as many: hardly a function is found that is
-# symmetric at these and not at others.
-_SAMPLES = 3
-# How far functions may be apart, relative to the largest of their numbers.
+# Functions are equal up to this part of the largest of their numbers. Higher: a weak asymmetry is
+# missed. Lower: rounding errors count.
 _EQUAL = 1e-9
-# How far states are translated to see whether it matters. Any number does.
-_SHIFT = 0.7
 
 
 @checked
-class Quotient(HybridSystem):
+class Quotient(Derived):
     """`system` modulo a symmetry, which is declared here once and written into no reset.
 
     ```python
@@ -38,28 +35,27 @@ class Quotient(HybridSystem):
     stride = hj.find_limit_cycle(walker, step, multiplicity=2)
     ```
 
-    What leads into a chart that was left out leads into its mirror image, with the state mirrored,
-    so that a step is a cycle already; two of them are a stride. With S the symmetry and P the map
+    A transition into a chart that was left out leads into its mirror image, with the state
+    mirrored, so that a step is a cycle; two steps are a stride. With S the symmetry and P the map
     of a step of `system`, the multipliers of a step are those of S P, and those of the stride,
     (S P)^2, are their squares.
 
     **Arguments:**
 
-    - `system`: written in full, with its own guess in a chart that is kept.
+    - `system`: written in full, with its guess in a chart that is kept.
     - `swap`: charts that are mirror images of each other, {kept: left out}. The transitions of
-        both stand in the same order.
-    - `relabel`: states that trade their names in the mirror, {name: name}, in either order.
-    - `flipped`: states that change their sign.
-    - `translation`: states on which nothing else depends, such as the place along the floor. They
-        are left out.
+        both are listed in the same order.
+    - `relabel`: states that are exchanged in the mirror, {name: name}, in either order.
+    - `flipped`: states that change their sign in the mirror.
+    - `translation`: states that have no effect on others, such as the position along the floor.
+        They are left out.
 
     Inputs are those of the charts that are kept.
 
-    **Raises:** `DefinitionError` where charts or states do not fit together, and, when a cycle is
-    looked for, with the name of a function that has not the symmetry.
+    **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle is
+    looked for, if a function does not have the symmetry; it names the function.
     """
 
-    system: HybridSystem
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)
     names: tuple[tuple[str, str], ...] = eqx.field(static=True)
     flipped: tuple[str, ...] = eqx.field(static=True)
@@ -86,7 +82,7 @@ class Quotient(HybridSystem):
 
     @property
     def relabel(self) -> dict[str, str]:
-        """States that trade their names."""
+        """States that are exchanged."""
         return dict(self.names)
 
     def __check_init__(self):
@@ -96,32 +92,20 @@ class Quotient(HybridSystem):
                 raise DefinitionError(
                     f"Quotient: there is no chart '{name}' to swap; charts are {[*charts]}."
                 )
-        known = {state for chart in charts.values() for state in chart.states}
+        states = {state for chart in charts.values() for state in chart.states}
         for name in (*self.relabel, *self.relabel.values(), *self.flipped, *self.translation):
-            if name not in known:
+            if name not in states:
                 raise DefinitionError(
-                    f"Quotient: there is no state '{name}'; states are {sorted(known)}."
+                    f"Quotient: there is no state '{name}'; states are {sorted(states)}."
                 )
         for kept, left_out in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[left_out].states):
                 raise DefinitionError(
                     f"Quotient: mirrored, chart '{kept}' has the states {sorted(mirrored)}, but "
-                    f"chart '{left_out}' has {sorted(charts[left_out].states)}: say which states "
-                    "trade their names, by `relabel`."
+                    f"chart '{left_out}' has {sorted(charts[left_out].states)}: give the states "
+                    "that are exchanged by `relabel`."
                 )
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return self.system.inputs
-
-    @property
-    def input_units(self) -> tuple[str, ...]:
-        return self.system.input_units
-
-    @property
-    def time_unit(self) -> str:
-        return self.system.time_unit
 
     def charts(self):
         left_out = set(self.swap.values())
@@ -129,21 +113,18 @@ class Quotient(HybridSystem):
         return {name: _Reduced(x, self.translation) for name, x in charts if name not in left_out}
 
     def transitions(self):
-        left_out, found = self.swap.values(), []
-        for x in self.system.transitions():
-            if x.source not in left_out:
-                source = self._reduced(x.source)
-                target, reset = self._landing(x)
-                guard = x.guard if isinstance(x.guard, Scheduled) else _of_reduced(source, x.guard)
-                enabled = None if x.enabled is None else _of_reduced(source, x.enabled)
-                landing = _of_reduced(source, reset)
-                found.append(
-                    Transition(x.name, x.source, target, guard, x.direction, landing, enabled)
-                )
-        return found
+        return [
+            self._transition(x)
+            for x in self.system.transitions()
+            if x.source not in self.swap.values()
+        ]
 
-    def period(self):
-        return self.system.period()
+    def _transition(self, x: Transition) -> Transition:
+        at = self._reduced(x.source).lifted
+        target, reset = self._landing(x)
+        guard = x.guard if isinstance(x.guard, Scheduled) else at(x.guard)
+        enabled = None if x.enabled is None else at(x.enabled)
+        return Transition(x.name, x.source, target, guard, x.direction, at(reset), enabled)
 
     def guess(self):
         guess = self.system.guess()
@@ -152,8 +133,16 @@ class Quotient(HybridSystem):
         state = self.charts()[guess.chart].less(guess.state)
         return Guess(guess.chart, state, guess.time, after=guess.after)
 
+    def outputs(self):
+        charts, outputs = self.charts(), []
+        for x in self.system.outputs():
+            functions = dict.fromkeys(charts, x.function) if callable(x.function) else x.function
+            kept = {name: charts[name].lifted(f) for name, f in functions.items() if name in charts}
+            outputs.append(Output(x.name, kept, x.unit))
+        return outputs
+
     def check(self) -> None:
-        """Raise for a function that has not the symmetry."""
+        """Raise an error for a function that does not have the symmetry."""
         if is_traced(self):
             return
         claims = list(self._claims())
@@ -163,100 +152,90 @@ class Quotient(HybridSystem):
         @jax.jit
         @jax.vmap
         def both(q, t):
-            return [tuple(_vector(f(t, q, u)) for f in pair if f) for _, *pair in claims]
+            return [tuple(as_vector(f(t, q, u)) for f in pair) for _, *pair in claims]
 
-        samples = rng.normal(size=(_SAMPLES, d)), rng.normal(size=_SAMPLES)
-        for (sentence, *_), pair in zip(claims, both(*samples), strict=True):
-            if not pair or not _equal(*pair):
+        values = both(rng.normal(size=(3, d)), rng.normal(size=3))
+        for (sentence, *_), pair in zip(claims, values, strict=True):
+            if not _equal(*pair):
                 raise DefinitionError(
-                    f"{type(self.system).__name__} has not the symmetry that Quotient states: "
+                    f"{type(self.system).__name__} does not have the symmetry of its Quotient: "
                     f"{sentence}."
                 )
 
     def _claims(self):
-        """What the symmetry says: functions of (t, q, u) that are equal, and the sentence for where
-        they are not. Of q the first numbers are the state, without what is translated."""
+        """The statements of the symmetry: a sentence for its failure, and two functions of
+        (t, q, u) that are equal. The first numbers of q are the state without translations."""
         charts, events = self.system.charts(), self.system.transitions()
-        cut = lambda name, q: q[: len(self._reduced(name).kept)]  # noqa: E731
-        moved = lambda name, q: self._reduced(name).full(cut(name, q), _SHIFT)  # noqa: E731
-        still = lambda name, q: self._reduced(name).full(cut(name, q))  # noqa: E731
-        at = lambda place, name, f: lambda t, q, u: f(t, place(name, q), u)  # noqa: E731
+
+        def full(name, q, shift=0.0):
+            chart = self._reduced(name)
+            return chart.full(q[: len(chart.kept)], shift)
+
         if self.translation:
-            for name, chart in charts.items():
-                sentence = f"the field of chart '{name}' changes under the translation"
-                yield sentence, at(moved, name, chart.field), at(still, name, chart.field)
-            for x in events:
-                sentence = f"the transition '{x.name}' changes under the translation"
-                f = self._event(x)
-                yield sentence, at(moved, x.source, f), at(still, x.source, f)
+            fields = [(f"field of chart '{name}'", name, x.field) for name, x in charts.items()]
+            steps = [(f"transition '{x.name}'", x.source, self._event(x)) for x in events]
+            for what, name, f in fields + steps:
+                before, after = (
+                    lambda t, q, u, f=f, name=name, shift=shift: f(t, full(name, q, shift), u)
+                    for shift in (0.0, 0.7)
+                )
+                yield f"the {what} changes under the translation", before, after
         for kept, other in self.swap.items():
-            image = lambda name, q, kept=kept: self._image(charts, kept, still(kept, q))  # noqa: E731
+
+            def still(f, kept=kept):
+                return lambda t, q, u: f(t, full(kept, q), u)
+
+            def image(f, kept=kept):
+                return lambda t, q, u: f(t, self._mirrored(kept, full(kept, q)), u)
+
+            def back(f, kept=kept):
+                return lambda t, q, u: self._mirrored(kept, as_vector(f(t, q, u)), back=True)
+
             sentence = f"the field of chart '{other}' is not the mirror image of that of '{kept}'"
-            field = at(image, other, charts[other].field)
-            mirrored = lambda t, q, u, kept=kept, field=field: self._mirror(  # noqa: E731
-                charts, kept, _vector(field(t, q, u))
-            )
-            yield sentence, at(still, kept, charts[kept].field), mirrored
-            own = [x for x in events if x.source == kept]
-            images = [x for x in events if x.source == other]
-            if len(own) != len(images):
-                yield f"'{kept}' and '{other}' have different numbers of transitions", None, None
-            for x, y in zip(own, images, strict=False):
+            yield sentence, still(charts[kept].field), back(image(charts[other].field))
+            of_kept, of_other = ([x for x in events if x.source == name] for name in (kept, other))
+            if len(of_kept) != len(of_other):
+                sentence = f"'{kept}' and '{other}' have different numbers of transitions"
+                yield sentence, lambda t, q, u: [0.0], lambda t, q, u: [1.0]
+            for x, y in zip(of_kept, of_other, strict=False):
                 sentence = f"the transition '{y.name}' is not the mirror image of '{x.name}'"
-                yield sentence, at(still, kept, self._event(x)), at(image, other, self._event(y))
-
-    def _image(self, charts: Mapping[str, Chart], kept: str, q: Any):
-        """The mirror image of a state in a chart that is kept."""
-        states, image = charts[kept].states, charts[self.swap[kept]].states
-        order = np.array([states.index(self._partner(name)) for name in image])
-        sign = [-1.0 if self._partner(name) in self.flipped else 1.0 for name in image]
-        return q[order] * np.array(sign)
-
-    def outputs(self):
-        charts = self.charts()
-        found = []
-        for output in self.system.outputs():
-            given = output.function
-            functions = dict.fromkeys(charts, given) if callable(given) else given
-            there = {
-                name: _of_reduced(charts[name], function)
-                for name, function in functions.items()
-                if name in charts
-            }
-            found.append(Output(output.name, there, output.unit))
-        return found
+                yield sentence, still(self._event(x)), image(self._event(y))
 
     def _reduced(self, name: str) -> "_Reduced":
         return _Reduced(self.system.charts()[name], self.translation)
 
     def _landing(self, x: Transition) -> tuple[str, Callable]:
         """The chart to which a transition leads, one that is kept, and the state there."""
-        back = {left_out: kept for kept, left_out in self.swap.items()}
-        target = back.get(x.target, x.target)
-        charts, after = self.system.charts(), self._reduced(target)
+        target = {left_out: kept for kept, left_out in self.swap.items()}.get(x.target, x.target)
 
         def reset(t, q, u):
-            new = _vector(x.reset(t, q, u))
-            return after.less(new if target == x.target else self._mirror(charts, target, new))
+            new = as_vector(x.reset(t, q, u))
+            mirrored = new if target == x.target else self._mirrored(target, new, back=True)
+            return self._reduced(target).less(mirrored)
 
         return target, reset
 
     def _event(self, x: Transition) -> Callable:
         """Guard and reset of a transition, as one vector."""
-        _, reset = self._landing(x)
-        if isinstance(x.guard, Scheduled):
+        (_, reset), guard = self._landing(x), x.guard
+        if isinstance(guard, Scheduled):
             return reset
-        return lambda t, q, u: jnp.append(reset(t, q, u), x.sign * x.guard(t, q, u))
+        return lambda t, q, u: jnp.append(reset(t, q, u), x.sign * guard(t, q, u))
 
     def _partner(self, name: str) -> str:
         back = {b: a for a, b in self.relabel.items()}
         return self.relabel.get(name, back.get(name, name))
 
-    def _mirror(self, charts: Mapping[str, Chart], kept: str, q: Any):
-        """The state in a chart that is kept, from one in its mirror image."""
-        states, image = charts[kept].states, charts[self.swap[kept]].states
-        order = np.array([image.index(self._partner(name)) for name in states])
-        return q[order] * np.array([-1.0 if name in self.flipped else 1.0 for name in states])
+    def _mirrored(self, kept: str, q: Any, back: bool = False):
+        """The mirror image of a state of a chart that is kept, or with `back`, of a state of its
+        image."""
+        charts = self.system.charts()
+        source, target = charts[kept].states, charts[self.swap[kept]].states
+        if back:
+            source, target = target, source
+        order = [source.index(self._partner(name)) for name in target]
+        names = target if back else map(self._partner, target)
+        return q[np.array(order)] * np.array([-1.0 if x in self.flipped else 1.0 for x in names])
 
 
 class _Reduced(Chart):
@@ -289,25 +268,21 @@ class _Reduced(Chart):
     def absent(self) -> Mapping[str, float]:
         return self.chart.absent
 
-    def full(self, q, place=0.0):
-        return jnp.full(len(self.chart.states), place).at[self.kept].set(q)
+    def full(self, q, shift=0.0):
+        """The state of the whole chart, translated by a shift."""
+        return jnp.full(len(self.chart.states), shift).at[self.kept].set(q)
 
     def less(self, q):
         return jnp.asarray(q)[self.kept]
 
+    def lifted(self, function: Callable) -> Callable:
+        """A function of the whole chart's state, of the reduced one."""
+        return lambda t, q, u: function(t, self.full(q), u)
+
     def field(self, t, q, u):
-        return self.less(_vector(self.chart.field(t, self.full(q), u)))
+        return self.less(as_vector(self.chart.field(t, self.full(q), u)))
 
 
-def _of_reduced(chart: _Reduced, function):
-    return lambda t, q, u: function(t, chart.full(q), u)
-
-
-def _equal(one, other):
-    size = np.nanmax(np.abs(one), initial=0.0)
-    same = one.shape == other.shape
-    return same and np.allclose(one, other, rtol=0, atol=_EQUAL * size, equal_nan=True)
-
-
-def _vector(value):
-    return jnp.stack([jnp.asarray(x, float) for x in value])
+def _equal(x, y):
+    size = np.nanmax(np.abs(x), initial=0.0)
+    return x.shape == y.shape and np.allclose(x, y, rtol=0, atol=_EQUAL * size, equal_nan=True)

@@ -14,7 +14,7 @@ from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from .chart import Chart
 from .structure import as_vector
-from .transition import Transition
+from .transition import Direction, Transition
 
 
 class Sliding(NamedTuple):
@@ -75,9 +75,10 @@ def sliding(
     up = lambda t, q, u: middle.rates(t, q, u)[0]  # noqa: E731
     down = lambda t, q, u: middle.rates(t, q, u)[1]  # noqa: E731
 
-    def event(source, target, guard, direction="falling", enabled=None):
-        called = f"{source} to {target}"
-        return Transition(called, source, target, guard, direction, enabled=enabled)
+    def event(source, target, guard, direction: Direction = "falling", enabled=None):
+        return Transition(
+            f"{source} to {target}", source, target, guard, direction, enabled=enabled
+        )
 
     transitions = [
         event(above, name, height, enabled=held),

@@ -82,9 +82,9 @@ def solvers(
 
     **Raises:** `DefinitionError` for what is no solver.
     """
-    for one in given.values() if isinstance(given, Mapping) else (given,):
-        if not isinstance(one, Method | eqx.Module | ByChart | None):
-            raise _no_solver(one)
+    for solver in given.values() if isinstance(given, Mapping) else (given,):
+        if not isinstance(solver, Method | eqx.Module | ByChart | None):
+            raise _no_solver(solver)
     return ByChart(tuple(given), tuple(given.values())) if isinstance(given, Mapping) else given
 
 
@@ -146,19 +146,17 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
     return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
 
 
-def _method(name: str, a, b, c, error, order: float, **rest: float) -> Method:
+def _method(name: str, a, b, c, error, order: float, **controls: float) -> Method:
     rows = tuple(tuple(map(float, row)) for row in a)
-    return Method(name, rows, *(tuple(map(float, x)) for x in (b, c, error)), order, **rest)
+    b, c, error = (tuple(map(float, x)) for x in (b, c, error))
+    return Method(name, rows, b, c, error, order, **controls)
 
 
 def _radau(s: int) -> Method:
-    legendre = np.polynomial.legendre
-    c = legendre.legroots([*[0] * (s - 1), -1, 1]).real
-    for _ in range(3):  # Newton's steps to full precision
-        value, slope = (legendre.legval(c, x) for x in _with_derivative([*[0] * (s - 1), -1, 1]))
-        c = c - value / slope
-    c = (1 + np.sort(c)) / 2
-    c[-1] = 1.0
+    from scipy import special
+
+    # The Radau points are 1 and zeros of a Jacobi polynomial.
+    c = np.append((1 + special.roots_jacobi(s - 1, 1, 0)[0]) / 2, 1.0)
     a = np.array([_integrals(c, end) for end in c])
     eigenvalues = np.linalg.eigvals(a)
     gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
@@ -174,14 +172,12 @@ def _radau(s: int) -> Method:
     )  # fmt: skip
 
 
-def _with_derivative(series):
-    return series, np.polynomial.legendre.legder(series)
-
-
 def _integrals(c: Float[np.ndarray, " s"], end: float) -> Float[np.ndarray, " s"]:
     """Integrals from 0 to `end` of the Lagrange polynomials at the points c."""
     x, weights = np.polynomial.legendre.leggauss(len(c))
     x = end * (1 + x) / 2
-    others = ~np.eye(len(c), dtype=bool)
-    values = [np.prod((x[:, None] - c[o]) / (c[j] - c[o]), axis=1) for j, o in enumerate(others)]
+    values = [
+        np.prod((x[:, None] - np.delete(c, j)) / (c[j] - np.delete(c, j)), axis=1)
+        for j in range(len(c))
+    ]
     return end / 2 * np.array(values) @ weights

@@ -174,7 +174,7 @@ class Structure:
             return u
         return u[np.array([self.system.inputs.index(n) for n in names], int)]
 
-    def field(self, a: int, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
+    def field(self, a: int, t: Array, q: Array, u: Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
 
     @property
@@ -190,8 +190,8 @@ class Structure:
         return _kinds.recall(self.source, None, make)
 
     def _is_one(self, kind: Kind) -> bool:
-        """Whether functions can be traced with the numbers in which they differ as arguments and
-        then mean the same. (They cannot if Python branches on a number.)"""
+        """Test whether functions can be traced with the numbers in which they differ as arguments
+        and then mean the same. (They cannot if Python branches on a number.)"""
         n = self.dims[self.chart_index(self.transitions[kind[0]].source)]
 
         def at_a_point(s, place, *point):
@@ -331,7 +331,7 @@ class Outputs:
         return jnp.stack(values) if values else jnp.zeros(0)
 
     def defined(self, a: int) -> bool:
-        """Whether all outputs are defined in chart a."""
+        """Test whether all outputs are defined in chart a."""
         return all(self._function(item, a) is not None for item in self.items)
 
     def require(self, a: int) -> None:

@@ -16,7 +16,7 @@ from .._core.precision import real
 from .._core.text import columns, fields, value
 from .chart import Chart
 from .output import Output
-from .solver import ByChart, Solver, solvers
+from .solver import ByChart, Method, Solver, solvers
 from .transition import Transition
 
 
@@ -35,7 +35,7 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     `unit`, in words.
     """
     metadata = {"doc": doc, "unit": unit}
-    options = {} if default is None else {"default": default}
+    options: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=_number, metadata=metadata, **options)
 
 
@@ -106,7 +106,7 @@ class HybridSystem(Definition):
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
 
-    solver: Solver | ByChart | None = eqx.field(
+    solver: Solver | Method | ByChart | None = eqx.field(
         static=True, default=None, kw_only=True, converter=solvers
     )
 
@@ -155,11 +155,10 @@ def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
     return other
 
 
-class Driven(HybridSystem):
-    """`system` with an input that is a function of time, added to the piecewise constant one."""
+class Derived(HybridSystem):
+    """A system made of another one, of which it has all that it does not define anew."""
 
     system: HybridSystem
-    drive: Callable[[Any], Any]
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -184,3 +183,9 @@ class Driven(HybridSystem):
 
     def outputs(self):
         return self.system.outputs()
+
+
+class Driven(Derived):
+    """`system` with an input that is a function of time, added to the piecewise constant one."""
+
+    drive: Callable[[Any], Any]

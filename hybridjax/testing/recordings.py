@@ -22,7 +22,6 @@ from ..orbits.cycle import LimitCycle
 from ..recordings.recording import Recording, Trial
 from ..sections.families import ClockPhase
 from ..systems.output import OutputNames
-from ..systems.structure import Structure
 
 
 # Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of
@@ -96,7 +95,7 @@ def simulate_recording(
 
     **Raises:** `DefinitionError` as `response_function`.
     """
-    Structure(cycle.system).resolve_outputs(outputs)
+    cycle.structure.resolve_outputs(outputs)
     force = np.asarray(force, float)
     period = float(cycle.period)
     if not 1 <= rate * period * steps <= SECTIONS:

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 import hybridjax as hj
-from hybridjax.designs.candidates import Candidates, make_noise
-from hybridjax.designs.numerators import order_criterion
 
 from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
 
@@ -51,42 +48,6 @@ def test_an_impulse_response_is_its_spectrum(model, usual):
     ]
     assert plans[0].names == ("response of y",) and plans[0].certificate < 1.03
     assert plans[0].usual_criterion == pytest.approx(plans[1].usual_criterion, rel=1e-6)
-
-
-def misfit(model, design, fewer, harmonics):
-    """Return that of the best model with fewer multipliers, found by `fit_multipliers`."""
-    htf = expected_htf(model, design, NOISE, harmonics)
-    return hj.fit_multipliers(htf, fewer, check=False).cost
-
-
-def test_the_choice_of_an_order(model, usual):
-    fewer, harmonics = 1, (-1, 0, 1)
-    goal = hj.designs.Order(fewer, harmonics=harmonics)
-    plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    assert plan.certificate < 1.03 and plan.saved > 1.2
-    for design, said in ((plan.usual, plan.usual_criterion), (plan.design, plan.criterion)):
-        assert 1 / said == pytest.approx(misfit(model, design, fewer, harmonics), rel=0.02)
-    for other in random_designs(5, plan.usual_rms["u"], N, 16, band=(0, 2)):
-        assert misfit(model, other, fewer, harmonics) < plan.certificate / plan.criterion
-
-
-@pytest.mark.filterwarnings("ignore:Values in x were outside bounds")  # SLSQP of older SciPy
-def test_the_choice_of_an_order_by_another_optimizer(model):
-    """Sequential quadratic programming, with a numerical gradient of the misfit."""
-    few = hj.multisine(N, 8, band=(0, 2))
-    cosines, goal = Candidates.of(few), hj.designs.Order(0, harmonics=0)
-    criterion = order_criterion(goal, model, cosines, make_noise(model, NOISE, {}))
-    start = cosines.power_of(few)
-    rms = float(np.sqrt(start.sum()))
-    plan = hj.optimal_design(model, few, goal=goal, noise=NOISE, limit={"u": rms})
-    other = minimize(
-        lambda p: -1e-3 / criterion.bound(p).criterion, start, method="SLSQP",
-        bounds=[(1e-9, 1)] * len(start),
-        constraints=[{"type": "ineq", "fun": lambda p: start.sum() - p.sum()}],
-        options={"ftol": 1e-10, "maxiter": 40},
-    )  # fmt: skip
-    best = -1e-3 / other.fun
-    assert best * (1 - 1e-3) < plan.criterion < best * plan.certificate * 1.001
 
 
 def test_a_sum_with_weights(model, usual):
@@ -141,7 +102,6 @@ def test_bad_goals(model, usual):
     double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
     M = hj.designs.Multipliers
     cases = (
-        (model, hj.designs.Order(2, (-1, 0, 1)), "2 multipliers are not fewer than the model's 2"),
         (model, hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
         (model, M(weights=(1.0,), harmonics=0), "must be 2 numbers: one for each of"),
         (model, M(5, harmonics=0), "there is no multiplier 5, the model has 2"),
@@ -229,6 +189,6 @@ def test_physical_parameters():
     variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
     x = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
     observed = hj.ObservedHTF(x, sections)
-    S = hj.fitting.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
+    S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
     np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -17,8 +17,6 @@ import hybridjax as hj
 from hybridjax._core.compilation import compiler_options
 from hybridjax.engine.settings import Settings
 
-from ..conftest import APEX
-
 
 # Compiled in a third of the time, to slower programs.
 QUICK = compiler_options()
@@ -149,21 +147,6 @@ def test_section_map_in_closed_form(relay_map):
     assert_equal_derivatives(H, jax.vmap(jax.hessian(exact))(BOTH), 1e-9)
 
 
-def test_gradient_of_a_mapped_loss(relay_map):
-    """A chart's field is not defined at the other chart's states; a mapped branch computes both
-    sides, and nothing of the wrong one may be seen."""
-
-    def loss(many, b):
-        return jnp.sum(jax.vmap(lambda v: relay(relay_map, v.at[5].set(b)))(many) ** 2)
-
-    def true(many, b):
-        return jnp.sum(jax.vmap(lambda v: exact(v.at[5].set(b)))(many) ** 2)
-
-    found = compiled(jax.grad(loss, argnums=(0, 1)))(BOTH, V[5])
-    for x, y in zip(found, jax.grad(true, argnums=(0, 1))(BOTH, V[5]), strict=True):
-        assert_equal_derivatives(x, y, 1e-11)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "second",
@@ -206,77 +189,3 @@ def test_a_map_that_does_not_arrive(relay_map):
 
 
 # --- The lossy hopper -----------------------------------------------------------------------------
-
-
-PARAMETERS = ("m", "M", "k", "b", "l0", "a", "g", "retention")
-ISOCHRONS = hj.ClockPhase(4, anchor=APEX)
-ANGLES = hj.KinematicPhase(
-    4, position="yM", velocity="vM", center=(1.9, 0.0), scale=(0.3, 1.9), anchor=APEX
-)
-
-
-@pytest.fixture(scope="module")
-def cycle():
-    return hj.find_limit_cycle(hj.models.VerticalHopper(retention=0.9), settings=TIGHT)
-
-
-def point(P):
-    """(state, input, time, parameters) at the start of a section map of the hopper."""
-    system = P.placed.cycle.system
-    parameters = jnp.stack([getattr(system, name) for name in PARAMETERS])
-    return jnp.concatenate([P.fixed_point, jnp.zeros(1), P.placed.lanes.t[P.i][None], parameters])
-
-
-def hopper(P, v):
-    """State and time at arrival."""
-    n = P.dims[0]
-    system = hj.models.VerticalHopper(**dict(zip(PARAMETERS, v[n + 2 :], strict=True)))
-    arrival = fresh(P, system)(v[:n], v[n], v[n + 1])
-    return jnp.append(arrival.q, arrival.t)
-
-
-def differences(f, x, e=1e-4):
-    """Derivative by central differences of fourth order; f takes many points."""
-    n = len(x)
-    steps = e * jnp.concatenate([c * jnp.eye(n) for c in (1, -1, 2, -2)])
-    plus, minus, plus2, minus2 = np.split(np.asarray(f(x + steps)), 4)
-    return np.moveaxis((8 * (plus - minus) - (plus2 - minus2)) / (12 * e), 0, -1)
-
-
-def crossed(placed, event):
-    """The section from which the cycle goes through an event, and the next one."""
-    charts = np.asarray(placed.lanes.chart)
-    before, after = {"touchdown": (0, 1), "liftoff": (1, 0)}[event]
-    (i, *_) = np.flatnonzero((charts == before) & (np.roll(charts, -1) == after))
-    return int(i), int(i + 1) % placed.n_sections
-
-
-CASES = [
-    pytest.param(ISOCHRONS, "touchdown", id="isochron, touchdown", marks=pytest.mark.slow),
-    pytest.param(ISOCHRONS, "liftoff", id="isochron, liftoff", marks=pytest.mark.slow),
-    pytest.param(ANGLES, "touchdown", id="kinematic, touchdown", marks=pytest.mark.slow),
-    pytest.param(ANGLES, "liftoff", id="kinematic, liftoff"),
-]
-
-
-@pytest.mark.parametrize("family,event", CASES)
-def test_section_maps_of_the_hopper(cycle, family, event):
-    placed = hj.place_sections(cycle, family)
-    P = hj.section_map(cycle, placed, *crossed(placed, event))
-    v = point(P) + 1e-3
-    f = lambda v: hopper(P, v)  # noqa: E731
-    J = compiled(jax.jacrev(f))(v)
-    true = differences(compiled(jax.vmap(f)), v)
-    assert_equal_derivatives(J, true, 1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family,event", [x.values for x in CASES])
-def test_second_derivatives_of_the_hopper(cycle, family, event):
-    placed = hj.place_sections(cycle, family)
-    P = hj.section_map(cycle, placed, *crossed(placed, event))
-    v = point(P) + 1e-3
-    f = lambda v: hopper(P, v)  # noqa: E731
-    first = compiled(jax.vmap(jax.jacfwd(f)))
-    H = compiled(jax.jacfwd(jax.jacfwd(f)))(v)
-    assert_equal_derivatives(H, differences(first, v), 1e-7)

@@ -10,11 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 import hybridjax as hj
-from hybridjax._core.executor import to_host
 from hybridjax.engine.runge_kutta import inverse, take_step
-from hybridjax.orbits.scale import stiff_charts
 from hybridjax.systems.solver import as_method
-from hybridjax.systems.structure import Structure
 
 from ..toys import Field
 
@@ -152,29 +149,6 @@ def test_linearization_of_a_stiff_system(damped):
     np.testing.assert_allclose(B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8)
 
 
-def test_stiffness_is_told(damped):
-    explicit, implicit = Structure(Damped()), Structure(damped.system)
-    assert stiff_charts(explicit, to_host(damped.legs), 1.0) == pytest.approx({"a": -FAST})
-    assert not stiff_charts(implicit, to_host(damped.legs), 1.0) and "stiff" not in repr(damped)
-
-
-@pytest.mark.slow
-def test_stiffness_is_cured_by_itself(damped):
-    itself = hj.find_limit_cycle(Damped(), settings=hj.Settings(solver="auto"))
-    assert Damped(solver=hj.Radau()).solver == itself.system.solver
-    np.testing.assert_array_equal(itself.anchor.q, damped.anchor.q)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Kvaerno5()], ids=str)
-def test_solvers_of_diffrax_give_the_same_cycle(solver):
-    cycle = hj.find_limit_cycle(
-        hj.models.VerticalHopper(), settings=hj.Settings(solver=solver, max_steps=4000)
-    )
-    default = hj.find_limit_cycle(hj.models.VerticalHopper())
-    np.testing.assert_allclose(cycle.multipliers, default.multipliers, atol=1e-9)
-
-
 @pytest.mark.slow
 def test_derivatives_of_a_stiff_cycle(damped):
     """Followed in both modes, and twice; the cycle is linear in the parameter."""
@@ -188,13 +162,3 @@ def test_derivatives_of_a_stiff_cycle(damped):
         np.testing.assert_allclose(found / size, exact(1.0) / size, rtol=1e-9, atol=1e-12)
     twice = jax.jit(jax.jacfwd(jax.jacfwd(state)))(20.0)
     np.testing.assert_allclose(twice / size, 0.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_experiments_with_a_stiff_system(damped):
-    sections = hj.ClockPhase(8)
-    design = hj.multisine(8, 8, amplitude=1e-3, lines="odd")
-    data = hj.run_experiments(damped, sections, design, outputs="y", start="steady")
-    estimate = hj.estimate_htf(data, harmonics=(0,))
-    found = hj.linearize(damped, sections, outputs="y").htf(estimate.f, harmonics=(0,))
-    assert np.max(estimate.error(found)) < 1e-6

@@ -101,27 +101,6 @@ def test_derivatives_under_all_transformations(cycle):
 
 
 @pytest.mark.slow
-def test_a_sweep(cycle):
-    slow = np.array([4.0, 5.0, 7.0])
-    found = hj.find_limit_cycles([Thermostat(slow=x) for x in slow], cycle)
-    np.testing.assert_allclose(found.period, [exact(slow=x)[0] for x in slow], rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_branch(cycle):
-    branch = hj.continuation(cycle, "slow", (5.0, 6.0), step=0.5)
-    expected = [exact(slow=x)[0] for x in branch.values]
-    np.testing.assert_allclose(branch.cycles.period, expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_fit(cycle):
-    data = hj.ObservedCycle([hj.AtEvent("on")], period=exact(slow=5.3)[0], period_std=1e-6)
-    fit = hj.fit_model(Thermostat(), data, free=("slow",), guess=cycle)
-    np.testing.assert_allclose(fit.system.slow, 5.3, rtol=1e-6)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
 def test_experiments(cycle, start):
     sections = [hj.AtEvent("on"), hj.AtEvent("off")]
@@ -152,6 +131,7 @@ class Counted(Thermostat):
         return {"on": Loud(1.0, self.fast), "off": Room(0.0, self.slow)}
 
 
+@pytest.mark.slow
 def test_a_stiff_chart_costs_only_where_lanes_are():
     count = []
     s = Structure(Counted(say=lambda: count.append(1)))

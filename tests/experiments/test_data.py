@@ -34,20 +34,6 @@ def test_periodic_start_has_no_transient(model):
     assert hj.experiments.simulate_experiments(model, DESIGN, start="periodic").u.shape[1] == 5 * 4
 
 
-@pytest.mark.parametrize(
-    "message, arguments",
-    {
-        "`start` must be 'cycle' or": dict(start="rest"),
-        "`discard` must be an integer from 0": dict(discard=-1),
-        "the design is for N = 5": dict(design=hj.multisine(5, 4, (0, 2.0), inputs=2)),
-        "and 1 inputs": dict(design=hj.multisine(4, 4, (0, 2.0))),
-    }.items(),
-)
-def test_bad_simulations(model, message, arguments):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.experiments.simulate_experiments(model, **(dict(design=DESIGN) | arguments))
-
-
 def test_failed_experiments_are_named():
     y = np.ones((80, 84 * 32, 1))
     y[17, 41 * 32 + 21 :] = np.nan
@@ -95,9 +81,3 @@ def test_bad_records(message, change):
     hj.ExperimentData(**GOOD)
     with pytest.raises(hj.DefinitionError, match=message):
         hj.ExperimentData(**(GOOD | change))
-
-
-def test_the_window_is_the_last_periods():
-    data = hj.ExperimentData(np.ones((2, 20, 1)), np.ones((2, 20, 1)), n_sections=4, periods=3)
-    assert data.window == slice(8, None) and data.windows() == [slice(8, 20)]
-    assert data.u[:, data.window].shape[1] == 12

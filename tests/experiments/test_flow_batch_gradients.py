@@ -83,19 +83,6 @@ def test_reverse_and_forward_mode_agree_with_differences(experiment, parameters)
 
 
 @pytest.mark.slow
-def test_experiments_that_are_mapped(experiment, parameters):
-    """The gradient of a map is the sum of gradients, and the map of gradients is a list of them."""
-    many = jnp.stack([inputs(2), -inputs(2)])
-    f = lambda x, u: loss(experiment, x, u)[0]  # noqa: E731
-    each = compiled(jax.vmap(jax.grad(f), (None, 0)))(parameters, many)
-    total = compiled(jax.grad(lambda x, u: jnp.sum(jax.vmap(f, (None, 0))(x, u))))
-    np.testing.assert_allclose(total(parameters, many), each.sum(axis=0), rtol=1e-9)
-    one = compiled(jax.grad(f))
-    for u, found in zip(many, each, strict=True):
-        np.testing.assert_allclose(found, one(parameters, u), rtol=1e-9)
-
-
-@pytest.mark.slow
 def test_second_derivatives_agree_with_differences(experiment, parameters):
     """A product with the Hessian, forward over reverse, and a number of it forward twice."""
     u, v = inputs(1), jnp.array([0.1, 0.2, -0.3, 0.1, 0.05, 0.2, -0.1])

@@ -40,26 +40,11 @@ def test_process_noise_has_the_color_that_it_says(std, memory):
     require_color(x, np.broadcast_to(std, N)[:, None], memory)
 
 
-def test_white_noise_is_one_draw_for_each_sample():
-    x = ProcessNoise(0.7, seed=5).draw((1, 6, 2), 3, first=4)
-    np.testing.assert_array_equal(x[0], 0.7 * np.random.default_rng((5, 4)).normal(size=(6, 2)))
-
-
-@pytest.mark.parametrize("memory", [0.0, 1.0])
-def test_there_may_be_no_samples(memory):
-    assert ProcessNoise(1.0, memory=memory).draw((2, 0, 1), 2).shape == (2, 0, 1)
-
-
 def test_noise_does_not_depend_on_the_parts_in_which_it_is_drawn():
     noise = ProcessNoise(STD, seed=2, memory=1.0)
     whole = noise.draw((7, 5 * N, 1), N)
     parts = [noise.draw((k, 5 * N, 1), N, first) for k, first in ((3, 0), (0, 3), (4, 3))]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-
-def test_process_noise_can_be_compared():
-    assert ProcessNoise(STD) == ProcessNoise(list(STD)) != ProcessNoise(STD, memory=1.0)
-    assert hash(ProcessNoise(STD)) == hash(ProcessNoise(STD.copy()))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.precision import at_precision, single_precision
 
 from ..conftest import OUTPUTS
 
@@ -61,9 +60,3 @@ def test_what_single_precision_cannot_give_is_refused(hopper_cycle, both, design
     placed = both[0]
     with pytest.raises(hj.DefinitionError, match="single precision leaves errors of about .*e-0"):
         hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, accuracy=1e-7, execution=SINGLE)
-
-
-def test_thresholds_are_those_of_the_precision_at_hand():
-    assert at_precision(1e-12, 1e-6) == 1e-12
-    with single_precision():
-        assert at_precision(1e-12, 1e-6) == 1e-6

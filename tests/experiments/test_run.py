@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
-from hybridjax._core import compilation
+from hybridjax.identify.htf_estimate import missing_frequencies
 
 from ..conftest import OUTPUTS, no_compilation
 from ..orbits import hopper_scipy
@@ -39,11 +39,6 @@ def family(request, hopper_cycle, design):
     ldtp = request.getfixturevalue(f"{request.param}_ldtp")
     data = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, **BATCH)
     return request.param, placed, ldtp, data
-
-
-@pytest.fixture(scope="session")
-def isochron_data(hopper_cycle, placed_isochrons, design):
-    return hj.run_experiments(hopper_cycle, placed_isochrons, design, OUTPUTS, **BATCH)
 
 
 def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
@@ -94,29 +89,8 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     after = broken.failed_at[17] + 1
     assert np.all(np.isfinite(broken.y[17, :after])) and np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
-    lost = hj.identify.missing_frequencies(broken)
+    lost = missing_frequencies(broken)
     assert len(estimate.f) + len(lost) == len(design.frequencies)
-
-
-def test_batches_do_not_change_the_result(hopper_cycle, placed_isochrons, isochron_data):
-    u = np.concatenate([isochron_data.u, isochron_data.u[:20]])
-    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, **BATCH)
-    np.testing.assert_array_equal(data.y[:80], isochron_data.y)
-    np.testing.assert_allclose(data.y[80:], isochron_data.y[:20], atol=1e-12)
-
-
-def test_a_periodic_start_has_no_transient(hopper_cycle, family):
-    _, placed, ldtp, _ = family
-    line = np.arange(1, 81)[:, None]
-    u = 1e-5 * np.cos(2 * np.pi * line * np.arange(CYCLES * N) / (CYCLES * N))[..., None]
-    data = hj.run_experiments(
-        hopper_cycle, placed, u, OUTPUTS, start="periodic", discard=0, **BATCH
-    )
-    assert data.periods == CYCLES
-    for k in (3, 24, 79):
-        x0 = ldtp.periodic_state(u[k], CYCLES)
-        predicted = np.asarray(ldtp.simulate(u[k], x0))
-        assert np.max(np.abs(predicted - data.y[k])) < 1e-3 * np.max(np.abs(predicted))
 
 
 def test_large_inputs_that_change_the_order_of_events_are_reported(
@@ -168,28 +142,6 @@ def test_new_values_of_parameters_do_not_compile_again(hopper_cycle, placed_isoc
     stiffer = eqx.tree_at(lambda p: p.cycle.system.k, placed_isochrons, jnp.asarray(10.001, float))
     with no_compilation():
         hj.run_experiments(stiffer.cycle, stiffer, design, OUTPUTS, **BATCH)
-
-
-def test_one_program_serves_all_plans_parameters_and_cycles(hopper_cycle, placed_isochrons):
-    before = set(compilation._by_text)
-    u = np.zeros((2, 32, 1))
-    for accuracy in (1e-7, 1e-8):  # a plan of its own for each
-        hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0, accuracy=accuracy)
-    other = hj.find_limit_cycle(hj.models.VerticalHopper(k=9.5))
-    hj.run_experiments(other, placed_isochrons.family, u, OUTPUTS, discard=0)
-    assert len(set(compilation._by_text) - before) <= 1
-
-
-@pytest.mark.slow
-def test_responses_of_users_functions_and_of_their_programs_are_the_same(
-    hopper_cycle, placed_isochrons
-):
-    """What `run_experiments` computes from programs, `response_function` computes from classes."""
-    u = 0.1 * np.random.default_rng(0).standard_normal((2, 64, 1))
-    data = hj.run_experiments(hopper_cycle, placed_isochrons, u, OUTPUTS, discard=0)
-    y = hj.response_function(hopper_cycle, placed_isochrons, OUTPUTS)(u).y
-    y = np.asarray(y).reshape(data.y.shape[0], -1, *data.cycle_outputs.shape) - data.cycle_outputs
-    np.testing.assert_allclose(data.y, y.reshape(data.y.shape), atol=1e-12)
 
 
 @hypothesis.settings(max_examples=15)

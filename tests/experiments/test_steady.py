@@ -55,15 +55,6 @@ def test_calls_that_are_repeated_compile_nothing(vanderpol_cycle, start):
         run(2)
 
 
-def test_linear_experiments_that_are_repeated_compile_nothing():
-    A = 0.3 * np.random.default_rng(0).normal(size=(4, 2, 2))
-    model = hj.LDTP(A, np.ones((4, 2, 1)), np.ones((4, 1, 2)))
-    simulate = hj.experiments.simulate_experiments
-    simulate(model, DESIGN, start="periodic")
-    with no_compilation():
-        simulate(model, DESIGN.realizations(1, seed=3), start="periodic")
-
-
 def test_a_steady_start_that_is_not_there_is_named(vanderpol_cycle, monkeypatch):
     monkeypatch.setattr(steady, "MOST_STEPS", 1)
     u = np.tile(DESIGN.inputs()[:1], (3, 1, 1)) * np.array([0.0, 1.0, 0.0])[:, None, None]
@@ -95,11 +86,6 @@ def test_the_root_has_exact_derivatives(vanderpol_cycle, settled):
     _, slope = jax.jvp(last, (0.0,), (1.0,))
     h = 1e-4
     np.testing.assert_allclose(slope, (last(h) - last(-h)) / (2 * h), rtol=1e-5, atol=1e-9)
-
-
-def test_bad_inputs(response):
-    with pytest.raises(hj.DefinitionError, match="multiple of the 4 sections"):
-        response.steady_start(np.zeros((1, 5, 1)))
 
 
 def test_process_noise_acts_but_is_not_recorded(vanderpol_cycle):

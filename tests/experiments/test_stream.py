@@ -58,16 +58,6 @@ def test_process_noise_does_not_depend_on_the_chunks(arguments):
     np.testing.assert_array_equal(records(parts), whole.y)
 
 
-def test_inputs_may_lie_on_disk(arguments, whole, tmp_path):
-    np.save(tmp_path / "u.npy", whole.u)
-    u = np.load(tmp_path / "u.npy", mmap_mode="r")
-    cycle, placed, _, outputs = arguments
-    parts = hj.experiments.stream_experiments(
-        cycle, placed, u, outputs, Options(discard=20, **BATCH), chunk=80
-    )
-    np.testing.assert_array_equal(records(parts), whole.y)
-
-
 def test_workers_and_batches_change_nothing(arguments, whole):
     with no_compilation():
         for workers in (1, 3):

@@ -32,7 +32,7 @@ def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
     return hj.experiments.add_noise(data, std=noise, seed=seed)
 
 
-def inside(model, count, repeats, variance, runs=100, **more):
+def inside(model, count, repeats, variance, runs=40, **more):
     """How often discs of 95 % hold the true value, of how many: H_0 at every third line."""
     hits = []
     for seed in range(runs):
@@ -62,7 +62,7 @@ def test_discs_hold_the_truth_as_often_as_they_say(model, count, repeats, varian
 def test_discs_whatever_the_errors_are(constant, noise, R):
     """Products of two cosines are of constant size. Of such errors without noise discs that look at
     sizes alone hold 90 % (three realizations), 92 % (four), 94 % (eight); two tell no more."""
-    rng, runs = np.random.default_rng(R), 40_000
+    rng, runs = np.random.default_rng(R), 20_000
     error = constant * np.exp(2j * np.pi * rng.random((R, runs)))
     error += noise * rng.normal(size=(R, runs, 2)) @ [np.sqrt(0.5), 1j * np.sqrt(0.5)]
     shares = np.full((R, 1), 1 / R)

@@ -18,9 +18,7 @@ def test_the_hopper_is_found_exactly(harmonics, exact, multipliers):
     assert fit.residual.max() < 1e-9
 
 
-def test_the_paper_protocol(paper_estimate, hopper, multipliers):
-    fit = hj.fit_multipliers(paper_estimate, hopper)
-    assert fit.compare(multipliers).max_error < 2e-5
+def test_the_paper_protocol(paper_estimate, multipliers):
     narrow = hj.fit_multipliers(paper_estimate, 2, (-2, -1, 0, 1, 2))
     assert narrow.compare(multipliers).max_error < 2e-5
 
@@ -66,11 +64,8 @@ def test_units_of_an_output_do_not_matter(paper_estimate):
     scale = np.array([1e3, 1e-3])[:, None]
     H = np.asarray(paper_estimate.H) * scale
     other = hj.HTF(paper_estimate.f, H, paper_estimate.harmonics, 32)
-    np.testing.assert_allclose(
-        hj.fit_multipliers(other, 2).coefficients,
-        hj.fit_multipliers(paper_estimate, 2).coefficients,
-        rtol=1e-8,
-    )
+    fits = [hj.fit_multipliers(htf, 2, (-1, 0, 1)) for htf in (other, paper_estimate)]
+    np.testing.assert_allclose(fits[0].coefficients, fits[1].coefficients, rtol=1e-8)
 
 
 @pytest.mark.parametrize(

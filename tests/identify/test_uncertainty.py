@@ -103,7 +103,7 @@ def test_without_variances_the_misfit_tells(small):
 def test_errors_with_the_poles_of_the_system_are_weighted_without_variances(small):
     """Those of process noise: nearly as accurate as with their variances, and regions hold."""
     model, htf = small
-    true, runs = model.multipliers, 60
+    true, runs = model.multipliers, 25
     chi = np.polyval(np.poly(true).real[::-1], np.exp(-2j * np.pi * htf.f))
     by_line = (1e-3 + 1e-2 / np.abs(chi) ** 2)[:, None, None]
     variance = np.broadcast_to(by_line, htf.H.shape)
@@ -115,7 +115,7 @@ def test_errors_with_the_poles_of_the_system_are_weighted_without_variances(smal
         held += blind.contains(true).all()
         square += [fit.compare(true).error[0] ** 2 for fit in (told, blind)]
     assert covered(held, runs)
-    assert square[1] < 1.05 * square[0]
+    assert square[1] < 1.1 * square[0]
 
 
 def test_the_spectrum_of_errors_is_found(small):
@@ -129,10 +129,10 @@ def test_the_spectrum_of_errors_is_found(small):
     supposed = np.broadcast_to(supposed, htf.H.shape)
     variance = np.broadcast_to(true[..., None], htf.H.shape)
     found = []
-    for seed in range(100):
+    for seed in range(50):
         groups = group_htf(noisy(htf, variance, np.random.default_rng(seed)), supposed, 13)
         found.append(error_spectrum(groups, c, f, 2))
-    np.testing.assert_allclose(np.mean(found, axis=0), true, rtol=0.04)
+    np.testing.assert_allclose(np.mean(found, axis=0), true, rtol=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
     """Against the roots of coefficients drawn at random."""
     estimate, rng = pair_and_real
     true, c = estimate.multipliers, estimate.coefficients
-    draws = rng.multivariate_normal(c, estimate.covariance, size=4000)
+    draws = rng.multivariate_normal(c, estimate.covariance, size=2000)
     roots = np.array([np.roots([1, *draw]) for draw in draws])
     pick = np.argmin(np.abs(roots[:, :, None] - true), axis=1)
     roots = np.take_along_axis(roots, pick, axis=1)
@@ -170,7 +170,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
     held = [
         MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true) for draw in draws
     ]
-    assert np.all([covered(n, 4000) for n in np.sum(held, axis=0)])
+    assert np.all([covered(n, 2000) for n in np.sum(held, axis=0)])
 
 
 def test_bad_requests(pair_and_real, small, variance):

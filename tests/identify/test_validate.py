@@ -18,14 +18,14 @@ def small():
 def test_the_true_model_leaves_white_noise(small):
     """Both p-values are uniformly distributed, though starts are unknown and samples missing."""
     p = []
-    for seed in range(60):
+    for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
-    for test in np.reshape(p, (60, 2, 2)).transpose(1, 2, 0).reshape(4, 60):
+    for test in np.reshape(p, (30, 2, 2)).transpose(1, 2, 0).reshape(4, 30):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
-    assert covered(int((np.array(p) > 0.05).sum()), 240)
+    assert covered(int((np.array(p) > 0.05).sum()), 120)
 
 
 def test_the_fit_is_the_share_explained(small):
@@ -75,19 +75,6 @@ def test_process_noise_is_correlated_in_time_only(small):
     assert not found.white and found.whiteness.max() < 1e-6
 
 
-def test_identified_beside_held_out_data(hopper):
-    """A model identified from one record explains another, but for the noise."""
-    train, test = record(hopper, 32 * 250, 0), record(hopper, 32 * 80, 1)
-    noisy = [
-        hj.Record(r.u, r.y + 0.01 * r.y.std(axis=0) * np.random.default_rng(k).normal(
-            size=r.y.shape), n_sections=32, outputs=("yM", "vM"))
-        for k, r in enumerate((train, test))
-    ]  # fmt: skip
-    model = hj.identify.realize(hj.fit_series(noisy[0], 2), order=2)
-    found = hj.validate(model, noisy[1])
-    np.testing.assert_allclose(found.fit, 99.0, atol=0.4)
-
-
 @pytest.mark.parametrize("start", ["free", "cycle"])
 def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     """Neither residuals nor p-values of the true model change, however large the drift is."""
@@ -131,10 +118,10 @@ def test_amplitudes(small):
         hj.identify.amplitude_sweep(run, small, u, [0.0, 1.0])
 
 
-def test_bad_requests(small, hopper):
+def test_bad_requests(small):
     data = record(small, 4 * 50)
-    with pytest.raises(hj.DefinitionError, match="different n_sections: 32 and 4"):
-        hj.validate(hopper, data)
+    with pytest.raises(hj.DefinitionError, match="different n_sections: 6 and 4"):
+        hj.validate(hj.testing.synthetic_ldtp(), data)
     with pytest.raises(hj.DefinitionError, match="sampled 5 times only"):
         hj.validate(small, record(small, 20))
     with pytest.raises(hj.DefinitionError, match="`level` must be a number between 0 and 1"):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.beats.estimation import WAVES, fit_curve
-from hybridjax.recordings.beats.model import basis, forecast, intervals_of, tabulated
+from hybridjax.recordings.beats.model import forecast, intervals_of, tabulated
 
 from .mishaps import mishandle, misjudged
 
@@ -28,7 +27,9 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def found(noisy):
-    return hj.recordings.phase_response(noisy, BEAT, input="u")
+    """With one event in ten missed."""
+    lost = mishandle(noisy, misjudged(lost=0.1), input="u", outputs=(), event="beat", seed=1)
+    return hj.recordings.phase_response(lost, BEAT, input="u")
 
 
 def test_a_rhythm_without_noise_is_found_exactly():
@@ -38,11 +39,11 @@ def test_a_rhythm_without_noise_is_found_exactly():
     assert exact.r2 > 0.9999 and exact.result == 0 and exact.miscounted == 0
 
 
-def test_the_band_holds_the_curve_and_forecasts_gain_from_it(noisy, found):
+def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     low, high = found.interval(X, 0.99)
     assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
     assert 3 < found.detail < 10 and abs(found.jitter - 0.05) < 0.01 and found.p_flat < 1e-3
-    assert rms(found.values - CURVE) < 0.1 and rms(found.plain - CURVE) < 0.1  # (little jitter)
+    assert rms(found.values - CURVE) < 0.12 and rms(found.plain - CURVE) < 0.12
     assert found.left_out_flat + 0.01 < found.left_out < found.r2
     assert "Shape: it adds" in repr(found)
     page = found._repr_html_()
@@ -72,14 +73,6 @@ def test_slopes_are_derivatives(noisy):
         np.testing.assert_allclose(base.by_curve[:, k], difference, atol=0.02 * 0.1)
     moved = forecast(intervals, table, a, rates + 1e-5)
     np.testing.assert_allclose(base.by_rate, (moved.duration - base.duration) / 1e-5, atol=5e-4)
-
-
-def test_missed_events_do_not_count(noisy):
-    lost = mishandle(noisy, misjudged(lost=0.1), input="u", outputs=(), event="beat", seed=1)
-    phase = hj.recordings.estimate_phase(lost, BEAT)
-    fit = fit_curve(intervals_of(lost, phase, "u"), WAVES)
-    assert rms(basis(X, WAVES) @ fit.coefficients - CURVE) < 0.1
-    assert phase.missed + (~fit.used).sum() > 20
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():

@@ -243,31 +243,6 @@ def test_c3d(tmp_path):
     refused("no C3D file, or damaged", path)
 
 
-def test_c3d_without_analogs(tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
-    file = ezc3d.c3d()
-    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
-    file["parameters"]["POINT"]["LABELS"]["value"] = ("LASI",)
-    file["data"]["points"] = np.ones((4, 1, len(SLOW)))
-    file.write(str(tmp_path / "walk.c3d"))
-    assert hj.read_recording(tmp_path / "walk.c3d").signals == ("LASI.x", "LASI.y", "LASI.z")
-    says = "no signal 'Fz1'; it has LASI.x, LASI.y, LASI.z"
-    refused(says, tmp_path / "walk.c3d", signals="Fz1", kind=hj.DefinitionError)
-
-
-def test_units_that_are_not_numbers(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "x.h5", "w") as file:
-        file["time"], file["x"] = SLOW, X
-        file["x"].attrs["units"] = np.nan
-    refused("the unit of 'x' is nan, which is no text", tmp_path / "x.h5")
-    for header, says in (("time (s),x (NaN)", "the unit of 'x' is nan"),
-                         ("time (nan),x", "times in 'time .nan.' are in 'nan'")):  # fmt: skip
-        path = tmp_path / "x.csv"
-        path.write_text(f"{header}\n0,1\n1,2\n")
-        refused(says, path, kind=hj.HybridJaxError)
-
-
 def test_events_outside_of_the_recording(tmp_path):
     path = tmp_path / "walk.c3d"
     write_c3d(path, first=10)
@@ -352,19 +327,6 @@ def test_bags(tmp_path, version):
     else:
         path.write_bytes(path.read_bytes()[:500])
         refused("no bag of ROS, or damaged", path)
-
-
-def test_a_bag_without_messages_of_ros(tmp_path):
-    mcap = pytest.importorskip("mcap.writer")
-    path = tmp_path / "x.mcap"
-    with open(path, "wb") as file:
-        writer = mcap.Writer(file)
-        writer.start()
-        schema = writer.register_schema("sample", "jsonschema", b"{}")
-        channel = writer.register_channel("/x", "json", schema)
-        writer.add_message(channel, 1, b'{"x": 1}', 1)
-        writer.finish()
-    refused("no bag of ROS, or damaged", path)
 
 
 # All of them

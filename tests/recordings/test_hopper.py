@@ -36,15 +36,6 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert not any(w.cause == "outputs" for w in hj.recordings.advise(data[1], fits[1]).warnings)
 
 
-def test_dirt(hopper_recording, hopper_cycle, angle):
-    dirty = spoil(hopper_recording, noise=1e-4, quantum=1e-5, missing=0.01, gap=(80.3, 90.7))
-    data = hj.recordings.section_data(dirty, angle, inputs="u", outputs=("yM", "vM"), n_sections=16)
-    fit = hj.fit_series(data.records, order=2)
-    assert len(data.records) == 2
-    assert fit.compare(hopper_cycle.multipliers).max_error < 3e-3
-    assert fit.contains(hopper_cycle.multipliers, 0.999).all()
-
-
 def test_slow_change_of_the_period(hopper_recording, hopper_cycle, angle):
     """Everything goes slower and slower: multipliers stay what they are, and phase says by how
     much."""
@@ -96,12 +87,7 @@ def test_compass_gait_by_events():
     noisy = spoil(made, outputs, noise=1e-4)
     marked = noisy.mark("middle", hj.Crossing("s", "falling"), bandwidth=20 / period)
     data = hj.recordings.section_data(
-        marked,
-        hj.AtEvent("middle"),
-        inputs="u",
-        outputs=outputs,
-        n_sections=16,
-        timing="duration",
+        marked, hj.AtEvent("middle"), inputs="u", outputs=outputs, n_sections=16, timing="duration"
     )
     fit = hj.fit_series(data.records, order=2, overhang=32)
     assert fit.compare(cycle.multipliers[:2]).max_error < 1e-2

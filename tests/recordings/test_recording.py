@@ -50,13 +50,6 @@ def test_trials_must_belong_together():
         hj.Recording.join([])
 
 
-def test_tables_with_columns():
-    one = hj.Recording.from_frame({"time": T, "a": T})
-    assert one.signals == ("a",)
-    with pytest.raises(hj.DefinitionError, match="no column 't'; its columns are time, a"):
-        hj.Recording.from_frame({"time": T, "a": T}, time="t")
-
-
 def test_pandas_and_parquet(tmp_path):
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"time": T, "a": T, "event e": [0, 1, 0, 0, 1]})
@@ -217,16 +210,6 @@ def test_the_unit_of_time(tmp_path):
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
     with pytest.raises(hj.DefinitionError, match="are in 'samples', which is no known unit"):
         hj.read_recording(tmp_path / "y.csv")
-
-
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-@pytest.mark.parametrize("missing", ["nan", "NA", ""])
-def test_ends_of_lines(tmp_path, end, missing):
-    lines = ["\ufefftime,a", f"0,{missing}", "1,+2.5e-3", "2, 3", "", ""]
-    (tmp_path / "x.csv").write_text(end.join(lines), encoding="utf-8", newline="")
-    found = hj.read_recording(tmp_path / "x.csv").trials[0]
-    np.testing.assert_array_equal(found.time, [0, 1, 2])
-    np.testing.assert_array_equal(found.values[:, 0], [np.nan, 2.5e-3, 3])
 
 
 @pytest.mark.parametrize(

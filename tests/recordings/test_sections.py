@@ -11,6 +11,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
+from hybridjax.identify.series.fit import fit_records
+from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
 from .mishaps import mishandle, misjudged
@@ -136,7 +138,7 @@ def test_slow_drift_is_taken_out(wave):
     recording = hj.Recording(t, drifting)
     assert sample(recording).rms()[1][0] > 0.1
     rough = hj.recordings.estimate_phase(recording, CIRCLE)
-    flat = hj.recordings.without_drift(recording, rough, ("f", "x", "v"), 4)
+    flat = without_drift(recording, rough, ("f", "x", "v"), 4)
     assert sample(flat).rms()[1][0] < 0.02
     assert sample(flat).records[0].drift == np.inf
     assert sample(flat).with_drift(9).records[0].drift == 9
@@ -145,7 +147,7 @@ def test_slow_drift_is_taken_out(wave):
         (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.recordings.without_drift(wave, phase, "x", cycles)
+            without_drift(wave, phase, "x", cycles)
 
 
 def test_times_of_crossings(wave):
@@ -154,20 +156,11 @@ def test_times_of_crossings(wave):
     assert sample(wave, timing="duration").outputs[2] == "duration"
 
 
-def test_the_number_of_sections(wave):
-    """Of the family, or of the call; it need not be said twice, but may."""
-    phase = hj.recordings.estimate_phase(wave, CIRCLE)
-    assert sample(wave, phase).n_sections == sample(wave, phase, n_sections=8).n_sections == 8
-    top = hj.Crossing("v", "falling")
-    assert sample(wave, top).n_sections == 32
-    assert sample(wave, top, n_sections=4).n_sections == 4
-
-
 def test_bad_arguments(wave):
     for options, message in [
         ({"inputs": "g"}, "no signal 'g'"),
         ({"n_sections": 16}, "n_sections is 16, but the phase is that of a family of 8"),
-        ({"n_sections": 0, "phase": lambda t, s: 2 * np.pi * t}, "`n_sections` must be an integer"),
+        ({"n_sections": 0}, "`n_sections` must be an integer"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
             sample(wave, **options)
@@ -248,21 +241,14 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 def test_the_command_says_what_has_not_converged(files, tmp_path, monkeypatch, capsys):
-    short = functools.partial(hj.fit_series, max_steps=1)
-    monkeypatch.setattr("hybridjax.recordings.identification.fit_series", short)
+    short = functools.partial(fit_records, max_steps=1)
+    monkeypatch.setattr("hybridjax.recordings.identification.fit_records", short)
     assert identify(files, tmp_path / "out", "--order", "2") == 1
     assert "a fit did not converge" in capsys.readouterr().err
     page = (tmp_path / "out" / "report.html").read_text()
     assert "<code>order</code>" in page and "`" not in page
-
-
-def test_the_command_from_crossing_to_crossing(files, tmp_path):
-    options = ["--input", "force", "--outputs", "x,v", "--sections", "16", "--order", "1"]
-    trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
-    main(["identify", *trials, *options, "--crossing", "v:falling", "--out", str(tmp_path / "out")])
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert abs(summary["multipliers"][0][0] - MULTIPLIER) < 2e-2
 
 
 @pytest.mark.parametrize("text", ["x:up", "x:rising:high", "x:rising:0:1"])
@@ -278,7 +264,6 @@ def test_the_command_says_how_crossings_are_written(files, tmp_path, text, capsy
     [
         (["--outputs", "x,q"], "no signal 'q'"),
         (["--time", "t"], "no column 't'"),
-        (["--sections", "200"], "are too few"),
     ],
 )
 def test_the_command_writes_nothing_half(files, tmp_path, more, message):
@@ -305,16 +290,9 @@ def test_a_trial_without_a_signal(wave):
         hidden[4:, column] = np.nan
         one = hj.Recording(t, dict(zip("fxv", hidden.T, strict=True)), name="second")
         both = hj.Recording.join([wave, one])
-        phase = hj.recordings.estimate_phase(both, lambda t, signals: 2 * np.pi * t)
+        clock = [eqx.tree_at(lambda t: t.events, t, {"s": np.arange(21.0)}) for t in both.trials]
         with pytest.raises(hj.DefinitionError, match=f"trial 'second' has 4 samples of {name}"):
-            sample(both, phase)
-
-
-def test_constant_input(wave):
-    t, values = wave.trials[0].time, wave.trials[0].values
-    still = hj.Recording(t, {"f": 0 * t + 3, "x": values[:, 1], "v": values[:, 2]})
-    with pytest.raises(hj.DefinitionError, match="input f is constant"):
-        sample(still)
+            sample(both.with_trials(clock), hj.AtEvent("s"))
 
 
 def test_signals_with_clocks_of_their_own(rhythm):

@@ -93,15 +93,6 @@ def test_an_interruption_leaves_whole_pieces(tmp_path):
     np.testing.assert_array_equal(found.value, [rng.normal() for rng in expected])
 
 
-def test_stores_may_have_addresses(tmp_path):
-    local = f"file://{tmp_path}/draws.zarr"
-    first, again = (hj.monte_carlo(np.random.Generator.normal, 4, store=local) for _ in range(2))
-    assert first.load().identical(again.load()) and (tmp_path / "draws.zarr").is_dir()
-    for _ in range(2):
-        other = hj.monte_carlo(np.random.Generator.normal, 4, store="memory://draws/a.zarr")
-        assert other.load().identical(first)
-
-
 def test_draws_must_stay_alike():
     with pytest.raises(hj.DefinitionError, match="the same names and shapes, .* draw 1 "):
         hj.monte_carlo(lambda rng: np.ones(rng.integers(1, 1000)), 5)

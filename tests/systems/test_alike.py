@@ -8,9 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.executor import to_host
-from hybridjax.engine import kernels
 from hybridjax.engine.chain import chain
-from hybridjax.models.balls import ChainContact as Contact
 from hybridjax.systems.structure import Structure
 
 from ..conftest import unchecked_host
@@ -126,25 +124,3 @@ def test_times_of_events_are_exact():
     first = {e.name: e.time for e in reversed(run(Circle()).events)}
     for i, level in enumerate(Circle().levels):
         assert first[f"{i} falling"] == pytest.approx(np.arccos(level) - np.arccos(0.9), abs=1e-11)
-
-
-def test_contacts_are_traced_once(monkeypatch):
-    traced, table = [], Contact.table
-
-    def counting(self, t):
-        traced.append(self.i)
-        return table(self, t)
-
-    monkeypatch.setattr(Contact, "table", counting)
-
-    def count(n):
-        structure = Structure(hj.models.BouncingChain(n=n))
-        assert len(structure.kinds) == 1
-        traced.clear()  # each contact was looked at by itself
-        for g in range(n):
-            point = np.zeros(1), np.ones((2 * n, 1)), np.zeros((1, 1))
-            kernels.reset(structure, structure.member(g), *point)
-            kernels.watched(structure, 0, None, *point, np.zeros(1, np.int32))
-        return len(traced)
-
-    assert count(5) == count(2) > 0

@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -48,29 +47,3 @@ def test_a_network_and_a_scan():
     there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     np.testing.assert_allclose(there[0], start[0], rtol=1e-10)
     np.testing.assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)
-
-
-class Bound(hj.HybridSystem):
-    """Two masses, one of which is nothing once x is above 1/2."""
-
-    def charts(self):
-        def field(t, q, u):
-            M = jnp.diag(jnp.stack([1.0 + 0.0 * q[0], jnp.where(q[0] > 0.5, 0.0, 1.0)]))
-            return jnp.linalg.solve(M, jnp.stack([0.2 * jnp.sin(t) - q[0] + u[0], -q[1]]))
-
-        return {"a": Field(("x", "y"), field)}
-
-    def period(self):
-        return 2 * np.pi
-
-
-@pytest.mark.slow
-def test_a_mass_matrix_that_becomes_singular_ends_its_own_experiment():
-    cycle = hj.find_limit_cycle(Bound(), hj.Guess("a", (-0.5, 0.0)))
-    u = np.zeros((3, 16, 1))
-    u[1] = 3.0
-    data = hj.run_experiments(cycle, hj.ClockPhase(8), u, outputs="x", discard=0)
-    bad, ok = hj.Result.FIELD_NOT_FINITE, hj.Result.OK
-    np.testing.assert_array_equal(data.result, [ok, bad, ok])
-    assert "#1" in data.summary() and "mass matrix" in data.summary()
-    assert np.isfinite(data.y[[0, 2]]).all()

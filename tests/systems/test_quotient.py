@@ -6,7 +6,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.models.walkers import SimplestStep as Step, _heelstrike
-from hybridjax.systems.structure import Structure
 
 
 hj.enable_x64()
@@ -114,19 +113,3 @@ def test_a_step_modulo_the_symmetry_and_a_stride():
 def test_what_is_no_symmetry_is_refused(system, symmetry, message):
     with pytest.raises(hj.DefinitionError, match=message):
         hj.find_limit_cycle(hj.Quotient(system, **symmetry))
-
-
-class Stiff(Stands):
-    solver = hj.Radau(3)
-
-
-class Stiffly(Full):
-    def charts(self):
-        model = hj.models.SimplestWalker()
-        return {f"{name} stands": Stiff(model, leg) for leg, name in enumerate(("left", "right"))}
-
-
-@pytest.mark.parametrize("system", [Full(solver={"left stands": hj.Radau(3)}), Stiffly()])
-def test_solvers_stay(system):
-    walker = hj.Quotient(system, **MIRROR, translation=("x",))
-    assert Structure(walker).method(0).name == "Radau(3)"

@@ -10,6 +10,7 @@ import hybridjax as hj
 hj.enable_x64()
 
 
+@pytest.mark.slow
 def test_a_block_on_a_belt_sticks_and_slips():
     """It leaves the belt where the spring is as strong as friction; slipping by DOP853."""
     F, belt, decay = 1.0, 0.2, 3.0

@@ -13,7 +13,7 @@ from hybridjax.systems.check import check_system
 from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import own_fields
 
-from ..toys import Field, Switched, TwoInputs
+from ..toys import Field, Switched
 
 
 ROOM = {
@@ -124,39 +124,6 @@ def test_what_is_wrong_is_said(system, message):
         check_system(system)
 
 
-def test_an_input_that_the_system_does_not_have():
-    class Bad(hj.Chart):
-        states = ("x",)
-        inputs = ("up",)
-
-        def field(self, t, q, u):
-            return u
-
-    with pytest.raises(hj.DefinitionError, match="chart 'a' uses input 'up'"):
-        check_system(Anything({"a": Bad()}))
-
-
-def test_directions_have_two_names():
-    with pytest.raises(
-        hj.DefinitionError, match="`direction` must be 'falling' or 'rising', not 'down'"
-    ):
-        hj.Transition("go", "a", "b", lambda t, q, u: q[0], "down")
-    with pytest.raises(hj.DefinitionError, match="direction.*down"):
-        hj.Crossing("x", "down")
-
-
-@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, np.inf])
-def test_a_schedule_needs_a_positive_period(period):
-    with pytest.raises(hj.DefinitionError, match="`period` must be a positive number"):
-        hj.Scheduled(period)
-
-
-def test_charts_see_their_own_inputs():
-    s = Structure(TwoInputs())
-    t, q, u = jnp.zeros(()), jnp.zeros(1), jnp.array([2.0, 3.0])
-    assert [float(s.field(a, t, q, u)[0]) for a in range(3)] == [32.0, 3.0, 0.5]
-
-
 def test_a_guard_falls_at_its_event():
     rising = Structure(replaced(direction="rising"))
     assert rising.guard(0, 0.0, jnp.array([2.0, 0.0]), jnp.zeros(1)) == -2.0
@@ -175,11 +142,3 @@ def test_outputs_by_name_by_function_and_by_chart():
         z.require(1)
     with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are 'x', 'v'"):
         s.resolve_outputs("y")
-
-
-def test_states_that_a_chart_does_not_carry_have_values_there():
-    s = Structure(hj.models.VerticalHopper())
-    stance = s.chart_index("stance")
-    z = s.resolve_outputs(("yM", "ym"))
-    np.testing.assert_array_equal(z(stance, 0.0, jnp.array([2.0, 1.0]), jnp.zeros(1)), [2.0, 0.0])
-    assert s.state_names() == ("yM", "vM", "ym", "vm")

@@ -1,12 +1,9 @@
 """Units: declared with charts, systems, outputs, recordings, they arrive at figures and files."""
 
-import json
 import pickle
 
-import jax
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 import hybridjax as hj
 from hybridjax._core.signal import Signal, ratio, unit_of
@@ -56,59 +53,10 @@ def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
         assert units(loaded.outputs) == ["m", "m/s"] and units(loaded.inputs) == ["N"]
 
 
-def test_files_without_units_can_be_read(tmp_path):
-    hj.save(tmp_path / "new.npz", small_htf(outputs={"y": "m"}))
-    with np.load(tmp_path / "new.npz") as file:
-        arrays = dict(file)
-    header = json.loads(arrays.pop("header").item())
-    assert header.pop("units") == {"y": "m"}
-    np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
-    assert hj.load(tmp_path / "old.npz").outputs == ("y",)
-    header["units"] = ["m"]
-    np.savez(tmp_path / "bad.npz", header=np.array(json.dumps(header)), **arrays)
-    with pytest.raises(hj.errors.FileFormatError, match="damaged"):
-        hj.load(tmp_path / "bad.npz")
-
-
-def test_a_jitted_function_does_not_mix_units_up(kinematic_ldtp):
-    parts = [getattr(kinematic_ldtp, name) for name in ("A", "B", "C", "D", "dims")]
-    look = jax.jit(lambda ldtp: ldtp.htf(np.array([0.1])))
-    for unit in ("m", "mm"):
-        htf = look(hj.LDTP(*parts, inputs="u", outputs={"y": unit, "v": ""}))
-        assert units(htf.outputs) == [unit, ""]
-
-
 def test_what_has_other_units_is_not_compared():
     with pytest.raises(hj.DefinitionError, match=r"\('y' \(m\),\) and \('y' \(mm\),\)"):
         small_htf(outputs={"y": "m"}).error(small_htf(outputs={"y": "mm"}))
     assert small_htf(outputs={"y": "m"}).error(small_htf(outputs="y")) == 0
-
-
-def test_units_of_a_recording_arrive_in_its_figures():
-    t = np.arange(0, 20, 0.01)
-    signals = {"x": np.cos(6.3 * t), "v": -np.sin(6.3 * t), "F": np.cos(15 * t)}
-    recording = hj.Recording(t, signals, units={"x": "m", "F": "N"})
-    phase = hj.KinematicPhase(8, position="x", velocity="v")
-    data = hj.recordings.section_data(recording, phase, inputs="F", outputs=("x", "v"))
-    assert data.units == ("N", "m", "") and units(data.records[0].outputs) == ["m", ""]
-    axes = hj.plot.section_data(data).axes
-    labels = [ax.get_ylabel() for ax in axes.ravel()]
-    assert labels[:4] == ["F (N)", r"$\delta$ F (N)", "power (N²)", "x (m)"] and labels[6] == "v"
-    pyplot.close("all")
-
-
-def test_axes_say_units(hopper_cycle, placed_kinematic, kinematic_ldtp):
-    def of(plot):
-        return plot.ax.get_xlabel(), plot.ax.get_ylabel()
-
-    assert of(hj.plot.cycle(hopper_cycle)) == ("yM (m)", "vM (m/s)")
-    htf = kinematic_ldtp.htf(np.linspace(0.1, 2, 20), (0, 1))
-    assert of(hj.plot.magnitude(htf, harmonics=(0,)))[1] == "$|H_m|$, yM (m/N)"
-    assert of(hj.plot.bode(htf, outputs="yM"))[1] == "$|H_{0}|$ (m/N)"
-    both = hj.plot.bode(htf).ax
-    texts = [text.get_text() for text in both.get_legend().get_texts()]
-    assert texts == ["yM (m/N)", "vM ((m/s)/N)", "exact"] and both.get_ylabel() == "$|H_{0}|$"
-    pyplot.close("all")
 
 
 class Chart(hj.Chart):

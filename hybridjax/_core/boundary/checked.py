@@ -69,7 +69,8 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
 
     **Raises:** `DefinitionError`.
     """
-    fields = _fields.recall(cls, None, lambda: _Fields(cls.__init__, cls))
+    constructor = cls.__init__  # type: ignore[misc]
+    fields = _fields.recall(cls, None, lambda: _Fields(constructor, cls))
     try:
         fields.take((None, *args), dict(kwargs))
     except Misfit as misfit:

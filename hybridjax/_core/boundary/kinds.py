@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
-from jax.typing import ArrayLike
 
 from .. import limits
 from ..arguments import Numbers
@@ -51,9 +50,9 @@ Index = Annotated[int, Whole(0, limits.COUNT)]
 """Also numbers that may be zero: samples to discard, lags of a lead."""
 SectionCount = Annotated[int, Whole(1, limits.SECTIONS)]
 PeriodCount = Annotated[int, Whole(1, limits.PERIODS)]
-ExperimentCount = Annotated[int, Whole(1, limits.EXPERIMENTS)]
+ExperimentCount = Annotated[int, Whole(1, limits.PERIODS)]
 Order = Annotated[int, Whole(1, limits.ORDER)]
-StepCount = Annotated[int, Whole(1, limits.STEPS)]
+StepCount = Annotated[int, Whole(1, limits.COUNT)]
 WorkerCount = Annotated[int, Whole(1, limits.WORKERS)]
 Seed = Annotated[int, Whole(0)]
 
@@ -65,13 +64,13 @@ Share = Annotated[float, Number("a number above 0, at most 1", above=0, high=1)]
 Fraction = Annotated[float, Number("a number from 0 to 1", low=0, high=1)]
 
 # The same, where one has an array of JAX at hand as often as a `float`.
-Duration = Annotated[ArrayLike, Number("a positive number", above=0)]
-Wait = Annotated[ArrayLike, Number("a number that is not negative", low=0)]
+Duration = Annotated[Numbers, Number("a positive number", above=0)]
+Wait = Annotated[Numbers, Number("a number that is not negative", low=0)]
 
 # Numbers that JAX may trace.
-Scalar = Annotated[ArrayLike, Reals("")]
-PositiveScalar = Annotated[ArrayLike, Reals("", sign="positive")]
-NonNegativeScalar = Annotated[ArrayLike, Reals("", sign="nonnegative")]
+Scalar = Annotated[Numbers, Reals("")]
+PositiveScalar = Annotated[Numbers, Reals("", sign="positive")]
+NonNegativeScalar = Annotated[Numbers, Reals("", sign="nonnegative")]
 Vector = Annotated[Numbers, Reals("n")]
 
 # Words.
@@ -94,7 +93,7 @@ _PLAIN = {
     type(None): Nothing(),
     typing.SupportsIndex: Whole(),
 }
-_SEQUENCES = {
+_SEQUENCES: dict[Any, dict[str, Any]] = {
     list: {"form": list},
     collections.abc.Sequence: {},
     collections.abc.Iterable: {"iterable": True},
@@ -170,5 +169,5 @@ def _array(hint: Any) -> Kind:
     kind = next((kind for dtype, kind in _ARRAYS.items() if dtype in hint.dtypes), None)
     if kind is None:
         return Instance(hint)
-    form = {np.ndarray: np.asarray, jax.Array: jnp.asarray}.get(hint.array_type)
-    return kind(hint.dim_str, missing=True, infinite=True, form=form)
+    forms: dict[Any, collections.abc.Callable] = {np.ndarray: np.asarray, jax.Array: jnp.asarray}
+    return kind(hint.dim_str, missing=True, infinite=True, form=forms.get(hint.array_type))

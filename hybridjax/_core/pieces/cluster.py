@@ -107,7 +107,8 @@ def _check_packages(client: Client) -> None:
         f"if {find}(x)}})[1]"
     )
     mine = {x: importlib.import_module(x).__version__ for x in _PACKAGES}
-    for worker, theirs in client.run(eval, expression, on_error="ignore").items():
+    versions: Any = client.run(eval, expression, on_error="ignore")
+    for worker, theirs in versions.items():
         for name, version in mine.items():
             if theirs.get(name) != version:
                 has = f"has {name} {theirs[name]}" if name in theirs else f"lacks {name}"

@@ -1,4 +1,4 @@
-"""Whether a store holds what is asked for; and how what users wrote is described there."""
+"""Descriptions of stored results, and digests of arrays, functions and objects in them."""
 
 import dataclasses
 import dis
@@ -9,32 +9,33 @@ import inspect
 import itertools
 import json
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ... import __version__
 
 
 def versions() -> dict[str, str]:
-    """Of the packages on which numbers depend to the last bit."""
-    others = ("jax", "jaxlib", "numpy", "scipy")
-    return {"hybridjax": __version__} | {x: importlib.metadata.version(x) for x in others}
+    """Return the versions of the packages on which numbers depend to the last bit."""
+    names = ("jax", "jaxlib", "numpy", "scipy")
+    return {"hybridjax": __version__} | {x: importlib.metadata.version(x) for x in names}
 
 
 def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
-    """The first difference between two descriptions in words; None if they are the same."""
+    """Return the first difference between two descriptions in words, None if they are the same."""
     if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
         for key in [*theirs, *(x for x in mine if x not in theirs)]:
             inside = f"{name}.{key}" if name else key
             if key not in mine or key not in theirs:
                 return f"`{inside}` is {'only there' if key in theirs else 'not there'}"
-            found = difference(mine[key], theirs[key], inside)
-            if found is not None:
-                return found
+            change = difference(mine[key], theirs[key], inside)
+            if change is not None:
+                return change
         return None
     if mine == theirs:
         return None
@@ -44,46 +45,42 @@ def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
 
 
 def array_digest(x: Any) -> str:
-    """A digest of an array with its numbers."""
+    """Return a digest of the numbers, the type and the shape of an array."""
     array = np.ascontiguousarray(x)
-    found = hashlib.sha256(f"{array.dtype}{array.shape}".encode())
-    found.update(array.tobytes())
-    return _DIGEST + found.hexdigest()[:32]
+    digest = hashlib.sha256(f"{array.dtype}{array.shape}".encode())
+    digest.update(array.tobytes())
+    return _DIGEST + digest.hexdigest()[:32]
 
 
 def digest_of(*words: str) -> str:
-    """A digest of texts."""
+    """Return a digest of texts."""
     return _DIGEST + hashlib.sha256(json.dumps(words).encode()).hexdigest()[:32]
 
 
-def function_digest(function: Callable) -> str:
-    """A digest of what a function does, as far as these show it: its code, its defaults, what it
-    holds (in variables around it, as a `functools.partial`, or as an object that can be called),
-    and the constants and functions of its module that it uses.
+def function_digest(function: Any) -> str:
+    """Return a digest of a function: its code, its defaults, the values that it holds (in variables
+    around it, as a `functools.partial`, or as a callable object), and the constants and functions
+    of its module that it uses. Also of a definition (a section family, an output) with the values
+    and functions in its fields.
 
-    Numbers, words, arrays, containers, dataclasses, functions and objects that can be called are
-    looked into. Of all else, of classes and what other modules define, the name stands for all.
-    Lists and dictionaries that a module holds are left out: programs change them as they go.
+    Numbers, strings, arrays, containers, dataclasses, functions and callable objects are described
+    in full; classes, and objects that other modules define, by their names. Lists and dictionaries
+    of a module are left out, as programs change them.
     """
     return digest_of(*_Describer().words(function))
 
 
-def definition_digest(x: Any) -> str:
-    """A digest of a definition, as families of sections and outputs are: of all that its fields
-    hold, and as above of the functions among it."""
-    return digest_of(*_Describer().words(x))
-
-
 _DIGEST = "sha256:"
-# Functions and objects within others that are looked at.
+# Functions and objects within others are described to this depth. Less: changes in deep helpers are
+# not detected. More: recursive functions take longer.
 _DEPTH = 8
 
 
 class _Describer:
-    """Says what objects are in words that are the same in every process."""
+    """Describes objects in words that are the same in every process."""
 
     def __init__(self):
-        self._known: dict[tuple[int, int], tuple[Any, str]] = {}
+        self._digests: dict[tuple[int, int], tuple[Any, str]] = {}
 
     def words(self, x: Any, depth: int = 0) -> list[str]:
         if x is None or isinstance(x, bool | int | float | complex | str | bytes):
@@ -94,7 +91,7 @@ class _Describer:
             items = x if isinstance(x, tuple | list) else sorted(x, key=repr)
             return [type(x).__name__, str(len(x)), *self._all(items, depth)]
         if hasattr(x, "__array__"):
-            if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
                 x = jax.random.key_data(x)
             array = np.asarray(x)
             # (The bytes of an array of objects are their places in memory.)
@@ -105,16 +102,16 @@ class _Describer:
         # (Functions that call each other are met again and again. An object that is held keeps its
         # number.)
         key = id(x), depth
-        if key not in self._known:
-            self._known[key] = x, digest_of(*self._all(_parts(x), depth + 1))
-        return [*name, self._known[key][1]]
+        if key not in self._digests:
+            self._digests[key] = x, digest_of(*self._all(_parts(x), depth + 1))
+        return [*name, self._digests[key][1]]
 
     def _all(self, items: Iterable[Any], depth: int) -> list[str]:
         return [word for x in items for word in self.words(x, depth)]
 
 
 def _parts(x: Any) -> Iterable[Any]:
-    """What an object is made of that says what it does."""
+    """Return the parts of an object on which its behavior depends."""
     if isinstance(x, types.FunctionType):
         variables = map(_contents, x.__closure__ or ())
         return x.__code__, *variables, x.__defaults__, x.__kwdefaults__, *_used_globals(x)
@@ -132,7 +129,7 @@ def _parts(x: Any) -> Iterable[Any]:
 
 
 def _used_globals(function: types.FunctionType) -> Iterable[tuple[str, Any]]:
-    """Constants and functions of its module that a function uses, with their names."""
+    """Yield the constants and functions of its module that a function uses, with their names."""
     module = function.__module__
     if function.__globals__.get("__name__", module) != module:  # a wrapper of another module
         return
@@ -147,7 +144,7 @@ def _used_globals(function: types.FunctionType) -> Iterable[tuple[str, Any]]:
 
 
 def _global_names(code: types.CodeType) -> set[str]:
-    """Also those in functions inside of it."""
+    """Return the global names in a function and in functions inside of it."""
     names = {x.argval for x in dis.get_instructions(code) if x.opname == "LOAD_GLOBAL"}
     inside = (_global_names(x) for x in code.co_consts if isinstance(x, types.CodeType))
     return names.union(*inside)
@@ -157,7 +154,7 @@ def _is_constant(x: Any) -> bool:
     if isinstance(x, tuple):
         return all(map(_is_constant, x))
     if dataclasses.is_dataclass(x) and not isinstance(x, type | eqx.Module):
-        return x.__dataclass_params__.frozen
+        return getattr(x, "__dataclass_params__").frozen  # noqa: B009
     plain = bool, int, float, complex, str, bytes, np.ndarray, np.generic, jax.Array, eqx.Module
     return isinstance(x, plain)
 
@@ -170,12 +167,12 @@ def _contents(cell: types.CellType) -> Any:
 
 
 def _held(x: Any) -> Iterable[tuple[str, Any]]:
-    """The attributes of an object, with their names."""
+    """Return the attributes of an object with their names."""
     if dataclasses.is_dataclass(x):
         names = [f.name for f in dataclasses.fields(x)]
     else:
         slots = (getattr(kind, "__slots__", ()) for kind in type(x).__mro__)
-        each = [(one,) if isinstance(one, str) else one for one in slots]
+        each = [(x,) if isinstance(x, str) else x for x in slots]
         names = [*getattr(x, "__dict__", {}), *itertools.chain(*each)]
     return tuple((name, getattr(x, name, None)) for name in names)
 

@@ -80,7 +80,7 @@ class Variable(NamedTuple):
         return -1 if np.dtype(self.dtype).kind == "i" else np.nan
 
 
-Constant = tuple[Sequence[str], np.ndarray] | tuple[Sequence[str], np.ndarray, Mapping[str, Any]]
+Constant = tuple[Sequence[str], np.ndarray, Mapping[str, Any]]
 """Dimensions, values and attributes of an array that exists before anything is computed."""
 
 

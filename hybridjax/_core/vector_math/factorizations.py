@@ -39,7 +39,9 @@ def solve_positive(
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
-    lower, below, pivots, x = _square(n), _square(n), [], []
+    lower, below = _square(n), _square(n)
+    pivots: list[Array] = []
+    x: list[Array] = []
     singular = jnp.asarray(False)
     for j in range(n):
         for i in range(j, n):

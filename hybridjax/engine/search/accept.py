@@ -5,26 +5,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..._core.executor import Array, cond, namespace
+from ..._core.executor import cond, namespace
 from ..._core.lanes import pick
 from ..._core.precision import at_precision
 from ...systems.structure import Structure
-from ..arrays import Index, Mask, Times
+from ..arrays import Array, Index, Mask, Times
 from ..cubic import CubicCrossing, first_crossing
 from ..events import INSTANT, width
 from ..lanes import Lanes
 from ..watch import Watch
-from .locate import LANDING_TRIES
+from .locate import LANDING, LANDING_TRIES
 from .state import Aim, Attempt, State, Task
 
 
-# A landing may lie beyond the step in which the crossing was met by this part of that step. Higher:
-# zeros of the step after it are accepted. Lower: those at its very end are missed.
-_BEYOND_STEP = 1e-6
 # The next step has this part of the length that the error estimate asks for, and lies between these
-# multiples of the last one (the lowest where the estimate is no number). Nearer to 1: more steps
+# multiples of the last one (the lower where the estimate is no number). Nearer to 1: more steps
 # are rejected. Farther: more steps are taken.
-_CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
+_CAUTION, _SHRINK, _GROW = 0.9, 0.2, 3.0
 
 
 class Verdict(NamedTuple):
@@ -60,7 +57,7 @@ class Verdict(NamedTuple):
 
 
 def accurate(new: Attempt, task: Task) -> Mask:
-    """Whether the error estimate of a step is at most the tolerance (times the lane's slack)."""
+    """Test whether the error estimate is at most the tolerance (times the lane's slack)."""
     return new.error <= task.stride.slack
 
 
@@ -78,11 +75,11 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     A step is accepted if it is accurate, every watched function is resolved over it, and none
     crosses zero on the way before the zero on which it lands.
     """
-    approach, active, end = state.approach, state.active, new.seen
+    approach, active, end = state.approach, state.active, new.watched
     xp, within_error = namespace(t), accurate(new, task)
     # Which approaches succeed.
     tau = approach.tau + new.past
-    beyond = _BEYOND_STEP * approach.reach + at_precision(*INSTANT) * task.span
+    beyond = LANDING * approach.reach + at_precision(*INSTANT) * task.span
     inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
     falling = of_row(end.rate, aim.which) < 0
     lands = active & new.lands & falling & xp.where(approach.on, inside, within_error)
@@ -91,7 +88,7 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
     looked_at, moved = fresh | lands, step_length(aim, new)
-    crossing = _crossing(looked_at, state.seen, end, moved, state.ready)
+    crossing = _crossing(looked_at, state.watched, end, moved, state.ready)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
@@ -130,7 +127,7 @@ def next_step(s: Structure, h: Times, aim: Aim, error: Times, lanes: Lanes) -> T
     else:
         length = error ** xp.asarray(1 / np.array(orders))[lanes.chart]
     factor = xp.clip(_CAUTION / length, _SHRINK, _GROW)
-    step = aim.step * xp.where(xp.isfinite(length), factor, _SHRINK_BLINDLY)
+    step = aim.step * xp.where(xp.isfinite(length), factor, _SHRINK)
     return xp.where((aim.step < h) & (length <= 1), xp.maximum(h, step), step)
 
 
@@ -140,13 +137,15 @@ def of_row(x: Array, which: Index) -> Times:
 
 
 def _crossing(
-    some: Mask, seen: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
+    some: Mask, watched: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
 ) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
     xp = namespace(ready)
 
     def look():
-        return first_crossing(seen.value, end.value, moved * seen.rate, moved * end.rate, ready)
+        return first_crossing(
+            watched.value, end.value, moved * watched.rate, moved * end.rate, ready
+        )
 
     def none():
         no = xp.zeros_like(ready)

@@ -31,7 +31,7 @@ def take_aim(s: Structure, state: State, task: Task) -> Aim:
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)
     # A zero that Newton's guess places within the first step is aimed at, where the way is known.
-    value, rate = state.seen
+    value, rate = state.watched
     lead = task.stride.lead
     guess = value / xp.where(rate < 0, -rate, xp.inf)
     guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))

@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..._core.executor import Array, cond, namespace, put
+from ..._core.executor import cond, namespace, put
 from ..._core.lanes import take_rows
 from ...systems.structure import Structure
-from ..arrays import AnyTimes, Mask, Padded, States
+from ..arrays import AnyTimes, Array, Mask, Padded, States
 from ..cubic import NEAR, control_points
 from ..events import width
 from ..lanes import Lanes, for_each_chart, only
@@ -51,15 +51,15 @@ def attempt(
         t, q, tau = only(here, lanes.t), only(here, lanes.q[:n]), xp.where(here, aim.step, 0.0)
         if in_step:
             t, tau = t[:1], aim.step[xp.argmax(here)][None]
-        along = None if out.along is None else only(here, out.along[:n])
-        step, along, change = _step(flow, present, t, q, tau, along, task, unroll)
-        allowed, error = _errors(flow, present, t, q, tau, step, change, along, task)
-        if along is not None:
+        before = None if out.along is None else only(here, out.along[:n])
+        step, along, change = _step(flow, present, t, q, tau, before, task, unroll)
+        allowed, error = _errors(flow, t, q, tau, step, change, along, task)
+        if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
             out = out._replace(along=along)
         landing = Landing(step.q, step.f1, zero, no, zero)
         if rows:
-            before = Watch(*(take_rows(x, rows) for x in state.seen))
+            before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
             if not in_step:
                 goal = aim._replace(which=which, step=tau)
@@ -77,7 +77,7 @@ def attempt(
             far, slow = _clearance(before, after, moved, take_rows(state.ready, rows), chosen)
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
-                seen=write(out.seen, rows, here, after),
+                watched=write(out.watched, rows, here, after),
                 past=xp.where(here, landing.past, out.past),
                 lands=xp.where(here, landing.lands, out.lands),
                 slow=xp.where(here, slow, out.slow),
@@ -130,27 +130,15 @@ def _step(
 
 
 def _errors(
-    flow: ChartFlow,
-    present: Present,
-    t,
-    q: States,
-    tau,
-    step: Step,
-    change,
-    along,
-    task: Task,
+    flow: ChartFlow, t, q: States, tau, step: Step, change, along, task: Task
 ) -> tuple[States, AnyTimes]:
     """The error that a step may have, and its error relative to that, with that of a derivative:
     a state at rest has no error of its own."""
     xp, settings, a = namespace(q), task.settings, flow.a
+    assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        field = flow.field
-        rounding = cond(
-            present,
-            lambda: rounding_error(field, t + tau, step.q, step.f1),
-            lambda: xp.zeros_like(q),
-        )
+        rounding = rounding_error(flow.field, t + tau, step.q, step.f1)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     error = xp.max(xp.abs(step.error) / allowed, axis=0, initial=0.0)
     if change is not None:
@@ -171,8 +159,8 @@ def _errors(
 def _bent(
     flow: ChartFlow, before: Watch, after: Watch, start, end: Landing, t, moved, span
 ) -> Mask:
-    """Whether the cubic interpolant misses a watched function halfway. `start`: the state and the
-    field at the start of the step."""
+    """Test whether the cubic interpolant misses a watched function halfway. `start`: the state
+    and the field at the start of the step."""
     xp, (q, f0) = namespace(moved), start
     middle = 0.5 * (q + end.q) + 0.125 * moved * (f0 - end.f)
     true = flow.watch(t + 0.5 * moved, middle, end.f).value
@@ -186,7 +174,7 @@ def _bent(
 def _clearance(
     before: Watch, after: Watch, moved: AnyTimes, armed: Flags, chosen: Flags
 ) -> tuple[Flags, Mask]:
-    """Whether watched functions stay away from zero, as far as their interpolants are certain; and
+    """Test whether watched functions stay away from zero, by bounds of their interpolants, and find
     lanes that land on a `chosen` zero at a vanishing speed."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate

@@ -35,11 +35,12 @@ def initial_step(s: Structure, lanes: Lanes, u: Inputs, span: Times, settings: S
         rates = xp.abs(f) / (size(settings, a, q) if scaled else xp.abs(q))
         rate = xp.max(xp.where(xp.isfinite(rates), rates, 0.0), axis=0, initial=0.0)
         time = xp.where(rate > 0, 1 / rate, xp.inf)
-        part = _FIRST_STEP * (settings.rtol / 1e-2) ** (1 / 7)
+        part = _FIRST_STEP * (rtol / 1e-2) ** (1 / 7)
         first = xp.minimum(part * time, _FIRST_STEP_OF_SPAN * span)
         first = first if scaled else xp.maximum(first, _SHORTEST * span)
         return xp.where(here, first, out)
 
-    xp = namespace(lanes.t)
+    assert settings.rtol is not None
+    xp, rtol = namespace(lanes.t), settings.rtol
     everywhere = xp.ones(lanes.t.shape[0], bool)
     return for_each_chart(s, lanes.chart, everywhere, work, _FIRST_STEP_OF_SPAN * span)

@@ -2,11 +2,11 @@
 
 from jaxtyping import Bool
 
-from ..._core.executor import Array, cond, namespace, put
+from ..._core.executor import cond, namespace, put
 from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
-from ..arrays import Index, Mask, Times
+from ..arrays import Array, Index, Mask, Times
 from ..events import INSTANT, LEVEL_CLEAR, apply_resets, enabled, keep_pace, rearm, width
 from ..lanes import Lanes
 from ..tape import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Tape
@@ -14,11 +14,6 @@ from ..watch import Watch, watch
 from .accept import Verdict, accept, next_step, of_row, step_length
 from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
-
-
-# A lane that is stuck blows up if its largest state changes by more than this part in that step;
-# otherwise its field jumps. Higher: fast growth is called a jump. Lower: rounding is called growth.
-_STILL = 1e-3
 
 
 def without_events(
@@ -40,7 +35,7 @@ def without_events(
     code = xp.where(active, code, IDLE).astype(xp.int32)
     end = state._replace(
         lanes=lanes,
-        seen=_merge(active, new.seen, state.seen),
+        watched=_merge(active, new.watched, state.watched),
         h=xp.where(active, h, state.h),
         along=new.along,
         error=state.error + xp.where(active, new.error, 0.0),
@@ -67,11 +62,12 @@ def with_events(
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
-    after, seen, aimed, zeno, slow = _after(s, state, aim, new, verdict, fired, t, task)
+    after, watched, aimed, zeno, slow = _after(s, state, aim, new, verdict, fired, t, task)
     h, stuck = _next_step(s, state, aim, new, verdict, fired, task)
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
-    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
+    # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
+    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= 1e-3 * xp.max(xp.abs(lanes.q), axis=0)
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
     result = state.result
     for failed, code in (
@@ -90,7 +86,7 @@ def with_events(
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
         after,
-        seen,
+        watched,
         aimed,
         _approach(state, new, verdict, moved),
         h,
@@ -117,7 +113,7 @@ def _after(
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
     """Lanes after their steps and events, the watched functions there, whether the target's level
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
-    lanes, end, accepted, xp = state.lanes, new.seen, verdict.accepted, namespace(t)
+    lanes, end, accepted, xp = state.lanes, new.watched, verdict.accepted, namespace(t)
     zero = width(t, task.span, end.rate)
     ready = (state.ready & ((end.value > 0) | verdict.lands)) | (end.value > zero)
     ready = xp.where(accepted, ready & ~verdict.chosen, state.ready)
@@ -136,12 +132,18 @@ def _after(
         lanes.events + (fired >= 0),
         pace,
     )
-    seen = _merge(accepted, end, state.seen)
-    return *_reset(s, after, seen, ready[-1], fired, together, task), zeno, slow
+    watched = _merge(accepted, end, state.watched)
+    return *_reset(s, after, watched, ready[-1], fired, together, task), zeno, slow
 
 
 def _reset(
-    s: Structure, lanes: Lanes, seen: Watch, aimed: Mask, fired: Index, together: Mask, task: Task
+    s: Structure,
+    lanes: Lanes,
+    watched: Watch,
+    aimed: Mask,
+    fired: Index,
+    together: Mask,
+    task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
@@ -151,12 +153,12 @@ def _reset(
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
-        residue = xp.abs(of_row(seen.value, fired))
+        residue = xp.abs(of_row(watched.value, fired))
         new = rearm(s, new, after, fired, together, task.span, task.u, residue)
         counts = xp.where(fires, level_counts(after, task.span), aimed)
-        return new, _merge(fires, after, seen), counts
+        return new, _merge(fires, after, watched), counts
 
-    return cond(fires.any(), work, lambda: (lanes, seen, aimed))
+    return cond(fires.any(), work, lambda: (lanes, watched, aimed))
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
@@ -165,7 +167,7 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
     approach, crosses, which = state.approach, verdict.crosses, verdict.which
     xp = namespace(moved)
     fastest = xp.maximum(
-        xp.abs(of_row(state.seen.rate, which)), xp.abs(of_row(new.seen.rate, which))
+        xp.abs(of_row(state.watched.rate, which)), xp.abs(of_row(new.watched.rate, which))
     )
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
     return Approach(
@@ -179,13 +181,7 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
 
 
 def _next_step(
-    s: Structure,
-    state: State,
-    aim: Aim,
-    new: Attempt,
-    verdict: Verdict,
-    fired: Index,
-    task: Task,
+    s: Structure, state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
     """The next step, and lanes that are stuck: the step is too short to be taken."""
     xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)
@@ -198,9 +194,9 @@ def _next_step(
     return h, rejected & (h < at_precision(*INSTANT) * task.span)
 
 
-def level_counts(seen: Watch, span: Times) -> Mask:
-    """Whether the target's level is clearly positive, so that its next fall counts."""
-    return seen.value[-1] > at_precision(*LEVEL_CLEAR) * span * abs(seen.rate[-1])
+def level_counts(watched: Watch, span: Times) -> Mask:
+    """Test whether the target's level is clearly positive, so that its next fall counts."""
+    return watched.value[-1] > at_precision(*LEVEL_CLEAR) * span * abs(watched.rate[-1])
 
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
@@ -209,7 +205,7 @@ def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
 
 
 def _expected(sequence: tuple[int, ...] | None, events: Index, fired: Index) -> Bool[Array, " L"]:
-    """Whether the next event of each lane is that of the limit cycle."""
+    """Test whether the next event of each lane is that of the limit cycle."""
     xp = namespace(fired)
     if sequence is None:
         return xp.ones(fired.shape, bool)

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 from jaxtyping import Bool
 
-from ..._core.executor import Array, cond, namespace, while_loop
+from ..._core.executor import cond, namespace, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
-from ..arrays import Index, Inputs, Mask, Times
+from ..arrays import Array, Index, Inputs, Mask, Times
 from ..events import arm
 from ..lanes import Lanes
 from ..settings import Settings
@@ -121,14 +121,14 @@ def _begin(s: Structure, lanes: Lanes, result: Index, task: Task, new_input: boo
     xp, L, u = namespace(lanes.t), lanes.t.shape[0], task.u
     finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0) & xp.isfinite(u).all(axis=0)
     result = update_result(result, ~finite, Result.BAD_INPUT)
-    seen = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
+    watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     follows = implicit and task.tangents is not False
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
     return State(
-        arm(s, lanes, seen, task.span) if new_input else lanes,
-        seen,
-        level_counts(seen, task.span),
+        arm(s, lanes, watched, task.span) if new_input else lanes,
+        watched,
+        level_counts(watched, task.span),
         Approach(no, none, zero, zero, zero, none),
         task.stride.h,
         deviation(s, lanes, task.settings) if follows else None,

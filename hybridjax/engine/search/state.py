@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float, Int
 
-from ..._core.executor import Array, namespace
+from ..._core.executor import namespace
 from ..._core.results import Result
-from ..arrays import Index, Inputs, Mask, Padded, Times
+from ..arrays import Array, Index, Inputs, Mask, Padded, Times
 from ..lanes import Lanes
 from ..settings import Settings
 from ..target import Target
@@ -58,7 +58,7 @@ class State(NamedTuple):
     """The state of the iteration."""
 
     lanes: Lanes
-    seen: Watch
+    watched: Watch
     """The watched functions at the lanes."""
     aimed: Mask
     """Whether the target's level would end the flow at its next falling zero."""
@@ -108,7 +108,7 @@ class Attempt(NamedTuple):
 
     q: Padded
     """The state at its end: on the zero that the lane aims at, if it lands."""
-    seen: Watch
+    watched: Watch
     """The watched functions there."""
     error: Times
     """Estimate of the step's error, relative to the tolerance."""

@@ -32,17 +32,17 @@ from .partition import check_sharing, is_real, meets_itself, regular
 InputNames = Count | SignalNames
 """The number of inputs, or their names."""
 
-# Cycles at the start of experiments from the limit cycle that are discarded where nothing else is
-# said (the paper's). Twice as many square what is left of the transient.
+# Cycles that are discarded by default after a start on the limit cycle, as in the paper. Fewer: the
+# transient biases estimates. More: strides are wasted.
 DISCARD = 20
-# Phases of a line are all the same if the mean of exp(2i phase) is this close to 1 in modulus.
-# Twice as much refuses phases that differ by 1.4 times as much.
+# Phases of a line count as equal if the mean of exp(2i phase) is this close to 1 in modulus.
+# Smaller: rounding makes a singular design. Larger: phases that differ are refused.
 _SAME_PHASES = 1e-6
-# A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Twice as much refuses
-# signals that are twice as large.
+# A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Smaller: estimates divide
+# by almost zero. Larger: weak signals are refused.
 _VANISHING = 1e-3
-# Lines are multiples of 1/P up to this, in lines. Twice as much takes frequencies for multiples
-# that are twice as far from one.
+# Frequencies may miss multiples of 1/P by this, in lines. Smaller: rounding of f is refused.
+# Larger: a wrong frequency is moved without an error.
 _OFF_LINE = 1e-6
 
 
@@ -93,7 +93,7 @@ class Design(eqx.Module):
         channels: Index | Sequence[Annotated[Numbers, Integers("n")]] = 0,
         inputs: InputNames = 1,
     ) -> "Design":
-        """A design from your own cosines.
+        """Return a design of given cosines.
 
         **Arguments:**
 
@@ -157,9 +157,8 @@ class Design(eqx.Module):
                     f"`{name}` must hold as many entries as `experiment`, "
                     f"{len(self.experiment)}, not {len(getattr(self, name))}."
                 )
-        found = np.unique(self.experiment)
-        count = max(len(found), 1)
-        if self.experiments != count or not np.array_equal(found, np.arange(count)):
+        numbers = np.unique(self.experiment)
+        if self.experiments != len(numbers) or not np.array_equal(numbers, np.arange(len(numbers))):
             raise DefinitionError(
                 "every experiment needs at least one frequency: `frequencies` has none for some."
             )
@@ -183,7 +182,8 @@ class Design(eqx.Module):
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
         power, square = np.bincount(group, np.abs(u) ** 2), u**2
-        alike = np.hypot(np.bincount(group, square.real), np.bincount(group, square.imag)) / power
+        re, im = np.bincount(group, np.real(square)), np.bincount(group, np.imag(square))
+        alike = np.hypot(re, im) / power
         self._refuse(
             (meets_itself(self.line, P, N, highest) & (alike > 1 - _SAME_PHASES)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
@@ -196,7 +196,7 @@ class Design(eqx.Module):
         )
 
     def _check_together(self, pairs: int) -> None:
-        """Lines that excite several inputs in one experiment: whether these can be told apart."""
+        """**Raises:** an error if responses to several inputs cannot be separated."""
         if pairs == len(self.line):
             return
         nu = len(self.input_names)
@@ -230,23 +230,23 @@ class Design(eqx.Module):
     def inputs(
         self, cycles: PeriodCount | None = None, experiments: slice | None = None
     ) -> Float[np.ndarray, "S n nu"]:
-        """The signals of all experiments, `cycles` periods long (default: P), n = cycles * N.
+        """Return the signals of all experiments, n = cycles * N samples long. Default: P cycles.
 
         They repeat after P periods. Cut anywhere, the last P periods hold the same lines; they
         have the phases of the design where `cycles` is a multiple of P, shifted ones elsewhere
         (which is why estimates divide by the spectrum of the window itself).
 
-        **Arguments:** `experiments`, consecutive ones, e.g. `slice(0, 100)`; by default all.
+        **Arguments:** `experiments`: consecutive ones, e.g. `slice(0, 100)`. Default: all.
         """
         cycles = self.periods if cycles is None else cycles
         first, last, step = (experiments or slice(None)).indices(self.experiments)
         if step != 1 or last <= first:
             raise DefinitionError(f"{experiments} holds no consecutive experiments.")
-        some = slice(*np.searchsorted(self.experiment, (first, last)))
-        experiment, line, channel = self.experiment[some], self.line[some], self.channel[some]
+        k = slice(*np.searchsorted(self.experiment, (first, last)))
+        experiment, line, channel = self.experiment[k], self.line[k], self.channel[k]
         length = self.n_sections * self.periods
         spectrum = np.zeros((last - first, length // 2 + 1, len(self.input_names)), complex)
-        value = 0.5 * length * self.amplitude[some] * np.exp(1j * self.phase[some])
+        value = 0.5 * length * self.amplitude[k] * np.exp(1j * self.phase[k])
         value = np.where(is_real(line, self.periods, self.n_sections), 2 * value.real, value)
         spectrum[experiment - first, line, channel] = value
         one = np.fft.irfft(spectrum, n=length, axis=1)
@@ -254,7 +254,7 @@ class Design(eqx.Module):
         return one[:, index]
 
     def scaled(self, rms: Positive) -> "Design":
-        """The same with amplitudes multiplied so that every signal has this rms value.
+        """Return the design with amplitudes multiplied so that every signal has this rms value.
 
         Each experiment and input by itself, over one window; the proportions within stay.
         """
@@ -262,11 +262,12 @@ class Design(eqx.Module):
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
 
     def realizations(self, count: Count, seed: Seed = 0) -> "Design":
-        """The design `count` times over, each time with new random phases.
+        """Return the design `count` times over, each time with new random phases.
 
-        Their responses scatter by noise and by distortion, so that the variance of an estimate can
-        be told. Cosines of one line and input turn by the same random angle in all experiments of
-        a realization, which keeps differences of 90 degrees and orthogonal experiments as they are.
+        The sample variance of their responses includes noise and nonlinear distortion, so it gives
+        the variance of an estimate. Cosines of one line and input turn by the same random angle in
+        all experiments of a realization, which keeps differences of 90 degrees and orthogonal
+        experiments as they are.
 
         **Returns:** a design with `count` times the experiments, one realization after the other.
         """
@@ -281,7 +282,7 @@ class Design(eqx.Module):
         return self._times(count, phase, self.experiment + shift)
 
     def with_negatives(self) -> "Design":
-        """Every experiment followed by the same with the sign changed.
+        """Return every experiment followed by the same with the sign changed.
 
         All even-order distortion cancels in `ExperimentData.odd_part`.
         """
@@ -289,7 +290,7 @@ class Design(eqx.Module):
         return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))
 
     def _times(self, count: int, phase, experiment) -> "Design":
-        """The cosines repeated, with other phases, in other experiments."""
+        """Return the cosines repeated, with other phases, in other experiments."""
         phase, experiment = phase.ravel(), experiment.ravel()
         order = np.lexsort((np.tile(self.line, count), experiment))
         each = {
@@ -306,7 +307,7 @@ class Design(eqx.Module):
     def expected_variance(
         self, noise: NonNegative = 1.0, repeats: Count = 1
     ) -> Float[np.ndarray, "F nu"]:
-        """The variance of every H_m at `frequencies` under white noise of this std on the output.
+        """Return the variance of every H_m at `frequencies` for white output noise of this std.
 
         `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
         """
@@ -321,11 +322,11 @@ class Design(eqx.Module):
             return 4 * noise**2 / (samples * power)
 
     def cycles(self, discard: Index = DISCARD) -> int:
-        """Cost of the design: cycles of all experiments, each with `discard` more at its start."""
+        """Return the cost of the design: cycles of all experiments, each with `discard` more."""
         return self.experiments * (self.periods + discard)
 
     def crest_factors(self) -> Float[np.ndarray, " S"]:
-        """max |u| / rms(u) in each experiment (over its inputs, the largest)."""
+        """Return max |u| / rms(u) of each experiment, the largest over its inputs."""
         u = self.inputs()
         rms = np.sqrt(np.mean(u**2, axis=1))
         peak = np.abs(u).max(axis=1)
@@ -372,7 +373,7 @@ def check_window(n_sections: int, periods: int) -> None:
 
 
 def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
-    """Frequencies as integers j with f = j / periods.
+    """Return frequencies as integers j with f = j / periods.
 
     **Raises:** `DefinitionError` for a frequency that is not a multiple of 1/periods.
     """
@@ -388,6 +389,8 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
     return lines.astype(int)
 
 
-def input_names(inputs: int | tuple[str, ...]) -> tuple[str, ...]:
-    """Names from names, or from a number: `u`, or `u0`, `u1`, ..."""
-    return names("inputs", None, inputs) if isinstance(inputs, int) else inputs
+def input_names(inputs: InputNames) -> tuple[str, ...]:
+    """Return names from names, or from a number: `u`, or `u0`, `u1`, ..."""
+    if isinstance(inputs, int):
+        return names("inputs", None, inputs)
+    return (inputs,) if isinstance(inputs, str) else tuple(inputs)

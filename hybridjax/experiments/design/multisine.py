@@ -29,13 +29,12 @@ from .partition import (
     is_half_integer,
     is_real,
     needs_two_phases,
-    two_adic,
 )
 
 
 Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
-Division = Literal["random", "sum-free", "2-adic", "disjoint", "orthogonal"]
+Division = Literal["random", "sum-free", "disjoint", "orthogonal"]
 
 # Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at
 # the edges. Larger: a line outside of the band is taken.
@@ -62,97 +61,79 @@ def multisine(
     highest_harmonic: Index | None = None,
     inputs: InputNames = 1,
 ) -> Design:
-    """Multisines that measure every frequency `j / periods` in a band.
+    """Return a design of multisines that measure every frequency `j / periods` in a band.
 
     The frequencies are divided at random among the experiments, under the rules of Sec. V-B
-    (see `Design.check`), in sets whose sizes differ by one at most. For N = 32, P = 64 and
+    (see `Design.check`), in sets whose sizes differ by at most one. For N = 32, P = 64 and
     frequencies up to 10 the 620 frequencies need 20 experiments, the exact minimum; the paper takes
-    80. `optimize_phases` gives the signals low crest factors.
+    80. `hj.experiments.optimize_phases` gives the signals low crest factors.
 
     **Arguments:**
 
-    - `n_sections`: N. `periods`: P, the periods in one window; the resolution is 1/P.
-    - `band`: the least and the largest frequency in cycles per period, both included; by default
-      from 0 to 10 as in the paper, or to N/2 where that is less.
-    - `amplitude`: of each cosine, or a function of an array of f that gives it. `Design.scaled`
-      sets the rms value of the signals. `seed`: of the phases and the division.
-    - `lines`: `"all"` but multiples of 1/2, which the paper leaves out. `"odd"` takes odd j only
-      (P must be even). A distortion of even order then answers between the lines and spoils none;
-      at small amplitudes, where it is the largest, this costs half of the lines and gains one to
-      two digits. `"two-phase"` takes all and the multiples of 1/2 as well, these in two experiments
-      each with phases 90 degrees apart (0 and N/2 in one).
-    - `division`: how frequencies are divided among experiments.
-      `"sum-free"`: so that the products f_i + f_j and f_i - f_j of one experiment, where a
-      quadratic distortion answers, miss its own lines. This needs many experiments with few lines
-      each, e.g. 80 where 20 suffice.
-      `"2-adic"`: in sets that have the same power of two in j, which are sum-free (P must be even);
-      these are many experiments (100 for P = 64), and their number follows from the lines.
-      With several inputs, one of them is excited per experiment, but with `"disjoint"` all of them
-      on different lines, and with `"orthogonal"` all of them on all lines, with phases that turn
-      from one experiment to the next, so that nu experiments tell nu inputs apart at nu times the
-      power per line.
-    - `experiments`: by default the fewest possible. Any greater number gives weaker signals
-      with fewer cosines each, and so less distortion; with the fewest of all lines, every
-      second-order product falls on a line of the same experiment, so amplitudes must be small.
+    - `n_sections`: N. Default: 32. `periods`: P, the periods in one window; the resolution is 1/P.
+      Default: 64.
+    - `band`: the lowest and the highest frequency in cycles per period, both included. Default:
+      0 to 10 as in the paper, or to N/2 if that is less.
+    - `amplitude`: of each cosine, or a function of an array of f that returns it. `Design.scaled`
+      sets the rms value of the signals. Default: 0.01.
+    - `seed`: of the phases and the division. Default: 0.
+    - `lines`: the excited frequencies. `"all"` are all but multiples of 1/2, as in the paper.
+      `"odd"` are those with odd j (P must be even). Distortion of even order then falls between the
+      excited frequencies; at small amplitudes, where it is the largest, this costs half of the
+      frequencies and gains one to two digits. `"two-phase"` are all and the multiples of 1/2 as
+      well, these in two experiments each with phases 90 degrees apart (0 and N/2 in one). Default:
+      "all".
+    - `division`: the division of frequencies among experiments. `"random"` has no further rule.
+      `"sum-free"` keeps the products f_i + f_j and f_i - f_j of an experiment, where quadratic
+      distortion falls, off its own frequencies; this needs many experiments with few frequencies
+      each, for example 80 instead of 20. Several inputs are excited one per experiment, but with
+      `"disjoint"` all of them on different frequencies, and with `"orthogonal"` all of them on all
+      frequencies, with phases that differ from one experiment to the next, so that nu experiments
+      separate nu inputs with nu times the power per frequency. Default: "random".
+    - `experiments`: their number for all inputs together. With more than the fewest, signals are
+      weaker and have fewer cosines each, and so less distortion. With the fewest for all
+      frequencies, every second-order product falls on a frequency of the same experiment, so
+      amplitudes must be small. Default: the fewest possible.
     - `highest_harmonic`: M, beyond which harmonics are taken as zero. Then 2 M + 1 experiments may
-      do instead of 20; the estimate needs the same
-      number: `estimate_htf(data, highest=M)`.
-    - `inputs`: their number or names; `experiments` is the number for all inputs together.
+      suffice instead of 20. Pass M to the estimate, too: `estimate_htf(data, highest=M)`. Default:
+      no assumption.
+    - `inputs`: their number or names. Default: 1.
 
-    **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too
-    few experiments (the message says the minimum), and for choices that exclude each other.
+    **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too few
+    experiments (the message has the minimum), and for choices that exclude each other.
     """
     names = input_names(inputs)
     check_window(n_sections, periods)
-    _check_choices(lines, division, periods, experiments, highest_harmonic)
-    band = (0.0, min(10.0, n_sections / 2)) if band is None else band
-    j = _lines(n_sections, periods, band, lines)
-    # A frequency that needs two phases stands twice; `second` marks its second appearance.
+    _check_choices(lines, division, periods, highest_harmonic)
+    j = _lines(n_sections, periods, band or (0.0, min(10.0, n_sections / 2)), lines)
+    # A frequency that needs two phases is listed twice; `second` marks the repetition.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, n_sections)]]))
     second = np.concatenate([[False], j[1:] == j[:-1]])
-    nu = len(names)
-    rng = np.random.default_rng(seed)
-    if division == "2-adic":
-        sets = _by_power(j, periods, rng)
-        experiment = [i * (sets.max() + 1) + sets for i in range(nu)]
-    elif highest_harmonic is not None:
+    nu, rng = len(names), np.random.default_rng(seed)
+    if highest_harmonic is not None:
         each = None if experiments is None else experiments // nu
         sets = [
             assign_apart(j, periods, n_sections, highest_harmonic, rng, each) for _ in range(nu)
         ]
-        experiment = [i * (sets[0].max() + 1) + sets[i] for i in range(nu)]
+        total = nu * (int(sets[0].max()) + 1)
     else:
-        fewest = fewest_experiments(j, periods) * nu
-        experiments = fewest if experiments is None else experiments
-        if experiments < fewest:
-            raise DefinitionError(
-                f"{experiments} experiments are too few: these {len(np.unique(j))} frequencies "
-                f"need at least {fewest}" + (f" for {nu} inputs." if nu > 1 else ".")
-            )
-        if experiments > len(j) * nu:
-            raise DefinitionError(
-                f"{experiments} experiments are more than the {len(j) * nu} cosines "
-                "that there are to distribute."
-            )
-        experiment = None
-    shares = [(experiments or 0) // nu + (i < (experiments or 0) % nu) for i in range(nu)]
-    phase = []
-    found = [] if experiment is None else experiment
+        sets, total = [], _number(j, periods, nu, experiments)
+    shares = [total // nu + (i < total % nu) for i in range(nu)]
+    phases = []
     for i in range(nu):
-        if experiment is None:
-            sets = assign(j, periods, shares[i], rng)
+        if highest_harmonic is None:
+            sets.append(assign(j, periods, shares[i], rng))
             if division == "sum-free":
-                sets = avoid_second_order(sets, j, periods, rng)
-            found.append(sum(shares[:i]) + sets)
-        random = rng.uniform(0, 2 * np.pi, len(j))
-        random = np.where(second, np.roll(random, 1) + np.pi / 2, random)
-        phase.append(np.where(is_real(j, periods, n_sections), 0.0, random))
-    experiment, phase = np.concatenate(found), np.concatenate(phase)
-    line, channel = np.tile(j, nu), np.repeat(np.arange(nu), len(j))
+                sets[i] = avoid_second_order(sets[i], j, periods, rng)
+        phase = rng.uniform(0, 2 * np.pi, len(j))
+        phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
+        phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
+    experiment = np.concatenate([sum(shares[:i]) + x for i, x in enumerate(sets)])
+    line, channel, phase = np.tile(j, nu), np.repeat(np.arange(nu), len(j)), np.concatenate(phases)
     if division == "disjoint" and nu > 1:
-        experiment = assign(line, periods, experiments, rng)
+        experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
-        experiment, line, channel, phase = _orthogonal(found[0], j, phase.reshape(nu, -1))
+        experiment, line, channel, phase = _orthogonal(sets[0], j, np.array(phases))
     order = np.lexsort((channel, line, experiment))
     line = line[order]
     size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
@@ -172,29 +153,43 @@ def multisine(
     )
 
 
-def _check_choices(lines, division, periods, experiments, highest_harmonic) -> None:
-    usual = division in ("random", "sum-free") and highest_harmonic is None
-    if lines == "two-phase" and not usual:
+def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> int:
+    """Return the number of experiments for all inputs together. Default: the fewest possible."""
+    fewest = fewest_experiments(j, periods) * nu
+    if experiments is None:
+        return fewest
+    if experiments < fewest:
+        raise DefinitionError(
+            f"{experiments} experiments are too few: these {len(np.unique(j))} frequencies "
+            f"need at least {fewest}" + (f" for {nu} inputs." if nu > 1 else ".")
+        )
+    if experiments > len(j) * nu:
+        raise DefinitionError(
+            f"{experiments} experiments are more than the {len(j) * nu} cosines that there are to "
+            "distribute."
+        )
+    return experiments
+
+
+def _check_choices(lines, division, periods, highest_harmonic) -> None:
+    if lines == "two-phase" and (
+        division not in ("random", "sum-free") or highest_harmonic is not None
+    ):
         raise DefinitionError(
             "lines='two-phase' goes with division='random' or 'sum-free' only, and not with "
             "highest_harmonic."
         )
     if highest_harmonic is not None and division != "random":
         raise DefinitionError(f"highest_harmonic and division={division!r} exclude each other.")
-    if division == "2-adic" and experiments is not None:
+    if lines == "odd" and periods % 2:
         raise DefinitionError(
-            "leave out `experiments` with division='2-adic': their number follows from the lines."
-        )
-    if (lines == "odd" or division == "2-adic") and periods % 2:
-        choice = "lines='odd'" if lines == "odd" else "division='2-adic'"
-        raise DefinitionError(
-            f"{choice} needs an even number of periods, not {periods}: else the even-order "
+            f"lines='odd' needs an even number of periods, not {periods}: else the even-order "
             "products fall on the lines themselves."
         )
 
 
 def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarray:
-    """The lines j of a band."""
+    """Return the lines j of a band."""
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
         raise DefinitionError(
@@ -216,19 +211,8 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     return j
 
 
-def _by_power(j, periods: int, rng: np.random.Generator):
-    """Experiments whose lines have the same power of two."""
-    power, experiment, first = two_adic(j, periods), np.empty(len(j), int), 0
-    for p in np.unique(power):
-        here = power == p
-        count = fewest_experiments(j[here], periods)
-        experiment[here] = first + assign(j[here], periods, count, rng)
-        first += count
-    return experiment
-
-
 def _orthogonal(division, j, phase):
-    """Every set of lines in nu experiments, with phases that turn from one to the next."""
+    """Return every set of lines in nu experiments, with phases that turn from one to the next."""
     nu, K = phase.shape
     count = division.max() + 1
     _, first, _ = np.meshgrid(np.arange(nu), division, np.arange(nu), indexing="ij")
@@ -249,7 +233,7 @@ def paper_design(
     division: Literal["random", "sum-free"] = "sum-free",
     experiments: ExperimentCount = 80,
 ) -> Design:
-    """The design of Ankarali & Cowan, Sec. VI-C: 620 frequencies in 80 random subsets.
+    """Return the design of Ankarali & Cowan, Sec. VI-C: 620 frequencies in 80 random subsets.
 
     The same as `multisine` with four times the experiments that it needs, without multiples of
     1/2. The paper's rules leave room to choose; by default the subsets are also sum-free:
@@ -275,7 +259,7 @@ def single_cosine(
     half_integers: Literal["error", "two-phase"] = "error",
     inputs: InputNames = 1,
 ) -> Design:
-    """One cosine per experiment (Sec. V-A), at the frequency or each of the frequencies `f`.
+    """Return one cosine per experiment (Sec. V-A), at the frequency or each of the frequencies `f`.
 
     **Arguments:** as for `multisine`; `f` in cycles per period, a multiple of 1/periods;
     `phase` in rad. With several inputs each frequency is applied to one after the other.

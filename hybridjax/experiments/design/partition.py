@@ -19,39 +19,39 @@ from jaxtyping import Bool, Complex, Int
 from ...errors import DefinitionError
 
 
-# Normal equations are singular if, with unknowns scaled to size 1, the least eigenvalue is below
-# this, or if one unknown's size is below this part of another's. Twice as much refuses experiments
-# that tell inputs apart 1.4 times as well.
+# Normal equations are singular if, with unknowns scaled to magnitude 1, the least eigenvalue is
+# below this, or if one magnitude is below this part of another. Smaller: inputs that only rounding
+# separates are accepted. Larger: good experiments with unequal inputs are refused.
 _SINGULAR = 1e-6
 
 
 def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
-    """`min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between two."""
-    rest = line % periods
-    return np.minimum(rest, periods - rest)
+    """Return `min(r, P - r)` with `r = j mod P`: 0 for integers f, P/2 for f half way between."""
+    remainder = line % periods
+    return np.minimum(remainder, periods - remainder)
 
 
 def is_half_integer(line: Int[np.ndarray, " K"], periods: int) -> Bool[np.ndarray, " K"]:
-    """Whether f is a multiple of 1/2: the cosine then meets its own mirror image (eq. 16)."""
+    """Return whether f is a multiple of 1/2: the cosine aliases with its conjugate (eq. 16)."""
     return (2 * line) % periods == 0
 
 
 def is_real(line: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Bool[np.ndarray, " K"]:
-    """Whether f is 0 or N/2, where `cos(w n + phi)` is a real factor times a fixed sequence."""
+    """Return whether f is 0 or N/2: `cos(w n + phi)` is a factor times a fixed sequence."""
     return (line == 0) | (2 * line == n_sections * periods)
 
 
 def needs_two_phases(
     line: Int[np.ndarray, " K"], periods: int, n_sections: int
 ) -> Bool[np.ndarray, " K"]:
-    """Multiples of 1/2 other than 0 and N/2: identified from two phases only."""
+    """Return whether f is a multiple of 1/2 other than 0 and N/2: it needs two phases."""
     return is_half_integer(line, periods) & ~is_real(line, periods, n_sections)
 
 
 def meets_itself(
     line: Int[np.ndarray, " K"], periods: int, n_sections: int, highest: int | None = None
 ) -> Bool[np.ndarray, " K"]:
-    """Lines that need two phases, where harmonics beyond `highest` are taken as zero."""
+    """Return whether f needs two phases if harmonics beyond `highest` are zero."""
     meets = needs_two_phases(line, periods, n_sections)
     if highest is not None:
         meets &= _around(2 * line, periods, n_sections) <= highest
@@ -59,29 +59,29 @@ def meets_itself(
 
 
 def _around(lines: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Int[np.ndarray, " K"]:
-    """The harmonic that leads over this distance: in periods, around the circle of N."""
+    """Return the harmonic between lines at this distance, around the circle of N."""
     turns = (lines // periods) % n_sections
     return np.minimum(turns, n_sections - turns)
 
 
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
-    """Whether normal equations can be solved, whatever the sizes of the unknowns."""
+    """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    there = size.min(axis=1) > _SINGULAR * size.max(axis=1)
-    size = np.where(there[:, None], size, 1.0)
+    even = size.min(axis=1) > _SINGULAR * size.max(axis=1)
+    size = np.where(even[:, None], size, 1.0)
     least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
-    return there & (least > _SINGULAR)
+    return even & (least > _SINGULAR)
 
 
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
-    """The exact minimum of experiments for these lines (repeated ones count as often)."""
+    """Return the exact minimum of experiments for these lines, repeated ones counted each time."""
     return int(np.bincount(line_class(line, periods)).max())
 
 
 def assign(
     line: Int[np.ndarray, " K"], periods: int, experiments: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " K"]:
-    """Random partition that obeys the rules: the experiment, 0..experiments-1, of each line.
+    """Return a random partition that obeys the rules: the experiment of each line.
 
     Class after class, in random order, is spread over the experiments that are the least full
     at that moment (ties at random), so sizes differ by at most one. Needs
@@ -106,7 +106,7 @@ def assign_apart(
     rng: np.random.Generator,
     experiments: int | None = None,
 ) -> Int[np.ndarray, " K"]:
-    """A partition in which no harmonic up to `2 highest` leads from one line to another.
+    """Return a partition in which no harmonic up to `2 highest` leads from one line to another.
 
     All lines of a class are integers k apart, if f = c + k and -f = c + k are both brought to the
     form c + k. Lines with the same remainder of k modulo S share an experiment: then they are S or
@@ -115,8 +115,7 @@ def assign_apart(
 
     **Raises:** `DefinitionError` for a number of experiments that does not do.
     """
-    rest = line % periods
-    cell = np.where(2 * rest < periods, line // periods, -(line // periods) - 1)
+    cell = np.where(2 * (line % periods) < periods, line // periods, -(line // periods) - 1)
     classes = line_class(line, periods)
     fewest = fewest_experiments(line, periods)
     least = 2 * highest + 1
@@ -138,26 +137,6 @@ def assign_apart(
     )
 
 
-def two_adic(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
-    """The power of two that divides j (at most that of P): 0 for odd lines."""
-    power = np.zeros(len(line), int)
-    step = 2
-    while periods % step == 0:
-        power += line % step == 0
-        step *= 2
-    return power
-
-
-def second_order_hits(classes: Int[np.ndarray, " k"], periods: int) -> int:
-    """How often a product of two lines of one experiment falls on a line of the same experiment.
-
-    A quadratic distortion answers two lines of classes a and b at a + b and a - b (plus integers),
-    so it spoils the lines of those classes.
-    """
-    products = _products(periods)
-    return _hits([int(c) for c in classes], products)
-
-
 def avoid_second_order(
     experiment: Int[np.ndarray, " K"],
     line: Int[np.ndarray, " K"],
@@ -165,11 +144,11 @@ def avoid_second_order(
     rng: np.random.Generator,
     rounds: int = 200_000,
 ) -> Int[np.ndarray, " K"]:
-    """The partition after random swaps, such that no second-order product of an experiment falls
-    on one of its own lines. Sizes stay as they are.
+    """Return the partition after random swaps, such that no second-order product of an experiment
+    falls on one of its own lines. Sizes stay as they are.
 
-    Simulated annealing on the number of `second_order_hits`. For N = 32, P = 64, f up to 10 and
-    80 experiments about 30 000 swaps suffice.
+    Simulated annealing on the number of such products. For N = 32, P = 64, f up to 10 and 80
+    experiments about 30 000 swaps suffice.
 
     **Raises:** `DefinitionError` if no such partition was found.
     """
@@ -217,7 +196,7 @@ def avoid_second_order(
 
 
 def _products(periods: int) -> list[list[int]]:
-    """For each pair of classes, a bit mask of the classes of its second-order products."""
+    """Return for each pair of classes a bit mask of the classes of its second-order products."""
     top = periods // 2 + 1
 
     def fold(x):
@@ -227,12 +206,10 @@ def _products(periods: int) -> list[list[int]]:
 
 
 def _hits(classes: list[int], products: list[list[int]]) -> int:
-    own = 0
-    for c in classes:
-        own |= 1 << c
-    return sum(
-        (products[a][b] & own).bit_count() for i, a in enumerate(classes) for b in classes[i:]
-    )
+    """Return the number of second-order products of some classes that fall on one of them."""
+    mask = sum(1 << c for c in classes)  # (an experiment has each class once)
+    pairs = ((a, b) for i, a in enumerate(classes) for b in classes[i:])
+    return sum((products[a][b] & mask).bit_count() for a, b in pairs)
 
 
 def check_sharing(

@@ -127,7 +127,7 @@ class LDTPFit(MultiplierEstimate):
     ) -> Float[np.ndarray, "M F ny"]:
         """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
 
-        See `hj.identify.noise_spectrum`.
+        See `LDTPFit.noise_spectrum`.
 
         **Raises:** `DefinitionError` if no noise was fitted.
         """

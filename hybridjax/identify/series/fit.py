@@ -122,7 +122,6 @@ class SeriesFit(MultiplierEstimate):
 
 
 @checked
-@one_blas_thread()
 def fit_series(
     data: RecordedData,
     order: Order | LDTP,
@@ -168,6 +167,21 @@ def fit_series(
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
     records = PreparedRecords(data)
+    return fit_records(records, order, overhang, start, loss, errors, check, max_steps)
+
+
+@one_blas_thread()
+def fit_records(
+    records: PreparedRecords,
+    order: int,
+    overhang: int | None = None,
+    start: Literal["free", "cycle"] = "free",
+    loss: Loss = "squares",
+    errors: Literal["residuals", "white"] = "residuals",
+    check: bool = True,
+    max_steps: int = 50,
+) -> SeriesFit:
+    """Fit records that are prepared; see `fit_series`."""
     overhang = records.n_sections if overhang is None else overhang
     problem = OutputErrorProblem.from_data(records, order, overhang, start == "free")
     usual = problem if loss == "squares" else without_outliers(problem)

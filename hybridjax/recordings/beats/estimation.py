@@ -14,18 +14,18 @@ from jaxtyping import Bool, Float, Int
 from scipy import optimize
 
 from ...identify.denominator import Covariance, sandwich
-from .model import Forecast, Intervals, basis, forecast, tabulated
+from .model import Forecast, Intervals, Table, basis, forecast, tabulated
 
 
 # Half waves of a curve. More: time, for detail that the smoothness removes. Fewer: curves that jump
 # are cut off.
 WAVES = 20
-# Most Gauss-Newton steps, halvings of a step, and updates of jitter, smoothness and miscounted
-# intervals. More: time. Fewer: fits end before convergence.
-_STEPS, _HALVINGS, _ROUNDS = 30, 8, 8
-# Relative changes at convergence: of the cost, the jitter, the smoothness. Larger: estimates depend
-# on the start. Smaller: more iterations for digits that noise hides.
-_SETTLED, _SAME_JITTER, _SAME_SMOOTHNESS = 1e-6, 0.01, 0.1
+# Most Gauss-Newton steps, and most halvings of a step or updates of jitter, smoothness and
+# miscounted intervals. More: time. Fewer: fits end before convergence.
+_STEPS, _ROUNDS = 30, 8
+# Relative changes at convergence: of the cost, and of jitter and smoothness. Larger: estimates
+# depend on the start. Smaller: more iterations for digits that noise hides.
+_SETTLED, _SAME = 1e-6, 0.01
 # Blocks from which standard errors are computed: one per trial if there are so many, else parts of
 # trials with at least so many intervals. More, shorter: blocks are not independent. Fewer, longer:
 # standard errors scatter.
@@ -92,16 +92,16 @@ def fit_curve(intervals: Intervals, waves: int, start: CurveFit | None = None) -
         fit = _minimize(intervals, table, _look(intervals, table, a, rates, used, smooth))
         a, rates, counted = fit.coefficients, fit.rates, fit.counted()
         now = float((fit.residual * fit.forecast.rate)[counted].std())
-        same = (counted == used).all() and abs(now - jitter) < _SAME_JITTER * now
+        same = (counted == used).all() and abs(now - jitter) < _SAME * now
         jitter, used = now, counted
-        if same and abs(before - smooth.penalty[-1]) <= _SAME_SMOOTHNESS * smooth.penalty[-1]:
+        if same and abs(before - smooth.penalty[-1]) <= 10 * _SAME * smooth.penalty[-1]:
             break
     return fit._replace(jitter=jitter, used=used)
 
 
 def _look(
     intervals: Intervals,
-    table: Float[np.ndarray, "M p"],
+    table: Table,
     a: Float[np.ndarray, " p"],
     rates: Float[np.ndarray, " trials"],
     used: Bool[np.ndarray, " L"],
@@ -112,7 +112,7 @@ def _look(
     return CurveFit(a, rates, 0.0, used, intervals.duration - ahead.duration, ahead, smooth, True)
 
 
-def _minimize(intervals: Intervals, table: Float[np.ndarray, "M p"], fit: CurveFit) -> CurveFit:
+def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
     """Gauss-Newton iteration over curve and rates."""
 
     def cost_of(fit):
@@ -126,7 +126,7 @@ def _minimize(intervals: Intervals, table: Float[np.ndarray, "M p"], fit: CurveF
         downhill = across.T @ fit.residual - fit.penalty * fit.coefficients
         step = np.linalg.lstsq(curvature, downhill)[0]
         faster = along @ np.append(1.0, -step)
-        for k in range(_HALVINGS):
+        for k in range(_ROUNDS):
             rates = np.maximum(fit.rates + faster / 2**k, fit.rates / 2)  # (never zero)
             a = fit.coefficients + step / 2**k
             new = _look(intervals, table, a, rates, fit.used, fit.smoothness)
@@ -179,7 +179,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     values, axes = np.linalg.eigh(curvature)
     determined = values > 1e-6 * values[-1]  # beyond rounding
     excess = float(((sums @ axes[:, determined]) ** 2 / values[determined]).sum())
-    excess = max(excess / determined.sum() / variance, 1.0) if variance > 0 else 1.0
+    excess = max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
     noise = variance * excess
     weight = np.arange(1.0, p) ** 4
     score = pull + curvature @ fit.coefficients

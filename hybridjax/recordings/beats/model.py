@@ -44,6 +44,11 @@ _POINTS = 1024
 _FEWEST = 3
 
 
+Lanes = Float[np.ndarray, " l"]
+Table = Float[np.ndarray, "M p"]
+"""A basis of curves at equal steps of the phase from 0 on."""
+
+
 class Intervals(NamedTuple):
     """All intervals of a recording between events that nothing interrupts, trial by trial."""
 
@@ -84,7 +89,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     """Return the intervals between events, with the input of that name, linear between samples.
 
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
-    missing or constant, and too few intervals during which it is known.
+    missing or constant, and too few intervals during which it is finite.
     """
     pairs = phase.by_trial(recording)
     if not all(w.linear for _, parts in pairs for w in parts):
@@ -94,17 +99,17 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     column, trials, outside = recording.column(name), [], 0
     for trial, parts in pairs:
         x = trial.values[:, column]
-        known = np.isfinite(x)
-        if known.sum() < 2:
+        finite = np.isfinite(x)
+        if finite.sum() < 2:
             raise DefinitionError(f"trial '{trial.name}' has no samples of the input {name}.")
         start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
         duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
-        holes = gaps(trial.time, known, bridgeable(trial.time, known))
+        holes = gaps(trial.time, finite, bridgeable(trial.time, finite))
         # An interval may begin or end just where the input does.
         used = ~inside(holes, start + 1e-9 * duration, start + (1 - 1e-9) * duration)
         outside += int((~used).sum())
         if used.sum() >= _FEWEST:
-            trials.append((trial.name, trial.time[known], x[known], start[used], duration[used]))
+            trials.append((trial.name, trial.time[finite], x[finite], start[used], duration[used]))
     if not trials:
         lost = f"; {outside} lie where {name} was not recorded" if outside else ""
         raise DefinitionError(
@@ -140,7 +145,7 @@ def basis(
     return np.cos(angle * phase[:, None]) * np.exp(-spread * phase[:, None])
 
 
-def tabulated(waves: int, jitter: float) -> Float[np.ndarray, "M p"]:
+def tabulated(waves: int, jitter: float) -> Table:
     """Return the basis at equal steps of the phase from 0 on."""
     return basis(np.arange(3 * _POINTS // 2 + 1) / _POINTS, waves, jitter)
 
@@ -163,7 +168,7 @@ class Forecast(NamedTuple):
 
 def forecast(
     intervals: Intervals,
-    table: Float[np.ndarray, "M p"],
+    table: Table,
     coefficients: Float[np.ndarray, " p"],
     rates: Float[np.ndarray, " trials"],
 ) -> Forecast:
@@ -186,7 +191,7 @@ def _integrate(
     h: Float[np.ndarray, " L"],
     w: Float[np.ndarray, " L"],
     curve: Float[np.ndarray, " M"],
-    table: Float[np.ndarray, "M p"],
+    table: Table,
 ) -> Forecast:
     """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
     L, p = len(h), table.shape[1]
@@ -245,13 +250,7 @@ def _integrate(
     return result
 
 
-def _end(
-    a: Float[np.ndarray, " l"],
-    b: Float[np.ndarray, " l"],
-    m0: Float[np.ndarray, " l"],
-    m1: Float[np.ndarray, " l"],
-    own: Float[np.ndarray, " l"],
-) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
+def _end(a: Lanes, b: Lanes, m0: Lanes, m1: Lanes, own: Lanes) -> tuple[Lanes, Lanes]:
     """Return the part of a step at whose end the phase is 1, and the rate there per step.
 
     It is the root of the cubic with the values a, b and slopes m0, m1 at both ends of the step.

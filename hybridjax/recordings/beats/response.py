@@ -23,6 +23,7 @@ from ..findings import Finding, print_findings
 from ..phase import Phase
 from ..phase_estimation import estimate_phase
 from ..recording import Recording
+from ..smoothing import Series
 from .estimation import WAVES, CurveFit, accuracy_of, fit_curve, plain_curve
 from .model import Intervals, basis, intervals_of
 
@@ -92,13 +93,11 @@ class PhaseResponse(eqx.Module):
         """Limits of what the data support."""
         return tuple(_warnings(self))
 
-    def __call__(self, phase: Phases) -> Float[np.ndarray, " n"]:
+    def __call__(self, phase: Phases) -> Series:
         """Return the curve at some phases, in cycles."""
         return self._waves(phase) @ self.coefficients
 
-    def interval(
-        self, phase: Phases, level: Probability = 0.95
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def interval(self, phase: Phases, level: Probability = 0.95) -> tuple[Series, Series]:
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
         the phases: they are too narrow where it changes faster than elsewhere."""
         waves = self._waves(phase)
@@ -145,10 +144,7 @@ def curve_unit(name: str) -> str:
 @checked
 @working("phase_response")
 def phase_response(
-    recording: Recording,
-    phase: Phase | AtEvent | Crossing,
-    *,
-    input: str,
+    recording: Recording, phase: Phase | AtEvent | Crossing, *, input: str
 ) -> PhaseResponse:
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.
 

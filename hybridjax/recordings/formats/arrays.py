@@ -16,9 +16,6 @@ from .columns import Columns, Wanted, check_declared, library, reading, split_he
 
 Place = tuple[str, ...]
 """Names of groups, from the outermost on, and of an array."""
-# MATLAB's version that is HDF5; bytes of the header of version 5, of the tag before an element, and
-# the type of a compressed element.
-_HDF5, _HEADER, _TAG, _PACKED = 2, 128, 8, 15
 
 
 class Leaf(NamedTuple):
@@ -70,13 +67,13 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
     from scipy.io import loadmat, matlab, whosmat
 
     with reading(path, "MATLAB file"):
-        version, _ = matlab.matfile_version(path)
-        if version != _HDF5:
+        is_hdf5 = matlab.matfile_version(path)[0] == 2
+        if not is_hdf5:
             _check_packed(path)
             names = [name for name, _, _ in whosmat(path)]
             chosen = [x for x in names if wanted.includes(x) or wanted.reaches(x)]
             content = loadmat(path, simplify_cells=True, variable_names=chosen)
-    if version == _HDF5:
+    if is_hdf5:
         return read_hdf5(path, wanted, ".")
     variables = {name: value for name, value in content.items() if not name.startswith("__")}
     return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
@@ -94,14 +91,18 @@ def _leaves(path: Path, place: Place, value: Any, wanted: Wanted) -> Iterator[tu
 
 
 def _check_packed(path: Path) -> None:
-    """**Raises:** `FileFormatError` if compressed variables hold more than `limits` allow."""
+    """**Raises:** `FileFormatError` if compressed variables hold more than `limits` allow.
+
+    A file of version 5 has a header of 128 bytes, then elements with a tag of 8 bytes; type 15 is
+    compressed.
+    """
     size = path.stat().st_size
     room = limits.unpacked(size)
     with open(path, "rb") as file:
-        order = "little" if file.read(_HEADER)[-2:] == b"IM" else "big"
-        while len(tag := file.read(_TAG)) == _TAG:
+        order = "little" if file.read(128)[-2:] == b"IM" else "big"
+        while len(tag := file.read(8)) == 8:
             kind, length = (int.from_bytes(x, order) for x in (tag[:4], tag[4:]))
-            if kind != _PACKED:
+            if kind != 15:
                 file.seek(length, 1)
                 continue
             unpacker, data = zlib.decompressobj(), file.read(min(length, size))

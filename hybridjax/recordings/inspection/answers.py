@@ -31,8 +31,8 @@ _ODD, _NONE = 0.8, 0.4
 # Unexplained power where a part's input is displaced as is best for it, relative to the
 # displacement that is best for all. Larger: displaced by chance. Smaller: real shifts pass.
 _BETTER = 0.5
-# Unexplained power of a part relative to the median that makes a disturbance, and of what the
-# input explains. Larger: stumbles pass. Smaller: noisy parts are reported.
+# Unexplained power of a part relative to the median that makes a disturbance, and relative to what
+# the input explains. Larger: stumbles pass. Smaller: noisy parts are reported.
 _DISTURBED, _MUCH = 9.0, 0.25
 # Fraction of an input's variance that repeats with the cycle, from which on it is feedback, and
 # the cycles that show it. Larger: triggers pass. Smaller: it repeats by chance.
@@ -150,8 +150,8 @@ def _odd(name: str, answers: list[_Answer], names: tuple[str, ...]) -> Iterator[
         "recorded, a stumble, a sensor that failed.",
     }
     for cause, spans in where.items():
-        action = "refused" if cause == "another sign" else "warned"
-        yield Finding(cause, texts[cause].format(name, listed(spans)), action)
+        text = texts[cause].format(name, listed(spans))
+        yield Finding(cause, text, "refused" if cause == "another sign" else "warned")
 
 
 def _answers(parts: list[_Part], i: int) -> list[_Answer]:
@@ -165,14 +165,14 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer]:
         products.append(x.T @ _centered([p.y[p.rows]]))
     answers = []
     for n, part in enumerate(parts):
-        others = [k for k, p in enumerate(parts) if p.trial != part.trial]
-        others = others or [k for k in range(len(parts)) if k != n]
+        training = [k for k, p in enumerate(parts) if p.trial != part.trial]
+        training = training or [k for k in range(len(parts)) if k != n]
         unknowns = regressors[n].shape[1]
-        if sum(len(regressors[k]) for k in others) < _ENOUGH * unknowns:
+        if sum(len(regressors[k]) for k in training) < _ENOUGH * unknowns:
             return []
-        square = np.sum([squares[k] for k in others], axis=0)
+        square = np.sum([squares[k] for k in training], axis=0)
         square += _RIDGE * np.trace(square) / unknowns * np.eye(unknowns)
-        b = np.linalg.solve(square, np.sum([products[k] for k in others], axis=0))
+        b = np.linalg.solve(square, np.sum([products[k] for k in training], axis=0))
         ny, wide = part.y.shape[1], part.inputs(i).shape[1]
         rows = slice(ny + i * wide, ny + (i + 1) * wide)
         outputs = _centered([part.y[part.rows]]) - regressors[n] @ b
@@ -205,10 +205,11 @@ def _parts(data: SectionData, r: int, sections: int) -> list[_Part]:
         u = (record.u[where] / size_u).reshape(b - a, N, -1)
         y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
         y = np.clip(y, -_LARGEST, _LARGEST)
-        known_u, known_y = np.isfinite(u).all(axis=(1, 2)), np.isfinite(y).all(axis=1)
+        finite_u = np.asarray(np.isfinite(u).all(axis=(1, 2)))
+        finite_y = np.asarray(np.isfinite(y).all(axis=1))
         rows = np.arange(1, b - a - ahead)
-        used = [known_u[rows + c] for c in range(-1, ahead + 1)]
-        used += [known_y[rows - 1], known_y[rows]]
+        used = [finite_u[rows + c] for c in range(-1, ahead + 1)]
+        used += [finite_y[rows - 1], finite_y[rows]]
         rows = rows[np.stack(used).all(axis=0)]
         u, y, time = np.nan_to_num(u), np.nan_to_num(y), data.times[r][where]
         if len(rows) >= _SHORTEST / 2:

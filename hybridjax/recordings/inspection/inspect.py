@@ -52,6 +52,7 @@ def inspect(
 
     **Raises:** `DefinitionError` for unknown names.
     """
+    inputs, outputs = tuple(inputs), tuple(outputs)
     names = [name for name in (*inputs, *outputs) if _is_recorded(recording, name)]
     findings: list[Finding] = []
     clean = recording

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..findings import Finding, places
 from ..recording import Recording, Trial
+from ..smoothing import Series
 
 
 # Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
@@ -64,7 +65,7 @@ def placeholders(s: Signal) -> tuple[Rows, list[Finding]]:
     )
 
 
-def _placeholders(x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _placeholders(x: Series) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
     for extreme in (np.min, np.max) * 2:  # two of either sign
         left = x[np.isfinite(x) & ~bad]
@@ -98,7 +99,7 @@ def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
     )
 
 
-def _frozen(x: Float[np.ndarray, " n"], period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
+def _frozen(x: Series, period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
     first, length = _runs(x)
     plateaus = length[length >= _PLATEAU]
@@ -113,7 +114,7 @@ def _frozen(x: Float[np.ndarray, " n"], period: float, is_input: bool) -> Bool[n
     return bad
 
 
-def _runs(x: Float[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
     """Return first samples and lengths of the runs of equal values; each NaN is its own run."""
     first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
     return first, np.diff(np.append(first, len(x)))
@@ -134,7 +135,7 @@ def clipped(s: Signal) -> Iterator[Finding]:
         )
 
 
-def _clipped(x: Float[np.ndarray, " n"]) -> tuple[int, list[float]]:
+def _clipped(x: Series) -> tuple[int, list[float]]:
     """Return the number of clipped samples, and their values."""
     first, length = _runs(x)
     flat = length >= _PLATEAU
@@ -192,7 +193,7 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
     """
     columns, trials = [recording.column(name) for name in names], recording.trials
     size = _SAME * np.nanstd(np.concatenate([t.values[:, columns] for t in trials]), axis=0)
-    known, findings = [np.zeros(len(t.time), bool) for t in trials], []
+    repeated, findings = [np.zeros(len(t.time), bool) for t in trials], []
     for (_, a), (j, b) in combinations(enumerate(trials), 2):
         x, y = a.values[:, columns], b.values[:, columns]
         shift = _shift(x, y, size)
@@ -202,16 +203,16 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
         same = np.zeros(len(y), bool)
         off = np.abs(x[first:last] - y[first - shift : last - shift])
         same[first - shift : last - shift] = (~(off > size)).all(axis=1)
-        if not (same & ~known[j]).any():
+        if not (same & ~repeated[j]).any():
             continue
         cause, start = "overlap", f"{same.sum()} samples ({places([b], [same])}) are"
         end = f"in trial '{a.name}' too, and count once; cut one of the two."
         if same.mean() > _EQUAL:
             cause, start = "a trial twice", f"all samples of trial '{b.name}' are"
             end, same[:] = f"in trial '{a.name}' already, and count once.", True
-        known[j] |= same
+        repeated[j] |= same
         findings.append(Finding(cause, f"{start} {end}", "left out"))
-    return known, findings
+    return repeated, findings
 
 
 def _shift(

@@ -12,9 +12,9 @@ from ..recording import Recording, Trial
 from ..sampling import cycle_means
 
 
-# Factor within which ranges of two signals are alike, and within which a ratio is a power of ten.
-# Larger: swapped columns pass; other settings are taken for units. Smaller: the reverse.
-_ALIKE, _NEAR_UNIT = 1.5, 1.2
+# Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
+# gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
+_ALIKE = 1.2
 # Least offset of another zero: in ranges, and in those of the other trials. Larger: offsets pass.
 # Smaller: scatter between trials is reported.
 _OFFSET, _OFF = 0.1, 10.0
@@ -44,8 +44,8 @@ def other_settings(
     middle, width = levels[..., 1], levels[..., 2] - levels[..., 0]
     of_outputs = [k for k, name in enumerate(names) if name in outputs]
     for s, trial in enumerate(trials):
-        others = np.arange(len(trials)) != s
-        usual, range_ = np.median(middle[others], axis=0), np.median(width[others], axis=0)
+        peers = np.arange(len(trials)) != s
+        usual, range_ = np.median(middle[peers], axis=0), np.median(width[peers], axis=0)
 
         # alike[i, j]: signal i is where signal j usually is.
         widths = np.broadcast_arrays(width[s][:, None], range_)
@@ -69,15 +69,15 @@ def other_settings(
             unit = 10.0**power
             # Pushes may be chosen to be ten times as strong.
             units = (1, 2, 3, 6) if name in outputs else (3, 6)
-            if abs(power) in units and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
+            if abs(power) in units and max(ratio / unit, unit / ratio) < _ALIKE:
                 text = (
                     f"{name} varies {ratio:.3g} times as much in trial '{trial.name}' as in the "
-                    f"others: if its unit is another one, divide it by {unit:g}."
+                    f"peers: if its unit is another one, divide it by {unit:g}."
                 )
                 yield Finding("another unit", text, "refused" if name in outputs else "warned")
                 continue
             off = abs(middle[s, k] - usual[k])
-            scatter = np.abs(middle[others, k] - usual[k]).max()
+            scatter = np.abs(middle[peers, k] - usual[k]).max()
             if name in outputs and off > max(_OFFSET * range_[k], _OFF * scatter):
                 yield Finding(
                     "another zero",
@@ -97,10 +97,10 @@ def clocks(recording: Recording) -> Iterator[Finding]:
     jumps = []
     steps = [float(np.median(np.diff(t.time))) for t in recording.trials]
     for s, trial in enumerate(recording.trials):
-        others = steps[:s] + steps[s + 1 :]
-        ratio = steps[s] / float(np.median(others)) if others else 1.0
+        peers = steps[:s] + steps[s + 1 :]
+        ratio = steps[s] / float(np.median(peers)) if peers else 1.0
         unit = 1000.0 ** np.round(np.log10(ratio) / 3)
-        if unit != 1 and max(ratio / unit, unit / ratio) < _NEAR_UNIT:
+        if unit != 1 and max(ratio / unit, unit / ratio) < _ALIKE:
             text = (
                 f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart as those of "
                 "the others: if its times have another unit (milliseconds), convert them."
@@ -123,10 +123,10 @@ def clocks(recording: Recording) -> Iterator[Finding]:
 def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
     """Find trials with another period, sign of an output, or start of the cycles."""
     for s, trial in enumerate(recording.trials):
-        others = [p for k, p in enumerate(phase.periods) if k != s and len(p)]
-        if not len(phase.periods[s]) or not others:
+        peers = [p for k, p in enumerate(phase.periods) if k != s and len(p)]
+        if not len(phase.periods[s]) or not peers:
             continue
-        period, usual = np.median(phase.periods[s]), np.median([np.median(p) for p in others])
+        period, usual = np.median(phase.periods[s]), np.median([np.median(p) for p in peers])
         if abs(period / usual - 1) > max(_OTHER_PERIOD, _SCATTERS * phase.jitter):
             yield Finding(
                 "another period",
@@ -138,9 +138,9 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
     columns = [recording.column(name) for name in outputs]
     pairs = phase.by_trial(recording)
     mean = np.array([[_average(t, k, parts) for k in columns] for t, parts in pairs])
-    known = np.flatnonzero(np.isfinite(mean).all(axis=(1, 2)))
-    for s in known if len(known) > 1 else ():
-        usual = np.median(mean[known[known != s]], axis=0)
+    finite = np.flatnonzero(np.isfinite(mean).all(axis=(1, 2)))
+    for s in finite.tolist() if len(finite) > 1 else ():
+        usual = np.median(mean[finite[finite != s]], axis=0)
         yield from _difference(mean[s], usual, recording.trials[s].name, outputs)
 
 
@@ -149,11 +149,11 @@ def _average(trial: Trial, column: int, parts: tuple[Winding, ...]) -> Float[np.
     x, at = trial.values[:, column], np.full(len(trial.time), np.nan)
     for part in parts:
         at = np.fmax(at, part.at(trial.time))
-    known = np.isfinite(at) & np.isfinite(x)
-    bins = (np.mod(at[known], 1) * _PHASES).astype(int) % _PHASES
+    finite = np.isfinite(at) & np.isfinite(x)
+    bins = (np.mod(at[finite], 1) * _PHASES).astype(int) % _PHASES
     count = np.bincount(bins, minlength=_PHASES)
     with np.errstate(invalid="ignore"):
-        mean = np.bincount(bins, x[known], _PHASES) / count
+        mean = np.bincount(bins, x[finite], _PHASES) / count
     return mean - mean.mean()
 
 

@@ -7,22 +7,22 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.arguments import Numbers, require_same
-from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import Positive
-from ..._core.boundary.values import Reals
-from ...errors import DefinitionError
-from ...experiments.data import ExperimentData
-from ...linear.ldtp import LDTP
-from .simulation import simulate_record
+from .._core.arguments import Numbers, require_same
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Positive
+from .._core.boundary.values import Reals
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..linear.ldtp import LDTP
+from .record_simulation import simulate_record
 
 
 class AmplitudeSweep(eqx.Module):
-    """How a linear model fails as inputs grow. Printing it gives a table.
+    """The misfit of a linear model for growing inputs. Printing it gives a table.
 
     **Fields:** `amplitudes` (A,): factors of the input; `rms` (A, nu): of the inputs; `misfit`
     (A, ny): rms of the difference from the model relative to the rms of the output, NaN where no
-    experiment ran to its end; `failed` (A,): experiments that did not.
+    experiment ran to its end; `failed` (A,): number of experiments that did not.
     """
 
     amplitudes: Float[np.ndarray, " A"]
@@ -34,9 +34,9 @@ class AmplitudeSweep(eqx.Module):
 
     @checked
     def limit(self, misfit: Positive) -> float:
-        """The amplitude up to which no output misfits more, between those tried by log-log lines.
+        """Return the amplitude up to which no misfit exceeds this one, by log-log interpolation.
 
-        **Raises:** `DefinitionError` if the smallest amplitude tried misfits more.
+        **Raises:** `DefinitionError` if the smallest amplitude tried has a larger misfit.
         """
         worst = np.where(np.isnan(self.misfit), np.inf, self.misfit).max(axis=1)
         beyond = np.flatnonzero(worst > misfit)
@@ -73,15 +73,15 @@ def amplitude_sweep(
     *,
     start: Literal["free", "cycle"] = "cycle",
 ) -> AmplitudeSweep:
-    """Apply an input at several amplitudes and compare with the linear model's response.
+    """Apply an input at several amplitudes and compare the outputs with the linear model's.
 
     **Arguments:**
 
-    - `run`: makes experiments from inputs (S, n, nu): a simulation, e.g.
+    - `run`: function that makes experiments from inputs (S, n, nu): a simulation, e.g.
       `lambda u: hj.run_experiments(cycle, sections, u, outputs)`, or a laboratory.
     - `model`: the linear one. `u` (S, n, nu): inputs at amplitude 1. `amplitudes` (A,): positive
       factors.
-    - `start`: as in `validate`; by default experiments start on the limit cycle.
+    - `start`: as in `validate`. Default: "cycle", experiments start on the limit cycle.
 
     **Raises:** `DefinitionError` for amplitudes that are not positive and finite.
     """

@@ -1,2 +1,0 @@
-from .lanes import Lanes as Lanes
-from .trajectory import Event as Event

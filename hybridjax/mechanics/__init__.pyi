@@ -1,1 +1,0 @@
-from .mechanism import Constrained as Constrained, Impact as Impact, Mechanism as Mechanism
