@@ -19,7 +19,7 @@ from .multiplier_estimate import (
     MultiplierComparison,
     Multipliers,
     channel_index,
-    compare_by_output,
+    compare_multipliers,
 )
 
 
@@ -90,7 +90,14 @@ class RationalFit(eqx.Module):
 
         **Raises:** `DefinitionError` for an output that is not there.
         """
-        return compare_by_output(list(self.multipliers), true, self.outputs, output)
+        chosen = range(len(self.outputs))
+        if output is not None:
+            chosen = [channel_index("output", output, self.outputs)]
+        parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
+        pairs = np.concatenate([(part.true, part.estimated) for part in parts], axis=1)
+        return MultiplierComparison(
+            *pairs, tuple(np.repeat([self.outputs[k] for k in chosen], len(parts[0].true)))
+        )
 
     def __repr__(self) -> str:
         rows = [
