@@ -147,7 +147,7 @@ def physical(family, design: hj.Design, noise: dict[str, float], free: tuple[str
         variance=np.broadcast_to(each, htf.H.shape),
     )  # fmt: skip
     system, observed = family.cycle.system, hj.ObservedHTF(htf, family.placed.family)
-    seen = hj.fitting.identifiability(system, observed, free, guess=family.cycle)
+    seen = hj.identifiability(system, observed, free, guess=family.cycle)
     slopes = []
     for name in free:
         values = [float(getattr(system, name)) * (1 + x) for x in (-_ASIDE, _ASIDE)]

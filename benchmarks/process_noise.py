@@ -1,6 +1,6 @@
 """Multipliers from series of a system that noise drives: innovations against output error.
 
-`hj.testing.synthetic_ldtp`, with every A 1.145 times as large, which makes multipliers of modulus
+`synthetic_ldtp`, with every A 1.145 times as large, which makes multipliers of modulus
 0.75; 300 cycles of white inputs of variance one. Noise enters where the first input does, white or
 colored (0.8 of it is left after a section, which takes one state more), with a standard deviation
 of `--size`; noise of the sensors, 0.1. The states at the starts are unknown. Printed, as `name

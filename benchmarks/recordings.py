@@ -22,6 +22,7 @@ from real_recordings import real  # noqa: F401 (called by its name)
 from scipy import stats
 
 import hybridjax as hj
+from hybridjax.recordings.sampling import without_drift
 from hybridjax.testing import spoil
 
 
@@ -218,7 +219,7 @@ def dirt(seeds=5, strides=500, noise=1e-4):
                 dirty = mishandle(dirty, mishap, seed=seed, **names)
             if drift is not None:
                 rough = hj.recordings.estimate_phase(dirty, phase_of(name))
-                dirty = hj.recordings.without_drift(dirty, rough, ("yM", "vM"), drift)
+                dirty = without_drift(dirty, rough, ("yM", "vM"), drift)
             data = at_sections(dirty, name)
             data = data if drift is None else data.with_drift(drift)
             fit = hj.fit_series(data.records, 2, check=False)

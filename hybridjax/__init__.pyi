@@ -3,15 +3,10 @@ from . import (
     designs as designs,
     errors as errors,
     experiments as experiments,
-    fitting as fitting,
     identify as identify,
-    mechanics as mechanics,
     models as models,
-    orbits as orbits,
     plot as plot,
     recordings as recordings,
-    scale as scale,
-    sections as sections,
     testing as testing,
 )
 from ._core.compilation import (
@@ -26,7 +21,7 @@ from ._core.vector_math.rewrite import enable_vector_math as enable_vector_math
 from .apps.recording_report import write_report as write_report
 from .designs.optimize import optimal_design as optimal_design
 from .engine.settings import Settings as Settings
-from .engine.trajectory import Trajectory as Trajectory, simulate as simulate
+from .engine.trajectory import simulate as simulate
 from .errors import (
     ComputationError as ComputationError,
     DefinitionError as DefinitionError,
@@ -38,12 +33,14 @@ from .experiments.design.multisine import multisine as multisine, paper_design a
 from .experiments.record import Record as Record
 from .experiments.response_function import response_function as response_function
 from .experiments.run import run_experiments as run_experiments
-from .fitting.fit import fit_model as fit_model
+from .fitting.fit import fit_model as fit_model, identifiability as identifiability
 from .fitting.observations import (
+    AbstractObservation as AbstractObservation,
     ObservedCycle as ObservedCycle,
     ObservedHTF as ObservedHTF,
     ObservedSeries as ObservedSeries,
 )
+from .fitting.stability import spectral_radius as spectral_radius
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
 from .identify.multipliers import fit_multipliers as fit_multipliers
@@ -54,17 +51,24 @@ from .identify.validate import validate as validate
 from .io import load as load, save as save
 from .linear.htf import HTF as HTF, Scatter as Scatter
 from .linear.ldtp import LDTP as LDTP
-from .orbits.branch import Branch as Branch
+from .mechanics.mechanism import Mechanism as Mechanism
+from .orbits.coincidence import coincidences as coincidences
 from .orbits.continuation import continuation as continuation
 from .orbits.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .orbits.cycle import LimitCycle as LimitCycle
 from .orbits.find import find_limit_cycle as find_limit_cycle
-from .orbits.limit_cycles import LimitCycles as LimitCycles, find_limit_cycles as find_limit_cycles
+from .orbits.limit_cycles import find_limit_cycles as find_limit_cycles
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .scale.draws import monte_carlo as monte_carlo
+from .scale.family import Points as Points
 from .scale.sweep import sweep as sweep
+from .sections.abstract import (
+    AbstractLevels as AbstractLevels,
+    AbstractSections as AbstractSections,
+    BoundSections as BoundSections,
+)
 from .sections.families import (
     ArcLength as ArcLength,
     ClockPhase as ClockPhase,
@@ -73,12 +77,11 @@ from .sections.families import (
 )
 from .sections.linearize import linearize as linearize
 from .sections.place import place_sections as place_sections
-from .sections.placed import PlacedSections as PlacedSections
 from .sections.section_map import section_map as section_map
 from .systems.chart import Chart as Chart
 from .systems.output import Output as Output
 from .systems.quotient import Quotient as Quotient
-from .systems.sliding import Sliding as Sliding, sliding as sliding
+from .systems.sliding import sliding as sliding
 from .systems.solver import Radau as Radau
 from .systems.system import (
     Guess as Guess,

@@ -85,7 +85,7 @@ with hj.plot.style():
 #
 # ## The best hopper of a given height
 #
-# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number
+# `hj.spectral_radius` is smooth everywhere, and a little above the true radius: the number
 # $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$.
 # Its slopes and those of the height of the apex go through the limit cycle and its events;
 # forwards, since there are only two parameters. The optimizer is one of scipy, for losses with
@@ -104,7 +104,7 @@ def look(kb):
         system = hj.models.VerticalHopper(k=kb[0], b=kb[1])
         found = hj.find_limit_cycle(system, cycle)
         height = hj.place_sections(found, [apex]).lanes.q[0, 0]
-        values = jnp.stack([height, jnp.log(hj.fitting.spectral_radius(found, smoothing=1e-4))])
+        values = jnp.stack([height, jnp.log(hj.spectral_radius(found, smoothing=1e-4))])
         return values, values
 
     slopes, values = jax.jacfwd(both, has_aux=True)(kb)

@@ -13,7 +13,8 @@ import pytest
 import hybridjax as hj
 from hybridjax._core.html import Curve, complex_number, multiplier_table, picture
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.orbits.branch import BranchEnd, BranchPoint
+from hybridjax.orbits.branch import Branch, BranchEnd, BranchPoint
+from hybridjax.orbits.limit_cycles import LimitCycles
 
 
 BYTES = 50_000  # the most that a result may take
@@ -56,7 +57,7 @@ def many(cycle, n):
     arrays, rest = eqx.partition(cycle, eqx.is_array)
     arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
     c = eqx.combine(arrays, rest)
-    return hj.LimitCycles(
+    return LimitCycles(
         c.system, c.base, c.period, c.anchor, c.legs, c.factors, c.residual, c.iterations,
         c.result, np.broadcast_to(c.event_sequence, (n, 2)), cycle.settings, c.conserved,
         c.multiplicity,
@@ -91,7 +92,7 @@ def test_many_cycles_and_branches(hopper_cycle):
     assert "left all bounds" in "".join(shown(lost).texts)
     point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
     end = BranchEnd(1.0, hj.Result.OK, "the <values> end")
-    branch = shown(hj.Branch("k", np.array([1.0, 2.0]), cycles, (point,), (end, end)))
+    branch = shown(Branch("k", np.array([1.0, 2.0]), cycles, (point,), (end, end)))
     assert {"flip", "2", "-1", "the <values> end"} <= set(branch.texts) and branch.pictures == 1
 
 

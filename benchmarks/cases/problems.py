@@ -17,6 +17,7 @@ import hybridjax as hj
 from hybridjax.experiments import campaign
 from hybridjax.experiments.campaign import Options, prepare
 from hybridjax.experiments.flow_batch import course, flow_batch
+from hybridjax.sections.placed import PlacedSections
 
 
 MODELS = {"hopper": hj.models.VerticalHopper, "bar": hj.models.TwoLeggedBar}
@@ -33,7 +34,7 @@ class Problem:
     """Experiments on a model, at sections that are placed on its cycle, with inputs (S, n, 1)."""
 
     label: str
-    placed: hj.PlacedSections
+    placed: PlacedSections
     outputs: tuple[str, str]
     u: np.ndarray
 

@@ -10,13 +10,14 @@ from .. import plot
 from .._core.writing import Format
 from ..engine.trajectory import Trajectory
 from ..orbits.cycle import LimitCycle
+from ..plot.look import Plot
 from ..sections.placed import PlacedSections
 from .paper_report import OUTPUTS
 
 
 _SYMBOLS = {"yM": "$y_M$", "vM": r"$\dot y_M$"}
 _DEVIATIONS = {"yM": r"$\delta y_M$", "vM": r"$\delta \dot y_M$"}
-Figures = Iterator[tuple[str, plot.Plot]]
+Figures = Iterator[tuple[str, Plot]]
 
 
 def save(out: Path, formats: Sequence[Format], figures: Figures) -> Iterator[str]:

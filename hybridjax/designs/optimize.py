@@ -164,7 +164,7 @@ def optimal_design(
     - `noise`: of each measured output, by name: the standard deviation of white noise, or a
       function that returns it by the frequency of the output (0 to N/2 cycles per period), the root
       of a spectrum. Or estimated noise: an `LDTPFit` with noise, or a model of noise as for
-      `hj.identify.noise_spectrum`. Default: all outputs are measured, with white noise 20 dB below
+      `LDTPFit.noise_spectrum`. Default: all outputs are measured, with white noise 20 dB below
       their rms deviation in `design` within the limits.
     - `largest`: largest amplitude of a cosine; a number, or a function of an array of f. Zero
       forbids a frequency. Default: no limit.

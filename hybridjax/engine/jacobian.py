@@ -30,12 +30,11 @@ def flow_jacobian(
     settings: Settings,
     h: Times | None = None,
     result: Index | None = None,
-    of_states: bool = False,
     new_input: bool = True,
     wanted: Wanted = True,
 ) -> tuple[Jacobians, Moved, Tape]:
-    """Derivative of (t, q) at the targets with respect to (t, q, u) at the start, at u = 0, or with
-    respect to q only (`of_states`). If it is not `wanted`, zeros: only the flow is computed then.
+    """Derivative of (t, q) at the targets with respect to q at the start, without input. If it is
+    not `wanted`, zeros: only the flow is computed then.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearizing first
@@ -48,7 +47,7 @@ def flow_jacobian(
     still, start, goal = fixed
     moved, tape = record(still, start, u, goal, settings, h, result, new_input, tangents=wanted)
     assert tape is not None
-    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states, wanted)
+    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True, wanted=wanted)
     if wanted is not True:
         end = jnp.where(wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q]))
     return jacobian, moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])), tape
@@ -63,8 +62,9 @@ def tape_jacobian(
     wanted: Wanted = True,
     across: Float[Array, "A d"] | None = None,
 ) -> tuple[Jacobians, Float[Array, "n L"]]:
-    """The Jacobians of `flow_jacobian` for a recorded flow, and (t, q) at the targets; both are
-    zeros if they are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
+    """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
+    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they are not
+    `wanted`. `across`: see `chain`; traced, it makes no difference."""
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
     columns, end = _push(s, lanes, target, tape, of_states, wanted)

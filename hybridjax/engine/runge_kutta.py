@@ -27,9 +27,6 @@ _UNROLLED_LANES = 128
 # Eliminations are unrolled up to this number of columns. Higher: they compile for longer. Lower: a
 # loop for each small system.
 _UNROLLED_COLUMNS = 4
-# Newton's iterations for the stages end after this number. Higher: longer steps where the field is
-# most nonlinear. Lower: steps are rejected there.
-_ITERATIONS = 12
 
 
 class Step(NamedTuple):
@@ -209,7 +206,7 @@ def _increments(method, field, t, q, h):
 
     def unsettled(carry):
         *_, going, i = carry
-        return going & (i < _ITERATIONS)
+        return going & (i < 12)  # a step that needs more is rejected for its error
 
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0

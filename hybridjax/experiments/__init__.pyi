@@ -1,5 +1,5 @@
 from .campaign import Options as Options
-from .design.multisine import optimize_phases as optimize_phases, single_cosine as single_cosine
+from .design.multisine import optimize_phases as optimize_phases
 from .noise import (
     ProcessNoise as ProcessNoise,
     add_noise as add_noise,

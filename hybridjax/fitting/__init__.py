@@ -1,6 +1,1 @@
 """Physical parameters from data."""
-
-import lazy_loader
-
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

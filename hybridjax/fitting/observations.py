@@ -51,7 +51,7 @@ class AbstractObservation(eqx.Module):
     have no derivative where two meet):
 
     ```python
-    class ObservedMultipliers(hj.fitting.AbstractObservation):
+    class ObservedMultipliers(hj.AbstractObservation):
         seen: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
@@ -75,7 +75,7 @@ class AbstractObservation(eqx.Module):
         `legs` and `factors` have derivatives by the free parameters, and so have results of
         `linearize` and `place_sections`. Functions that need concrete values raise an error, such
         as `cycle.multipliers`: use `linearize(...).monodromy()`, `characteristic_polynomial()`, or
-        `hj.fitting.spectral_radius`.
+        `hj.spectral_radius`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.

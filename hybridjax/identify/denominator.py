@@ -38,7 +38,7 @@ def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by decreasing modulus, of each pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
     roots = np.pad(roots, (0, len(coefficients) - len(roots)))  # numpy drops roots at zero
-    return roots[np.lexsort((-roots.imag, -np.abs(roots)))]
+    return roots[np.lexsort((-np.imag(roots), -np.abs(roots)))]
 
 
 class Covariance(NamedTuple):
@@ -107,10 +107,10 @@ def fading(c: Coefficients) -> Coefficients:
 
 def in_blocks(x: Float[np.ndarray, "S T *rest"], count: int) -> Float[np.ndarray, "B length *rest"]:
     """Divide the T cycles of each record into blocks, the last one filled up with zeros."""
-    S, T, *rest = x.shape
+    S, T, *shape = x.shape
     length = -(-T // count)
-    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(rest)
-    return np.pad(x, padding).reshape(S * count, length, *rest)
+    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(shape)
+    return np.pad(x, padding).reshape(S * count, length, *shape)
 
 
 def inverse_of_remainder(

@@ -74,12 +74,12 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     """
     from scipy.optimize import linear_sum_assignment  # (a third of a second)
 
-    found, truth = np.asarray(estimated, complex).ravel(), np.asarray(true, complex).ravel()
-    if found.size == 0 or truth.size == 0:
+    values, truth = np.asarray(estimated, complex).ravel(), np.asarray(true, complex).ravel()
+    if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
-    rows, columns = linear_sum_assignment(np.abs(found[:, None] - truth))
-    order = np.lexsort((-truth[columns].imag, -np.abs(truth[columns])))
-    return MultiplierComparison(true=truth[columns][order], estimated=found[rows][order])
+    rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
+    order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
+    return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
 
 
 def compare_by_output(
@@ -147,7 +147,7 @@ class MultiplierEstimate(eqx.Module):
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
         with np.errstate(all="ignore"):
             gradient = -powers / slope[:, None]
-        real = self.multipliers.imag == 0
+        real = np.imag(self.multipliers) == 0
         parts = np.stack([gradient.real, np.where(real[:, None], 0.0, gradient.imag)], axis=1)
         return np.einsum("iaj,jk,ibk->iab", parts, self.covariance, parts)
 
@@ -193,7 +193,7 @@ class MultiplierEstimate(eqx.Module):
         A conjugate pair is one hypothesis, not two.
         """
         truth = np.atleast_1d(np.asarray(true, complex)).ravel()
-        return self.distance(truth) <= self._radius(level, np.where(truth.imag == 0, 1, 2))
+        return self.distance(truth) <= self._radius(level, np.where(np.imag(truth) == 0, 1, 2))
 
     @checked
     def ellipse(

@@ -216,7 +216,7 @@ def fit_rational(
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
-    finite = finite[np.lexsort((-finite.imag, -np.abs(finite)))]
+    finite = finite[np.lexsort((-np.imag(finite), -np.abs(finite)))]
     return np.concatenate([np.full(len(coefficients) - 1 - len(finite), np.nan), finite])
 
 
@@ -264,4 +264,4 @@ class _Problem(NamedTuple):
 
 
 def _real(z: Complex[np.ndarray, "F n"]) -> Float[np.ndarray, "rows n"]:
-    return np.concatenate([z.real, z.imag])
+    return np.concatenate([np.real(z), np.imag(z)])

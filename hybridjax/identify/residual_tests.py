@@ -81,7 +81,7 @@ class Independence:
             rows = (section == n) & complete & np.isfinite(now[:, i])
             more = np.concatenate([past[rows], now[rows, i, None]], axis=1)
             self.counts[n, i] += len(more)
-            self.triangles[n, i] = np.linalg.qr(np.concatenate([triangle, more]), mode="r")
+            self.triangles[n, i] = _triangle(np.concatenate([triangle, more]))
 
     def result(
         self, level: float
@@ -111,6 +111,10 @@ class Independence:
         count = np.array([len(x) for x in ratios])
         p = stats.norm.sf(deviates / np.sqrt(np.maximum(count, 1)))
         return z, p, np.array([_smallest_visible(x, level) for x in ratios])
+
+
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    return np.linalg.qr(rows)[1]
 
 
 def _deviate(ratio, a: int, b: int):
@@ -145,7 +149,7 @@ def _smallest_visible(ratios: Sequence[tuple[int, int]], level: float) -> float:
     limit = np.log(_LARGEST)
     if not shortfall(limit) > 0:
         return np.inf
-    return float(np.exp(optimize.brentq(shortfall, -limit, limit, xtol=1e-3)))
+    return float(np.exp(optimize.root_scalar(shortfall, bracket=(-limit, limit), xtol=1e-3).root))
 
 
 def sections_of(records: Sequence[Record]) -> Int[np.ndarray, " n"]:

@@ -191,7 +191,7 @@ def _compressed(free, left, everything: bool):
     """Return pairs (Q, z) with no more columns of z than rows, and the same residuals."""
     if everything:
         free, left = free[:1], [np.concatenate(left, axis=1)]
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T, mode="r").T for z in left]
+    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in left]
     return list(zip(free, fewer, strict=True))
 
 

@@ -173,8 +173,8 @@ def validate(
     cycles, or all records are too short to be compared or for so many lags; for noise that does not
     belong to the model, or has an output without noise.
     """
-    free_start, model = start == "free", _with_noise(model, noise)
-    records = _Comparable(model, data, free_start, lags)
+    free_start, tested = start == "free", _with_noise(model, noise)
+    records = _Comparable(tested, data, free_start, lags)
     longest, sampled = records.longest, records.with_past(0)
     N, outputs, ny = longest.n_sections, longest.outputs, len(longest.outputs)
     fewest, spread = sampled.min(axis=0), records.spread
@@ -198,7 +198,7 @@ def validate(
     white, independent = Whiteness(N, lags, ny), Independence(N, lags, ny, len(longest.inputs))
     square, power, samples = np.zeros((N, ny)), np.zeros(ny), 0
     for group in in_groups(records.all()):
-        simulated = [simulate_record(model, record, free_start) for record in group]
+        simulated = [simulate_record(tested, record, free_start) for record in group]
         residuals = [r.y - y for r, y in zip(group, simulated, strict=True)]
         section, error = sections_of(group), np.concatenate(residuals)
         square += [np.nansum(error[section == n] ** 2, axis=0) for n in range(N)]
@@ -219,7 +219,7 @@ def validate(
         autocorrelation=auto,
         cross_correlation=cross,
         measured=longest.y[shown],
-        simulated=simulate_record(model, longest, free_start)[shown],
+        simulated=simulate_record(tested, longest, free_start)[shown],
         level=level,
         first_section=longest.first_section,
         left_out=records.left_out,

@@ -71,13 +71,13 @@ class HTFGroup(NamedTuple):
 
     def split(self, values: Complex[np.ndarray, "E n"]) -> Inexact[np.ndarray, "rows n"]:
         """Return one row for each equation of the numerators."""
-        return np.concatenate([values.real, values.imag]) if self.real else values
+        return np.concatenate([np.real(values), np.imag(values)]) if self.real else values
 
     def components(self, rows: Inexact[np.ndarray, "rows n"]) -> Float[np.ndarray, "2 E n"]:
         """Return the real and imaginary parts of rows that `split` has made."""
         if self.real:
             return rows.reshape(2, len(self.period_delay), -1)
-        return np.stack([rows.real, rows.imag])
+        return np.stack([np.real(rows), np.imag(rows)])
 
     def weighted(
         self, c: Coefficients, values: Complex[np.ndarray, "E n"]
@@ -149,7 +149,7 @@ class DelayedResponses(NamedTuple):
 
         (The Gram matrix itself would lose half of the digits.)
         """
-        triangle = np.linalg.qr(self.columns, mode="r")
+        _, triangle = np.linalg.qr(self.columns)
         return np.linalg.solve(np.linalg.cholesky(self.noise_gram), triangle.T)
 
 
@@ -298,7 +298,9 @@ def _groups(
 
     powers = np.exp(-2j * np.pi / htf.n_sections * f[:, None] * np.arange(size))
     powers, delay = both(powers, powers.conj()), np.exp(-2j * np.pi * f)
-    basis, to_powers = powers_basis(np.concatenate([powers.real, powers.imag]) if real else powers)
+    basis, to_powers = powers_basis(
+        np.concatenate([np.real(powers), np.imag(powers)]) if real else powers
+    )
 
     weights, data = entries(weight), entries(np.asarray(htf.H))
     scale = weights[0]

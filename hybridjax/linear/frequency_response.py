@@ -31,15 +31,15 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
 
     **Raises:** `DefinitionError` for harmonics that are out of range, repeated, or none.
     """
-    known = all_harmonics(n_sections)
+    every = all_harmonics(n_sections)
     if harmonics is None:
-        return known
+        return every
     integers = tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
-    outside = [m for m in integers if m not in known]
+    outside = [m for m in integers if m not in every]
     if outside:
         raise DefinitionError(
             f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "
-            f"{known[0]} to {known[-1]}."
+            f"{every[0]} to {every[-1]}."
         )
     if len(set(integers)) < len(integers) or not integers:
         raise DefinitionError(f"`harmonics` must be distinct and at least one: {integers}.")

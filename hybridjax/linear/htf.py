@@ -20,7 +20,7 @@ from ..errors import DefinitionError
 from .frequency_response import Frequencies, Harmonics, check_harmonics
 
 
-# Of three realizations that scatter evenly, relative to the mean for normal errors.
+# The largest roundness: that of three realizations that scatter evenly.
 _ROUNDEST = 3
 
 
@@ -61,7 +61,7 @@ class Scatter(eqx.Module):
             raise DefinitionError(f"`roundness` must be at most {_ROUNDEST}.")
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
-        r"""How large $|\delta H|^2 / v$ is with this probability at most.
+        r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
         $\nu (\alpha^{-1/\nu} - 1)$, Fisher's $F_{2, 2\nu}$, of $\alpha = (1 - p)(1 + p^2 (w - 1))$
         for the level p and the roundness w. Of normal errors the shape of the scatter says nothing
@@ -76,18 +76,20 @@ class Scatter(eqx.Module):
         return freedom * jnp.expm1(-jnp.log(miss) / freedom)
 
 
-# Distance in cycles per period up to which two frequencies are the same. Doubled: lines of designs
-# with periods beyond 5e8 are not told apart, instead of 1e9.
+# Distance in cycles per period up to which two frequencies are the same. Smaller: rounding makes
+# them different. Larger: lines of very long designs coincide.
 _SAME_FREQUENCY = 1e-9
-# A gap between frequencies is interpolated if it is no wider than so many of the widest step
-# (between frequencies that were measured). Doubled: errors of the spline in a gap grow 16 times.
+# Widest gap between frequencies that is interpolated, in widest steps between frequencies that were
+# measured. Larger: errors of the spline grow as its fourth power. Smaller: single gaps are refused.
 _WIDEST_GAP = 2
 Variance = Annotated[Numbers, Reals("M F ny nu", sign="nonnegative", infinite=True)]
 
-# Outputs and harmonics that a notebook shows: the largest ones of these. Doubled: twice the size.
-_SHOWN_OUTPUTS, _SHOWN_HARMONICS = 3, 5
+# Outputs, and harmonics (the largest ones), that a notebook shows. More: larger pages. Fewer: parts
+# of the response are hidden.
+_SHOWN = 4
 
-# Part of the largest line of an input below which a line is rounding. Doubled: none but rounding.
+# Part of the largest line of an input below which a line is rounding. Smaller: rounding counts as
+# an input. Larger: weak lines are ignored.
 _SILENT_LINE = 1e-10
 
 
@@ -188,9 +190,9 @@ class HTF(eqx.Module):
         f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
         order = np.argsort(f)
         u, peaks = self.inputs[0], np.nanmax(H, axis=1)
-        largest = np.argsort(-np.nanmax(peaks, axis=1), kind="stable")[:_SHOWN_HARMONICS]
+        largest = np.argsort(-np.nanmax(peaks, axis=1), kind="stable")[:_SHOWN]
         drawn, rows = [], []
-        for j, y in enumerate(self.outputs[:_SHOWN_OUTPUTS]):
+        for j, y in enumerate(self.outputs[:_SHOWN]):
             curves = [
                 Curve(f[order], H[k, order, j], f"H_{self.harmonics[k]}", COLORS[i])
                 for i, k in enumerate(np.sort(largest))
@@ -227,14 +229,14 @@ class HTF(eqx.Module):
         """
         if is_traced(self.f, f):
             raise DefinitionError("`at` must know `f`: call it outside of jit.")
-        wanted, known = np.atleast_1d(np.asarray(f, float)), np.asarray(self.f)
-        distance = np.abs(known - wanted[:, None])
+        wanted, measured = np.atleast_1d(np.asarray(f, float)), np.asarray(self.f)
+        distance = np.abs(measured - wanted[:, None])
         nearest = np.argmin(distance, axis=1)
         lost = ~(distance.min(axis=1) < _SAME_FREQUENCY)
         if lost.any():
             raise DefinitionError(
                 f"f = {wanted[lost][0]:.10g} was not excited or not measured; the nearest one is "
-                f"{known[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
+                f"{measured[nearest[lost][0]]:.10g} (`interpolate` goes between them)."
             )
         return self._with(self.f[nearest], lambda x: x[:, nearest], self.harmonics)
 
@@ -306,8 +308,8 @@ class HTF(eqx.Module):
             line = make_interp_spline(*self._neighbors(values), k=1, axis=1)
             return line(place)
 
-        found = self._with(wanted, linear, self.harmonics)
-        return eqx.tree_at(lambda x: x.H, found, from_host(H))
+        htf = self._with(wanted, linear, self.harmonics)
+        return eqx.tree_at(lambda x: x.H, htf, from_host(H))
 
     def predict(self, u: Annotated[Numbers, Reals("n nu")]) -> Float[Array, "time ny"]:
         """The periodic response to an input that repeats for ever.
@@ -338,23 +340,23 @@ class HTF(eqx.Module):
         periods = n // self.n_sections
         U = np.fft.fft(values, axis=0)
         excited = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
-        lines, conjugate, here = [], [], []
+        lines, conjugate, rows = [], [], []
         for k in excited:
             for sign in (1, -1):
                 distance = np.abs(self._circle(np.asarray(self.f) - sign * k / periods))
                 if len(distance) and distance.min() < _SAME_FREQUENCY:
                     lines.append(k)
                     conjugate.append(sign < 0)
-                    here.append(int(np.argmin(distance)))
+                    rows.append(int(np.argmin(distance)))
                     break
             else:
                 raise DefinitionError(
                     f"`u` holds the frequency f = {abs(self._circle(k / periods)):g} cycles per "
                     "period, where the HTFs are not known."
                 )
-        lines, here = np.array(lines, int), np.array(here, int)
+        lines, rows = np.array(lines, int), np.array(rows, int)
         conjugate = np.array(conjugate, bool)[:, None, None]
-        H = jnp.where(conjugate, jnp.conj(self.H[np.array(mirror)][:, here]), self.H[:, here])
+        H = jnp.where(conjugate, jnp.conj(self.H[np.array(mirror)][:, rows]), self.H[:, rows])
         parts = jnp.einsum("mkij,kj->mki", H, U[lines])
         places = (lines + periods * np.array(self.harmonics)[:, None]) % n
         Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)
@@ -408,9 +410,9 @@ class HTF(eqx.Module):
         return self.harmonics.index(m)
 
     def _mirror(self):
-        """For each harmonic the index of its negative, or `None` if one is not stored."""
-        known = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
-        mirror = [known.get(-m % self.n_sections) for m in self.harmonics]
+        """The index of the negative of each harmonic, or `None` if one is not stored."""
+        rows = {m % self.n_sections: row for row, m in enumerate(self.harmonics)}
+        mirror = [rows.get(-m % self.n_sections) for m in self.harmonics]
         return None if None in mirror else mirror
 
     def _neighbors(self, values):

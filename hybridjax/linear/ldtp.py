@@ -27,11 +27,11 @@ from .multipliers import product_eigenvalues, product_rank
 Matrix = Annotated[Numbers, Reals("rows columns")]
 Signals = Annotated[Numbers, Reals("n nu")]
 
-# Singular values of a factor below this part of its largest one are zero. Doubled: a multiplier
-# that is carried by so weak a direction counts as zero.
+# Singular values of a factor below this part of its largest one are zero. Smaller: rounding is
+# taken for multipliers. Larger: multipliers of weak directions count as zero.
 _RANK_TOLERANCE = 1e-12
-# Distance of z^N from a multiplier, below which less than half of the digits are left of a
-# response. Doubled: responses twice as far from the resonance are refused.
+# Distance of z^N from a multiplier at which a response is refused. Smaller: responses keep less
+# than half of their digits. Larger: accurate ones are refused.
 _RESONANCE = 1e-8
 
 
@@ -181,9 +181,9 @@ class LDTP(eqx.Module):
         if is_traced(self):
             return None
         names = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
-        known = facts({**names, "dimension": self._dimension()})
+        lines = facts({**names, "dimension": self._dimension()})
         multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        return card("LDTP", f"{self.n_sections} sections", known, *multipliers)
+        return card("LDTP", f"{self.n_sections} sections", lines, *multipliers)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
@@ -290,7 +290,7 @@ class LDTP(eqx.Module):
     def periodic_states(
         self, u: Annotated[Numbers, Reals("S n nu")], periods: PeriodCount
     ) -> Float[Array, "S d"]:
-        """As `periodic_state`, for S inputs (S, P N, nu) at once."""
+        """States as of `periodic_state`, for S inputs (S, P N, nu) at once."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
             raise DefinitionError(

@@ -15,11 +15,13 @@ from ..errors import ComputationError
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# Rounds of balancing. Doubled, units that differ by more are evened out.
+# Rounds of balancing. Fewer: units that differ by much remain. More: nothing changes any more.
 _BALANCING = 8
-# QR sweeps for one eigenvalue; two or three are usual. Doubled: failure is noticed later.
+# QR sweeps for one eigenvalue; two or three are usual. Fewer: rare ones fail. More: failure takes
+# longer.
 _MOST_SWEEPS = 60
-# After so many sweeps in vain the shift is chosen otherwise. Doubled: a cycle of shifts ends later.
+# Sweeps after which an exceptional shift breaks a cycle of shifts. Fewer: convergence is disturbed.
+# More: a cycle of shifts ends later.
 _EXCEPTIONAL_EVERY = 10
 
 

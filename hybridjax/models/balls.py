@@ -37,15 +37,8 @@ class BouncingBall(HybridSystem):
         return {"fall": BallFall(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "bounce",
-                "fall",
-                "fall",
-                guard=lambda t, q, u: q[0],
-                reset=lambda t, q, u: (0.0, -self.restitution * q[1]),
-            ),
-        )
+        bounced = lambda t, q, u: (0.0, -self.restitution * q[1])  # noqa: E731
+        return (Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),)
 
 
 class JugglerFall(Chart):

@@ -15,14 +15,17 @@ from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
-def tips(arms: Float[Array, "k n"], q: Float[Array, " n"]) -> Float[Array, "2 k"]:
+Arms = Float[Array | np.ndarray, "k n"]
+
+
+def tips(arms: Arms, q: Float[Array, " n"]) -> Float[Array, "2 k"]:
     """Positions of points of a chain of links relative to its foot. `arms` are their coordinates
     along each link, q the links' angles from the vertical."""
     return jnp.stack([jnp.sin(q), jnp.cos(q)]) @ arms.T
 
 
 def chain(
-    arms: Float[Array, "k n"],
+    arms: Arms,
     masses: Float[Array, " k"],
     inertias: Float[Array, " n"] | float,
     g: Parameter,
@@ -118,24 +121,16 @@ class TorsoWalker(HybridSystem):
         """The walker by three angles, and for the floating base also by the position (x, y) of the
         stance foot."""
         half = self.r / 2
-        legs = half * jnp.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
-        arms = legs + self.l * jnp.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
+        legs = half * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
+        arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
         return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
 
     def charts(self):
         return {"step": TorsoStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "touchdown",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[0] - self.stride,
-                direction="rising",
-                reset=self._touchdown,
-            ),
-        )
+        angle = lambda t, q, u: q[0] - self.stride  # noqa: E731
+        return (Transition("touchdown", "step", "step", angle, "rising", self._touchdown),)
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
@@ -144,7 +139,7 @@ class TorsoWalker(HybridSystem):
         return jnp.concatenate([q[swapped], after[swapped]])
 
     def _swing_foot(self, q):
-        return q[3:] + tips(self.r * jnp.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
+        return q[3:] + tips(self.r * np.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
 
     def guess(self):
         start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
@@ -236,15 +231,15 @@ class FiveLinkBiped(HybridSystem):
         about_joint = jnp.stack([self.shin_inertia, self.thigh_inertia, self.torso_inertia])[order]
         center = jnp.stack([self.shin_center, self.thigh_center, self.torso_center])[order]
         # Along whole links from the foot on, then along a part of the link itself.
-        links = jnp.array(
+        links = np.array(
             [[1, 0, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, 0, 0], [1, 1, 0, -1, 0]]
         )
-        arms = self.length * links + center[:, None] * jnp.diag(jnp.array([-1, -1, 1, -1, -1]))
+        arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
         return chain(arms, m, about_joint - m * center**2, self.g)
 
     def _swing_foot(self, q):
         """Position (x, y) of the swing foot relative to the stance foot."""
-        return tips(self.length * jnp.array([[1.0, 1.0, 0.0, -1.0, -1.0]]), q[:5])[:, 0]
+        return tips(self.length * np.array([[1.0, 1.0, 0.0, -1.0, -1.0]]), q[:5])[:, 0]
 
     def outputs(self):
         """`leg`: the angle of the line from stance foot to hip, which grows all the time."""
@@ -254,16 +249,10 @@ class FiveLinkBiped(HybridSystem):
         return {"step": BipedStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "touchdown",
-                "step",
-                "step",
-                guard=lambda t, q, u: self._swing_foot(q)[1],
-                reset=self._touchdown,
-                enabled=lambda t, q, u: self._swing_foot(q)[0] > 0,
-            ),
-        )
+        height = lambda t, q, u: self._swing_foot(q)[1]  # noqa: E731
+        ahead = lambda t, q, u: self._swing_foot(q)[0] > 0  # noqa: E731
+        landing = Transition("touchdown", "step", "step", height, "falling", self._touchdown, ahead)
+        return (landing,)
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))

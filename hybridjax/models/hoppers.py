@@ -68,21 +68,13 @@ class VerticalHopper(HybridSystem):
         return {"flight": HopperFlight(self), "stance": HopperStance(self)}
 
     def transitions(self):
+        height = lambda t, q, u: q[2]  # noqa: E731
+        landed = lambda t, q, u: (q[0], self.retention * q[1])  # noqa: E731
+        force = lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g  # noqa: E731
+        lifted = lambda t, q, u: (q[0], q[1], 0.0, 0.0)  # noqa: E731
         return (
-            Transition(
-                "touchdown",
-                "flight",
-                "stance",
-                guard=lambda t, q, u: q[2],
-                reset=lambda t, q, u: (q[0], self.retention * q[1]),
-            ),
-            Transition(
-                "liftoff",
-                "stance",
-                "flight",
-                guard=lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g,
-                reset=lambda t, q, u: (q[0], q[1], 0.0, 0.0),
-            ),
+            Transition("touchdown", "flight", "stance", height, reset=landed),
+            Transition("liftoff", "stance", "flight", force, reset=lifted),
         )
 
     def period(self):

@@ -131,7 +131,7 @@ class TrottingQuadruped(TwoLeggedBar):
     `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both feet of a pair
     stand, a reflex adds `thrust` to the force of the legs. Without it, the order in which the feet
     land has no effect of first order, and the cycle has multipliers; with it, each order has a
-    derivative of its own (`hj.orbits.coincidences`), and `find_limit_cycle` says so.
+    derivative of its own (`hj.coincidences`), and `find_limit_cycle` says so.
 
     The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
     piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
@@ -209,24 +209,14 @@ class SLIPRunner(HybridSystem):
         return {"flight": RunnerFlight(self), "stance": RunnerStance(self)}
 
     def transitions(self):
-        attack = lambda u: self.angle + u[0]  # noqa: E731
+        height = lambda t, q, u: q[0] - self.l0 * jnp.sin(self.angle + u[0])  # noqa: E731
+        landed = lambda t, q, u: (-self.l0 * jnp.cos(self.angle + u[0]), *q)  # noqa: E731
+        down = lambda t, q, u: q[2] < 0  # noqa: E731
+        stretch = lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0  # noqa: E731
+        lifted = lambda t, q, u: q[1:]  # noqa: E731
         return (
-            Transition(
-                "touchdown",
-                "flight",
-                "stance",
-                guard=lambda t, q, u: q[0] - self.l0 * jnp.sin(attack(u)),
-                reset=lambda t, q, u: (-self.l0 * jnp.cos(attack(u)), *q),
-                enabled=lambda t, q, u: q[2] < 0,
-            ),
-            Transition(
-                "liftoff",
-                "stance",
-                "flight",
-                guard=lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0,
-                direction="rising",
-                reset=lambda t, q, u: q[1:],
-            ),
+            Transition("touchdown", "flight", "stance", height, reset=landed, enabled=down),
+            Transition("liftoff", "stance", "flight", stretch, "rising", lifted),
         )
 
     def guess(self):

@@ -52,16 +52,9 @@ class RimlessWheel(HybridSystem):
         return {"swing": WheelSwing(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "impact",
-                "swing",
-                "swing",
-                guard=lambda t, q, u: q[0] - self.slope - self.alpha,
-                direction="rising",
-                reset=lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1]),
-            ),
-        )
+        angle = lambda t, q, u: q[0] - self.slope - self.alpha  # noqa: E731
+        after = lambda t, q, u: (self.slope - self.alpha, jnp.cos(2 * self.alpha) * q[1])  # noqa: E731
+        return (Transition("impact", "swing", "swing", angle, "rising", after),)
 
     def guess(self):
         return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))
@@ -97,17 +90,9 @@ class SimplestWalker(HybridSystem):
         return {"step": SimplestStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "heelstrike",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[1] - 2 * q[0],
-                direction="rising",
-                reset=_heelstrike,
-                enabled=lambda t, q, u: q[0] < 0,
-            ),
-        )
+        foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
+        ahead = lambda t, q, u: q[0] < 0  # noqa: E731
+        return (Transition("heelstrike", "step", "step", foot, "rising", _heelstrike, ahead),)
 
     def guess(self):
         """The long-period gait; `short_gait` is the other one."""
@@ -178,16 +163,12 @@ class CompassGait(HybridSystem):
         return {"step": CompassStep(self)}
 
     def transitions(self):
-        return (
-            Transition(
-                "heelstrike",
-                "step",
-                "step",
-                guard=lambda t, q, u: q[0] + q[1] + 2 * self.slope,
-                reset=self._heelstrike,
-                enabled=lambda t, q, u: q[1] < 0,
-            ),
+        foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731
+        ahead = lambda t, q, u: q[1] < 0  # noqa: E731
+        strike = Transition(
+            "heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead
         )
+        return (strike,)
 
     def _heelstrike(self, t, q, u):
         """Angular momentum about the new foot, and of the new swing leg about the hip, are kept."""

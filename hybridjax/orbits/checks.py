@@ -20,20 +20,18 @@ from .return_map import LEGS, Turn
 from .scale import fastest, is_implicit, points
 
 
-# A schedule divides the clock's period if the quotient is this near to a whole number. Smaller:
-# rounding rejects schedules that fit. Larger: turns that differ are taken for equal.
-_WHOLE = 1e-6
-# A function is the same at two times up to this part of its value, and this part of the change that
-# its derivatives predict over the states' sizes and the period. Smaller: rounding is taken for a
-# wrong clock. Larger: small errors of a stated period pass.
-_SAME, _SAME_SLOPE = 1e-6, 1e-9
+# Relative difference up to which a schedule divides the clock's period, a function has the same
+# value at two times, and the gradient of a conserved quantity is a left eigenvector of the
+# monodromy. Smaller: rounding and errors of the flow are taken for differences. Larger: wrong
+# clocks, and quantities that are lost slowly, pass.
+_SAME = 1e-6
+# The part of a function's change over the states' sizes and the period, as its derivatives predict
+# it, that is no difference between two times. Smaller: rounding is. Larger: small errors of a
+# stated period pass.
+_SAME_SLOPE = 1e-9
 # Times at which functions are compared, after that of each point, in parts of the period: fields
 # that jump with a clock do not jump there, and no shift is a multiple of another.
 _BASE, _LATER = 0.0729, np.array([0.1459, 0.3820, 0.6180, 1.4142])
-# The gradient of a conserved quantity, in sizes of the states, is a left eigenvector of the
-# monodromy up to this part of it. Smaller: errors of the flow are taken for losses. Larger: small
-# losses pass.
-_CONSERVED = 1e-6
 # A system is stiff if a mode decays to this power of e in one piece of a turn. Smaller: systems are
 # blamed that only move fast. Larger: stiff ones are not.
 _STIFF = 20.0
@@ -50,7 +48,7 @@ def check_clock(s: Structure) -> None:
             if given is None:
                 raise DefinitionError(_no_period(s, f"'{transition.name}' is scheduled"))
             ratio = period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < _WHOLE:
+            if not abs(ratio - round(min(ratio, 1e9))) < _SAME:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise no turn is like the last one."
@@ -62,7 +60,7 @@ def check_clock(s: Structure) -> None:
             times[x.name] = (offset + every * np.arange(round(period / every))) % period
         for (name, first), (other, second) in itertools.combinations(times.items(), 2):
             apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
-            if np.min(np.abs(apart)) < _WHOLE * period:
+            if np.min(np.abs(apart)) < _SAME * period:
                 raise DefinitionError(
                     f"'{name}' and '{other}' are scheduled for the same time in chart '{chart}': "
                     "write them as one event, or let one lead to a chart that the other leaves."
@@ -157,7 +155,7 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     rows = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
     values, gradients = rows[:, 0], rows[:, 2 : 2 + n]
     changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= _CONSERVED * np.abs(gradients * sizes).max(axis=1)
+    kept = changes <= _SAME * np.abs(gradients * sizes).max(axis=1)
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
@@ -169,7 +167,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float) -> str:
         return (
             f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
             "they come in one order or the other, and no linearization holds for both: "
-            "`hj.orbits.coincidences` of the cycle, which `throw=False` returns, has the "
+            "`hj.coincidences` of the cycle, which `throw=False` returns, has the "
             "derivatives of each. Let them happen at different times, or write them as one event."
         )
     if code == Result.SINGULAR:

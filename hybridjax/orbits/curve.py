@@ -38,9 +38,6 @@ _FLOOR, _SHARE = 1e-3, 0.02
 # Nothing moves if the largest move is at most this part of the largest state, all in sizes.
 # Smaller: an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e-6
-# A multiplier is complex, and two are conjugate, up to these differences. Larger: real pairs with
-# the product 1 that are close are taken for a Neimark-Sacker point. Smaller: rounding hides one.
-_COMPLEX, _CONJUGATE = 1e-9, 1e-6
 
 
 @dataclasses.dataclass
@@ -115,7 +112,7 @@ class Point:
     def has_pair_on_circle(self) -> bool:
         """True if the pair of multipliers whose product is closest to 1 is a complex one."""
         x, y = min(self.pairs, key=lambda pair: abs(pair[0] * pair[1] - 1))
-        return bool(abs(x.imag) > _COMPLEX and abs(x - np.conj(y)) < _CONJUGATE)
+        return bool(x.imag != 0 and x == np.conj(y))
 
 
 class Curve:

@@ -201,7 +201,7 @@ class ReturnMap(eqx.Module):
         def flow(lanes, target, h, result):
             jacobian, moved, tape = flow_jacobian(
                 s, lanes, target, self.settings, h, result,
-                of_states=True, new_input=False, wanted=wanted,
+                new_input=False, wanted=wanted,
             )  # fmt: skip
             factor = jacobian[0, 1 : n + 1]
             if direction is not None:

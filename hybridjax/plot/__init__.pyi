@@ -1,5 +1,5 @@
 from .designs import information as information, spectrum as spectrum, strides as strides
-from .fit_quality import amplitude as amplitude, validation as validation
+from .fit_quality import validation as validation
 from .frequency import (
     bode as bode,
     bodes as bodes,
@@ -8,9 +8,7 @@ from .frequency import (
 )
 from .look import (
     COLORS as COLORS,
-    COLUMN as COLUMN,
     PAGE as PAGE,
-    Plot as Plot,
     save as save,
     style as style,
 )

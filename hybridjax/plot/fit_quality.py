@@ -8,11 +8,10 @@ from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import PeriodCount, Positive
+from .._core.boundary.kinds import PeriodCount
 from .._core.text import p_value
-from ..identify.amplitude import AmplitudeSweep
 from ..identify.validate import Validation
-from .look import COLORS, CYCLE, PAGE, AxesLike, Plot, axis_of, label_of, letters, panels
+from .look import CYCLE, PAGE, AxesLike, Plot, axis_of, letters, panels
 
 
 @checked
@@ -70,32 +69,3 @@ def _stems(ax: Axes, lags, values, color, shift: float, limit: float) -> None:
     ax.axhline(0, color="black", lw=0.5)
     ax.set_ylabel("std. deviations")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-@checked
-def amplitude(
-    sweep: AmplitudeSweep,
-    *,
-    misfit: Positive | None = None,
-    labels: Mapping[str, str] | None = None,
-    ax: AxesLike | None = None,
-) -> Plot:
-    """The misfit of a linear model against the amplitude of the input, on logarithmic axes.
-
-    **Arguments:** `misfit`: one that is allowed; the amplitude up to which it is kept is marked.
-    """
-    with panels(ax) as axes:
-        panel = axes[0, 0]
-        for i, name in enumerate(sweep.outputs):
-            line = dict(marker="o", color=CYCLE[i % len(CYCLE)], label=label_of(name, labels))
-            panel.loglog(sweep.amplitudes, sweep.misfit[:, i], **line)
-        bad = sweep.failed > 0
-        for a in sweep.amplitudes[bad]:
-            panel.axvline(a, color=COLORS["red"], lw=0.6, ls=":")
-        if misfit is not None:
-            panel.axhline(misfit, color="0.5", lw=0.6)
-            panel.axvline(sweep.limit(misfit), color="0.5", lw=0.6)
-        panel.set_xlabel("factor of the input")
-        panel.set_ylabel("misfit / output (rms)")
-        panel.legend()
-    return Plot(axes)

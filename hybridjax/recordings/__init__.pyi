@@ -6,4 +6,4 @@ from .impulse import impulse_responses as impulse_responses
 from .inspection.inspect import inspect as inspect
 from .natural import natural_multipliers as natural_multipliers
 from .phase_estimation import estimate_phase as estimate_phase
-from .sampling import section_data as section_data, without_drift as without_drift
+from .sampling import section_data as section_data

@@ -1,6 +1,1 @@
 """Sweeps and Monte Carlo in pieces, on one machine or many, with results as labeled arrays."""
-
-import lazy_loader
-
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -75,7 +75,7 @@ def sweep(
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
     - `over`: values of each parameter by name, of which all combinations are taken; or
-        `hj.scale.Points`.
+        `hj.Points`.
     - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
         chart), "multipliers", "spectral_radius" (their largest modulus), "events" (at most four
         times as many as cycles of the coarse pass have), "residual"; and functions of a

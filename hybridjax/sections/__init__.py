@@ -1,6 +1,1 @@
 """Families of Poincaré sections; subclass `AbstractSections` to add one."""
-
-import lazy_loader
-
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

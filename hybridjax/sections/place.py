@@ -30,15 +30,12 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .abstract import AbstractSections, BoundSections, Orbit
 from .families import FamilyLike, as_family
-from .placed import PlacedSections, SectionsLike
+from .placed import GRACE, PlacedSections, SectionsLike
 
 
 # Least bound on the steps of the flow from one section to the next. Smaller: cycles with many
 # events between two sections fail. Larger: failures last longer.
 PATIENCE = 1024
-# Periods after which the flow to a section gives up. Less than 1: sections are missed. Larger: a
-# section that does not exist takes longer to notice.
-_LONGEST_WAY = 1.5
 # Rounding errors of the clock's phase, and the least distance of two sections, in periods. Smaller:
 # rounding moves a section into the next period. Larger: sections that are distinct are rejected.
 _SAME = 1e-9
@@ -129,13 +126,13 @@ def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections,
         return record(s, lanes, u, target, settings, h, result, tangents=True)
 
     def to(lanes, h, result, time, i, event, levels):
-        ends = time[None], i[None], event[None], lanes.t + _LONGEST_WAY * period
+        ends = time[None], i[None], event[None], lanes.t + (1 + GRACE) * period
         return go(lanes, h, result, Target(*ends, None, levels, Result.SECTION_MISSED))
 
     begin = cycle.anchor, (0.1 * period / N)[None], xp.zeros(1, xp.int32)
     zero = xp.zeros(1, xp.int32)[0]
     if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + _LONGEST_WAY * period)
+        target = toward(xp.full(1, np.inf), -1, cycle.anchor.t + (1 + GRACE) * period)
         first, _ = go(*begin, to_section(target, family.anchor))
         bound = _bind(s, cycle, family, first.lanes, go)
     else:

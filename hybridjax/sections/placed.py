@@ -25,7 +25,7 @@ from .families import FamilyLike
 
 # Periods after the arrival of the cycle itself at which a flow to a section gives up. Smaller: late
 # arrivals are lost. Larger: failures take longer.
-_GRACE = 0.5
+GRACE = 0.5
 
 
 @checked_methods
@@ -171,7 +171,7 @@ def section_target(
     """The target of lanes that flow to section i, `turns` periods after the first turn."""
     xp, arrival = namespace(t), lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
-    limit = xp.maximum(arrival, t) + _GRACE * period
+    limit = xp.maximum(arrival, t) + GRACE * period
     return Target(time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED)
 
 

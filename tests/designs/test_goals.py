@@ -189,6 +189,6 @@ def test_physical_parameters():
     variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1))
     x = hj.HTF(htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance)
     observed = hj.ObservedHTF(x, sections)
-    S = hj.fitting.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
+    S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
     np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.identify.joint.noise import noise_spectrum
 
 from .conftest import TWO_NOISE
 
@@ -113,7 +114,7 @@ def test_noise_of_a_model(two, optimal_two, isochron_ldtp):
     assert plan.certificate < 1.03
     harmonics = (-1, 0, 1)
     htf = two.htf(plan.usual.frequencies, harmonics)
-    spectrum = hj.identify.noise_spectrum(red, htf.f, harmonics)[..., None]
+    spectrum = noise_spectrum(red, htf.f, harmonics)[..., None]
     variance = spectrum * plan.usual.expected_variance()[:, None, :]
     htf = hj.HTF(htf.f, htf.H, harmonics, 6, two.inputs, two.outputs, variance=variance)
     bound = hj.identify.multiplier_bound(two, htf)

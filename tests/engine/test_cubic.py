@@ -69,11 +69,3 @@ def test_a_guard_that_starts_at_zero_must_leave_it_first():
     )
     # s^3 - s^2 + 0.1 s (zero to first order only) falls and rises without being positive first.
     assert np.isinf(crossing(-1e-18, -0.5, 0.0, -1.0, armed=False).position[0])
-
-
-def test_degenerate_cubics():
-    assert np.isinf(crossing(1.0, 1.0, 0.0, 0.0).position[0])  # constant
-    np.testing.assert_allclose(crossing(1.0, -1.0, -2.0, -2.0).position[0], 0.5, atol=1e-15)  # line
-    np.testing.assert_allclose(
-        crossing(1.0, 0.0, -1.0, -1.0).position[0], 1.0, atol=1e-15
-    )  # at the end

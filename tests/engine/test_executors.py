@@ -110,14 +110,6 @@ def test_both_find_the_same_cycle(hopper_cycle, compiled):
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
 
 
-def test_both_linearize_alike(kinematic_ldtp, compiled):
-    _, ldtp = compiled
-    for name in ("A", "B", "C", "D"):
-        np.testing.assert_allclose(
-            getattr(kinematic_ldtp, name), getattr(ldtp, name), atol=1e-10, err_msg=name
-        )
-
-
 class Decay(hj.HybridSystem):
     """x' = -rate x + u, reset to 1 where x falls to `level`: its period is -log(level) / rate."""
 
@@ -160,12 +152,3 @@ def test_a_class_of_the_same_name_is_another_system():
     for factor, direction in ((1.0, "falling"), (3.0, "falling"), (3.0, "rising")):
         time = first_kick(again(factor, direction))
         np.testing.assert_allclose(time, np.log(0.9 / 0.5) / factor, rtol=1e-9)
-
-
-def test_a_long_job_is_compiled_and_its_result_is_the_same(monkeypatch):
-    quick = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
-    monkeypatch.setattr(compilation, "_WORTH_COMPILING", -1.0)
-    compiled = hj.simulate(Decay(level=0.7), "x", [0.9], 3.0)
-    assert [e.name for e in quick.events] == [e.name for e in compiled.events]
-    np.testing.assert_allclose(quick.t, compiled.t, rtol=1e-13)
-    np.testing.assert_allclose(quick.after, compiled.after, rtol=1e-13)

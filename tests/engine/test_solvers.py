@@ -10,11 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 import hybridjax as hj
-from hybridjax._core.executor import to_host
 from hybridjax.engine.runge_kutta import inverse, take_step
-from hybridjax.orbits.scale import stiff_charts
 from hybridjax.systems.solver import as_method
-from hybridjax.systems.structure import Structure
 
 from ..toys import Field
 
@@ -150,22 +147,6 @@ def test_linearization_of_a_stiff_system(damped):
     ratio = size / size[:, None]
     np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
     np.testing.assert_allclose(B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8)
-
-
-def test_stiffness_is_told(damped):
-    explicit, implicit = Structure(Damped()), Structure(damped.system)
-    assert stiff_charts(explicit, to_host(damped.legs), 1.0) == pytest.approx({"a": -FAST})
-    assert not stiff_charts(implicit, to_host(damped.legs), 1.0) and "stiff" not in repr(damped)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Kvaerno5()], ids=str)
-def test_solvers_of_diffrax_give_the_same_cycle(solver):
-    cycle = hj.find_limit_cycle(
-        hj.models.VerticalHopper(), settings=hj.Settings(solver=solver, max_steps=4000)
-    )
-    default = hj.find_limit_cycle(hj.models.VerticalHopper())
-    np.testing.assert_allclose(cycle.multipliers, default.multipliers, atol=1e-9)
 
 
 @pytest.mark.slow

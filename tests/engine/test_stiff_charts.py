@@ -101,13 +101,6 @@ def test_derivatives_under_all_transformations(cycle):
 
 
 @pytest.mark.slow
-def test_a_sweep(cycle):
-    slow = np.array([4.0, 5.0, 7.0])
-    found = hj.find_limit_cycles([Thermostat(slow=x) for x in slow], cycle)
-    np.testing.assert_allclose(found.period, [exact(slow=x)[0] for x in slow], rtol=1e-8)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
 def test_experiments(cycle, start):
     sections = [hj.AtEvent("on"), hj.AtEvent("off")]

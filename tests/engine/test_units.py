@@ -96,25 +96,6 @@ def test_sizes_of_each_of_many_flows_and_derivatives():
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------
 
 
-def run(length, time):
-    system = hopper(length, time)
-    state = np.array([2.0, 1.9]) * sizes(length, time)[:2]
-    return hj.simulate(system, "stance", state, 3.0 * time)
-
-
-@pytest.mark.parametrize("length, time", UNITS[::3])
-def test_a_trajectory_takes_the_same_steps_in_all_units_of_length(length, time):
-    """In units of time, too, but for the first step."""
-    usual, other = run(1.0, 1.0), run(length, time)
-    if time == 1.0:
-        np.testing.assert_array_equal(other.t, usual.t)
-    assert [e.name for e in other.events] == [e.name for e in usual.events]
-    ends = [x.after[-1] / sizes(*u) for x, u in ((usual, (1.0, 1.0)), (other, (length, time)))]
-    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9, atol=1e-9)
-    times = [[e.time for e in x.events] for x in (usual, other)]
-    np.testing.assert_allclose(np.array(times[1]) / time, times[0], rtol=1e-10)
-
-
 class Any(hj.HybridSystem):
     """One chart with any field."""
 
@@ -152,15 +133,6 @@ def test_states_at_rest_stop_nothing(function, start, end):
         np.testing.assert_allclose(found.after[-1][1:], end, rtol=1e-9)
     else:
         np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
-
-
-def test_a_state_that_rounding_moves_beside_others():
-    """It takes no more steps than they do: rounding depends on a state, or on time."""
-    small = lambda t: (1 + 0.1 * jnp.cos(3 * t)) * 3 - 3 - 0.3 * jnp.cos(3 * t)  # noqa: E731
-    field = lambda t, q, u: (q[1], -q[0], -q[2] + (q[0] + 3.0 - q[0] - 3.0), small(t) - q[3])  # noqa: E731
-    found = hj.simulate(Any(field, 4), "x", (1.0, 0.0, 0.0, 0.0), 30.0)
-    assert len(found.t) < 400
-    np.testing.assert_allclose(found.after[-1], (np.cos(30.0), -np.sin(30.0), 0, 0), atol=1e-8)
 
 
 def test_derivatives_need_sizes():

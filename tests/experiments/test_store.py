@@ -10,7 +10,9 @@ import pytest
 import hybridjax as hj
 from hybridjax.experiments import StoredExperiments
 from hybridjax.experiments.campaign import Options
+from hybridjax.experiments.design.multisine import single_cosine
 from hybridjax.experiments.stored import prepare_pieces
+from hybridjax.identify.htf_estimate import missing_frequencies
 
 from ..conftest import OUTPUTS
 
@@ -67,7 +69,7 @@ def test_estimates_take_it_chunk_by_chunk(made, whole):
     estimate, expected = hj.estimate_htf(made), hj.estimate_htf(whole)
     error = np.abs(estimate.H - expected.H).max() / np.abs(expected.H).max()
     assert error < 1e-12
-    assert len(hj.identify.missing_frequencies(made)) == 0
+    assert len(missing_frequencies(made)) == 0
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -130,7 +132,7 @@ def test_another_system_is_refused(made, arguments):
 def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
-    design = hj.experiments.single_cosine([0.25, 0.75], 32, 4)
+    design = single_cosine([0.25, 0.75], 32, 4)
     options = Options(start=start)
     job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
     _, layout = job.begin(None)

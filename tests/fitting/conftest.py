@@ -48,7 +48,7 @@ def hopper_htf(hopper_cycle):
 @pytest.fixture(scope="session")
 def seen_in_htf(hopper_cycle, hopper_htf):
     data = hj.ObservedHTF(hopper_htf, SECTIONS)
-    return hj.fitting.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
+    return hj.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
 
 
 @pytest.fixture(scope="session")
@@ -63,6 +63,4 @@ def hopper_observed(hopper_cycle):
 
 @pytest.fixture(scope="session")
 def seen_in_cycle(hopper_cycle, hopper_observed):
-    return hj.fitting.identifiability(
-        hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle
-    )
+    return hj.identifiability(hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle)

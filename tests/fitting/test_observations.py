@@ -58,7 +58,7 @@ def test_names_that_the_system_does_not_know_are_refused(hopper_cycle):
         (hj.ObservedSeries(records(inputs="force", outputs="yM"), SECTIONS), "force"),
     ):
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.fitting.identifiability(system, data, "k", guess=hopper_cycle)
+            hj.identifiability(system, data, "k", guess=hopper_cycle)
 
 
 def test_only_experiments_that_ran_well_are_used():

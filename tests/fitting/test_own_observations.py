@@ -14,7 +14,7 @@ import hybridjax as hj
 TRUTH = hj.models.PaddleJuggler()
 
 
-class MultipliersBetweenSections(hj.fitting.AbstractObservation):
+class MultipliersBetweenSections(hj.AbstractObservation):
     """Coefficients of the characteristic polynomial, from a linearization."""
 
     seen: Array
@@ -26,7 +26,7 @@ class MultipliersBetweenSections(hj.fitting.AbstractObservation):
         return model.characteristic_polynomial()[1:3] - self.seen
 
 
-class MultipliersOfTheCycle(hj.fitting.AbstractObservation):
+class MultipliersOfTheCycle(hj.AbstractObservation):
     """The same from the factors of the cycle, as a class that declares nothing."""
 
     seen: Array

@@ -20,14 +20,14 @@ def test_it_is_bounded_as_stated(seed, smoothing):
     A = np.random.default_rng(seed).normal(size=(2, 3, 3))
     values, vectors = np.linalg.eig(A[1] @ A[0])
     true, loss = np.abs(values).max(), np.linalg.cond(vectors) ** 2 * smoothing
-    found = float(hj.fitting.spectral_radius(model(jnp.asarray(A)), smoothing))
+    found = float(hj.spectral_radius(model(jnp.asarray(A)), smoothing))
     assert found >= true / np.sqrt(1 - smoothing / 3) * (1 - 1e-9)
     assert loss >= 1 or found <= true / np.sqrt(1 - loss) * (1 + 1e-9)
 
 
 def test_it_is_the_sum_that_it_is_said_to_be():
     A = jnp.array([[[0.5, 0.7], [-0.2, 0.3]]])
-    found = float(hj.fitting.spectral_radius(model(A), 1e-2))
+    found = float(hj.spectral_radius(model(A), 1e-2))
     powers = [np.linalg.matrix_power(np.asarray(A[0]) / found, j) for j in range(3000)]
     total = sum(np.sum(p**2) for p in powers)
     assert total == pytest.approx(2 / 1e-2, rel=1e-9)
@@ -39,7 +39,7 @@ def test_it_has_a_derivative_where_multipliers_meet(e, mode):
     """Multipliers are 1 +- sqrt(e): at e = 0 their matrix is a Jordan block."""
 
     def radius(e):
-        return hj.fitting.spectral_radius(model(jnp.array([[[1.0, 1.0], [e, 1.0]]])))
+        return hj.spectral_radius(model(jnp.array([[[1.0, 1.0], [e, 1.0]]])))
 
     h = 1e-6
     difference = (radius(e + h) - radius(e - h)) / (2 * h)
@@ -53,7 +53,7 @@ def test_its_derivative_tends_to_that_of_the_radius():
         c, s = 0.8 * jnp.cos(1 + 3 * p), 0.8 * jnp.sin(1 + 3 * p)
         skew = jnp.array([[1.0, 2.0], [0.0, 1.0]])
         A = (1 + p) * skew @ jnp.array([[c, -s], [s, c]]) @ jnp.linalg.inv(skew)
-        return hj.fitting.spectral_radius(model(A[None]), smoothing)
+        return hj.spectral_radius(model(A[None]), smoothing)
 
     errors = [abs(float(jax.grad(radius)(0.0, eps)) - 0.8) for eps in (1e-2, 1e-4, 1e-6)]
     assert errors[1] < 0.05 * errors[0] and errors[2] < 0.05 * errors[1] and errors[2] < 1e-4
@@ -62,13 +62,11 @@ def test_its_derivative_tends_to_that_of_the_radius():
 def test_a_cycle_and_its_sections_agree_as_far_as_the_bias_allows(hopper_cycle, isochron_ldtp):
     true = np.abs(hopper_cycle.multipliers).max()
     for which in (hopper_cycle, isochron_ldtp):
-        errors = [
-            float(hj.fitting.spectral_radius(which, eps)) / true - 1 for eps in (1e-2, 1e-4, 1e-6)
-        ]
+        errors = [float(hj.spectral_radius(which, eps)) / true - 1 for eps in (1e-2, 1e-4, 1e-6)]
         assert errors[0] > errors[1] > errors[2] > 0 and errors[2] < 1e-4
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 1.0, -1e-3])
 def test_a_smoothing_out_of_range_is_refused(isochron_ldtp, smoothing):
     with pytest.raises(hj.DefinitionError, match="`smoothing` must be a number between 0 and 1"):
-        hj.fitting.spectral_radius(isochron_ldtp, smoothing)
+        hj.spectral_radius(isochron_ldtp, smoothing)

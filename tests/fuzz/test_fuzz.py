@@ -75,11 +75,3 @@ def test_the_loop_follows_a_clock_and_says_what_is_too_close():
     later = sample.arrows[0] | {"c": -0.75 - 1e-7}
     close = sample._replace(arrows=[sample.arrows[0], later])
     assert follow(twins, close)[2].excluded == "events too close"
-
-
-def test_the_loop_passes_what_is_not_enabled():
-    plan, sample = line(n=np.ones(1), c=-0.75, k=np.zeros(1), k0=-1.0)
-    gated = plan._replace(arrows=(Arrow(0, 0, "rising", gated=True),))
-    times, _, run = follow(gated, sample)
-    assert not times and run.excluded is None
-    np.testing.assert_allclose(run.q, 4.5, atol=1e-13)

@@ -6,6 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybridjax as hj
+from hybridjax.experiments.design.multisine import single_cosine
+from hybridjax.identify.htf_estimate import missing_frequencies
+from hybridjax.identify.joint.noise import noise_spectrum
+from hybridjax.recordings.sampling import without_drift
 
 from .things import APEX, NAMES as STATES, PHASE
 
@@ -26,9 +30,9 @@ def positional(function):
 def scale(t):
     yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
     yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
-    yield hj.scale.Points, dict(values={"x": [1.0]})
+    yield hj.Points, dict(values={"x": [1.0]})
     good = dict(ranges={"x": (0.0, 1.0)}, count=4)
-    yield hj.scale.Points.sobol, good
+    yield hj.Points.sobol, good
 
 
 def systems(t):
@@ -131,7 +135,7 @@ def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield hj.paper_design, lines | dict(experiments=8)
-    yield hj.experiments.single_cosine, dict(f=0.25, n_sections=6, periods=16)
+    yield single_cosine, dict(f=0.25, n_sections=6, periods=16)
     yield (
         hj.Design.from_lines,
         dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0, n_sections=6, periods=16),
@@ -170,7 +174,7 @@ def experiments(t):
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield hj.identify.missing_frequencies, dict(data=t.repeated)
+    yield missing_frequencies, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
@@ -187,7 +191,7 @@ def estimates(t):
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
     yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
-    yield hj.identify.noise_spectrum, dict(noise=t.model, f=np.array([0.1]))
+    yield noise_spectrum, dict(noise=t.model, f=np.array([0.1]))
     yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
     yield hj.identify.realize, dict(source=t.exact)
 
@@ -205,8 +209,8 @@ def series(t):
 def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     yield hj.fit_model, both
-    yield hj.fitting.identifiability, both
-    yield hj.fitting.spectral_radius, dict(model=t.model)
+    yield hj.identifiability, both
+    yield hj.spectral_radius, dict(model=t.model)
     yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
     yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
     values = np.ones((4, 2))
@@ -263,7 +267,7 @@ def recordings(t):
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
     yield (
-        hj.recordings.without_drift,
+        without_drift,
         dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
@@ -312,7 +316,6 @@ def plots(t):
     yield plot.phase, dict(found=t.phase)
     yield plot.section_data, dict(data=t.section_data)
     yield plot.validation, dict(found=t.validation)
-    yield plot.amplitude, dict(sweep=t.sweep)
     yield plot.save, dict(path="figure", plot=t.plot)
 
 
@@ -323,7 +326,7 @@ def rhythms(t):
         return q[0]
 
     yield hj.sliding, dict(charts=charts, surface=surface)
-    yield hj.orbits.coincidences, dict(cycle=t.cycle)
+    yield hj.coincidences, dict(cycle=t.cycle)
     about = dict(recording=t.recording, phase=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(found=t.beats)

@@ -7,7 +7,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.model import PeriodicModel, local_coordinates
-from hybridjax.identify.joint.noise import Predictor
+from hybridjax.identify.joint.noise import Predictor, noise_spectrum
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.series.records import CycleGrid
 
@@ -158,7 +158,7 @@ def test_noise_that_drives_the_system_is_found(small):
     data, other = noisy(small, noise, 600, 0), noisy(small, noise, 300, 1)
     fit = hj.fit_ldtp(data, small.dims, noise="innovations")
     f = np.linspace(0.05, 0.45, 9)
-    ratio = fit.noise_spectrum(f) / hj.identify.noise_spectrum(noise, f)
+    ratio = fit.noise_spectrum(f) / noise_spectrum(noise, f)
     assert np.abs(np.log(ratio)).max() < 0.6 and abs(np.log(ratio).mean()) < 0.1
     assert fit.contains(small.multipliers, 0.999).all()
     assert hj.validate(fit, other, level=1e-3).white
@@ -209,13 +209,13 @@ def test_the_filter_is_that_of_riccati(unit):
 
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
-    assert hj.identify.noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
+    assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
     f, N = np.array([0.1, 0.3]), 4
     white = hj.LDTP(np.zeros((N, 1, 1)), np.zeros((N, 1, 2)), np.zeros((N, 2, 1)),
                     np.broadcast_to(0.3 * np.eye(2), (N, 2, 2)))  # fmt: skip
-    np.testing.assert_allclose(hj.identify.noise_spectrum(white, f), 0.09)
+    np.testing.assert_allclose(noise_spectrum(white, f), 0.09)
     noise = driven(small, 0.3)
-    found = hj.identify.noise_spectrum(noise, f, (-1, 1))
+    found = noise_spectrum(noise, f, (-1, 1))
     for row, m in zip(found, (-1, 1), strict=True):
         H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
         np.testing.assert_allclose(row, (np.abs(H) ** 2).sum(axis=(0, 3)), rtol=1e-9)
@@ -240,4 +240,4 @@ def test_bad_input_is_refused_in_a_sentence(small):
     with pytest.raises(hj.DefinitionError, match="have no noise of their own"):
         hj.validate(small, data, noise=driven(small, 0.3, sensor=0.0))
     with pytest.raises(hj.DefinitionError, match="a multiplier of modulus"):
-        hj.identify.noise_spectrum(eqx.tree_at(lambda m: m.A, small, 2 * small.A), 0.1)
+        noise_spectrum(eqx.tree_at(lambda m: m.A, small, 2 * small.A), 0.1)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments.design.multisine import single_cosine
 
 from ..linear.conftest import hopper as hopper
 
@@ -23,7 +24,7 @@ def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full):
     """The window begins one period after the start."""
     for design, discard in (
         (full, 10),
-        (hj.experiments.single_cosine(np.arange(1, 48, 2) / 16, 32, 16), 1),
+        (single_cosine(np.arange(1, 48, 2) / 16, 32, 16), 1),
     ):
         data = hj.experiments.simulate_experiments(hopper, design, discard=discard)
         assert errors(hopper, data) > 1e-3

@@ -4,21 +4,6 @@ import pytest
 import hybridjax as hj
 
 
-# Dimensions 3, 2, 3, 2, 3, 2, two inputs, two outputs; rows separated by ";".
-SYNTHETIC = [
-    (".5 -.3 .2; .4 .6 -.1", "1 0; .5 -.2", "1 0 0; 0 1 -1", "0 0; 0 0"),
-    (".7 .2; -.5 .8; .3 .1", ".3 .1; 0 1; -.4 .2", "1 .5; 0 1", ".1 0; 0 0"),
-    (".6 .1 -.4; -.2 .9 .3", ".2 .6; -1 .1", "0 1 .2; 1 0 0", "0 0; 0 -.2"),
-    (".8 -.6; .5 .7; -.1 .4", ".5 0; .1 -.3; 0 .7", ".5 1; -1 0", "0 0; .3 0"),
-    (".9 .2 .1; -.3 .7 .5", "-.6 .4; .2 .8", "1 0 .3; .2 -1 0", "0 0; 0 0"),
-    ("1.1 -.4; .3 .9; .2 -.7", "0 .5; 1 -.1; .3 .2", "0 1; 1 1", "0 .1; 0 0"),
-]
-
-
-def parse(text):
-    return np.array([row.split() for row in text.split(";")], float)
-
-
 def blocks_at_random(seed, dims, ny, nu, gain=0.7):
     """Random matrices A, B, C, D; every `A[n]` has the norm `gain`."""
     rng = np.random.default_rng(seed)
@@ -45,8 +30,8 @@ def simulate_blocks(blocks, u, x0, start=0):
 
 @pytest.fixture(scope="session")
 def synthetic():
-    columns = zip(*[[parse(text) for text in row] for row in SYNTHETIC], strict=True)
-    return hj.LDTP.from_blocks(*columns)
+    """Dimensions 3, 2, 3, 2, 3, 2, two inputs, two outputs."""
+    return hj.testing.synthetic_ldtp()
 
 
 @pytest.fixture(scope="session")

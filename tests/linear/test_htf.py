@@ -92,7 +92,7 @@ def test_hopper_at_all_frequencies_and_harmonics(exact, reference):
     assert exact.harmonic_errors(expected).shape == (32, 2)
 
 
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([0.125, 0.375, -0.375, 0.875]))
 def test_three_ways_agree(seed, shape, f):
     dims, ny, nu = shape
@@ -122,19 +122,7 @@ def test_three_ways_agree(seed, shape, f):
     np.testing.assert_allclose(htf.H[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12)
 
 
-@settings(max_examples=10)
-@given(seeds, st.sampled_from(SHAPES), st.floats(-3, 3))
-def test_symmetry_for_real_signals_and_period_in_f(seed, shape, f):
-    dims, ny, nu = shape
-    N = len(dims)
-    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
-    htf = ldtp.htf([f, -f, f + N])
-    for m in range(-N, N + 1):
-        np.testing.assert_allclose(htf[-m][1], np.conj(htf[m][0]), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(htf[m][2], htf[m][0], rtol=0, atol=1e-12)
-
-
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(seeds, st.sampled_from(SHAPES))
 def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
@@ -179,13 +167,6 @@ def test_jit_and_vmap(synthetic):
     batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].multiply(2.0))
     many = eqx.filter_vmap(lambda ldtp: ldtp.htf(f, (0, 1)))(batch)
     np.testing.assert_allclose(many.H, np.stack([plain.H, 2 * plain.H]), rtol=0, atol=1e-14)
-
-
-def test_one_frequency_and_one_harmonic(synthetic):
-    htf = synthetic.htf(0.4, harmonics=0)
-    assert htf.H.shape == (1, 1, 2, 2)
-    np.testing.assert_array_equal(htf[0], htf.harmonic(0))
-    np.testing.assert_array_equal(synthetic.htf([0.4], (1, -3))[3], synthetic.htf([0.4])[-3])
 
 
 def test_interpolation_fills_the_gaps(hopper):

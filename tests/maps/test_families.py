@@ -12,7 +12,7 @@ import hybridjax as hj
 from ..conftest import APEX, OUTPUTS
 
 
-class ChosenPhases(hj.sections.AbstractSections):
+class ChosenPhases(hj.AbstractSections):
     """Sections at chosen phases of the clock, in periods."""
 
     label: ClassVar[str] = "chosen"
@@ -30,13 +30,13 @@ class ChosenPhases(hj.sections.AbstractSections):
         pass
 
     def bind(self, s, orbit):
-        return hj.sections.BoundSections.at_times(self.phases * orbit.period)
+        return hj.BoundSections.at_times(self.phases * orbit.period)
 
     def describe(self, i):
         return f"section {i} (phase {float(self.phases[i]):.3g})"
 
 
-class Levels(hj.sections.AbstractLevels):
+class Levels(hj.AbstractLevels):
     values: Float[Array, " N"]
 
     def present(self, s, a):
@@ -46,7 +46,7 @@ class Levels(hj.sections.AbstractLevels):
         return q[0] - self.values[i]
 
 
-class FallingPast(hj.sections.AbstractSections):
+class FallingPast(hj.AbstractSections):
     """Sections where the first state falls past each of some values."""
 
     label: ClassVar[str] = "falling past"
@@ -64,7 +64,7 @@ class FallingPast(hj.sections.AbstractSections):
         pass
 
     def bind(self, s, orbit):
-        return hj.sections.BoundSections.at_levels(Levels(self.values), self.n_sections)
+        return hj.BoundSections.at_levels(Levels(self.values), self.n_sections)
 
     def describe(self, i):
         return f"section {i} (at {float(self.values[i]):.3g})"

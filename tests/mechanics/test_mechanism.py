@@ -22,11 +22,11 @@ def double_pendulum():
     def kinetic(q, v):
         return 0.5 * m * jnp.sum(jax.jvp(place, (q,), (v,))[1] ** 2)
 
-    return hj.mechanics.Mechanism(kinetic, lambda q: m * G * jnp.sum(place(q)[:, 1]))
+    return hj.Mechanism(kinetic, lambda q: m * G * jnp.sum(place(q)[:, 1]))
 
 
 def free_ball():
-    return hj.mechanics.Mechanism(lambda q, v: 0.5 * M * jnp.sum(v**2), lambda q: M * G * q[1])
+    return hj.Mechanism(lambda q, v: 0.5 * M * jnp.sum(v**2), lambda q: M * G * q[1])
 
 
 def test_a_double_pendulum_moves_as_textbooks_say():
@@ -83,7 +83,7 @@ class Losing(hj.Chart):
     states = ("x", "y", "vx", "vy")
 
     def field(self, t, q, u):
-        body = hj.mechanics.Mechanism(
+        body = hj.Mechanism(
             lambda q, v: 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2
         )
         return jnp.concatenate([q[2:], body.acceleration(q[:2], q[2:])])

@@ -22,7 +22,7 @@ LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
 
 def test_each_order_of_the_feet_has_its_derivative(cycle):
     assert cycle.result == hj.Result.COINCIDENCE
-    found = sorted(hj.orbits.coincidences(cycle), key=lambda x: x.time)
+    found = sorted(hj.coincidences(cycle), key=lambda x: x.time)
     np.testing.assert_allclose([x.time for x in found], [0.48890534976601, 0.79608769379953])
     for both, expected in zip(found, (LET_GO, LAND), strict=True):
         assert not both.commute and len(both.orders) == 2

@@ -46,11 +46,6 @@ def test_a_forgotten_period_of_the_field():
         find(Oscillator(lambda t, x: 0.5 * jnp.cos(1.3 * t)))
 
 
-def test_a_dependence_on_time_that_the_guess_does_not_show():
-    with pytest.raises(hj.DefinitionError, match="field of chart 'a' depends on t"):
-        find(Oscillator(lambda t, x: 0.1 * x * jnp.cos(1.3 * t)), 0.0, 2.0)
-
-
 @pytest.mark.parametrize(
     "system, message",
     [

@@ -84,7 +84,7 @@ def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
     cycle = hj.find_limit_cycle(Race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
-    (found,) = hj.orbits.coincidences(cycle)
+    (found,) = hj.coincidences(cycle)
     assert found.time % 1.0 == pytest.approx(0.5) and not found.commute
     exact = {
         ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),

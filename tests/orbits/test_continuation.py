@@ -73,7 +73,7 @@ def test_neimark_sacker_of_the_juggler(juggling):
         branch.find("Hopf")
 
 
-@settings(max_examples=6, phases=(Phase.generate,))
+@settings(max_examples=3, phases=(Phase.generate,))
 @given(
     st.sampled_from(["A", "restitution", "g", "T"]),
     st.floats(0.75, 0.95) | st.floats(1.05, 1.3),
@@ -91,13 +91,6 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
         trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi / T) ** 2 * bounce.before["y"] / g
         np.testing.assert_allclose(np.sum(multipliers), trace, atol=1e-7)
         np.testing.assert_allclose(np.prod(multipliers), a**2, rtol=1e-9)
-
-
-def test_the_direction_of_values_is_that_of_the_branch(juggling):
-    up = hj.continuation(juggling, "A", (0.15, 0.2))
-    down = hj.continuation(juggling, "A", (0.2, 0.15))
-    np.testing.assert_array_equal(up.values, down.values[::-1])
-    assert (up.values[0], up.values[-1]) == (0.15, 0.2)
 
 
 def test_bad_input(juggling):

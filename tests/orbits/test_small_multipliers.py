@@ -77,6 +77,7 @@ def test_modes_that_decay_fast_beside_one_that_does_not():
     np.testing.assert_allclose(found, np.exp(-RATES), rtol=1e-8, atol=0)
 
 
+@pytest.mark.slow
 def test_a_relaxation_oscillation():
     """Its multiplier of 2e-134 is positive, as that of any planar flow."""
     w, logarithm = liouville(0.01)

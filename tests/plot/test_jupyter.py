@@ -8,7 +8,7 @@ import nbclient
 import nbformat
 import pytest
 
-import hybridjax as hj
+from hybridjax.plot.look import COLUMN
 
 
 CELLS = [
@@ -42,7 +42,7 @@ def test_every_figure_is_shown_once(outputs):
 
 def test_a_column_has_150_points_per_inch(outputs):
     head = base64.b64decode(images(outputs[1])[0])[16:20]  # of a PNG: where its width is
-    assert struct.unpack(">I", head)[0] > 0.9 * 150 * hj.plot.COLUMN
+    assert struct.unpack(">I", head)[0] > 0.9 * 150 * COLUMN
 
 
 def test_what_a_long_call_says_is_gone_when_it_ends(outputs):

@@ -4,6 +4,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.identify.amplitude import AmplitudeSweep
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.plot.fit_quality import amplitude
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def test_amplitude_marks_the_limit():
         np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
         ("u",), ("y",),
     )  # fmt: skip
-    ax = hj.plot.amplitude(sweep, misfit=1e-2).ax
+    ax = amplitude(sweep, misfit=1e-2).ax
     assert [line.get_label() for line in ax.get_lines()][0] == "y"
     assert ax.get_lines()[-1].get_xdata()[0] == pytest.approx(10**-0.5)
     assert ax.get_lines()[1].get_xdata()[0] == 1.0

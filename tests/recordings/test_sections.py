@@ -12,6 +12,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.apps.cli import main
 from hybridjax.identify.series.fit import fit_records
+from hybridjax.recordings.sampling import without_drift
 
 from .conftest import MULTIPLIER
 from .mishaps import mishandle, misjudged
@@ -137,7 +138,7 @@ def test_slow_drift_is_taken_out(wave):
     recording = hj.Recording(t, drifting)
     assert sample(recording).rms()[1][0] > 0.1
     rough = hj.recordings.estimate_phase(recording, CIRCLE)
-    flat = hj.recordings.without_drift(recording, rough, ("f", "x", "v"), 4)
+    flat = without_drift(recording, rough, ("f", "x", "v"), 4)
     assert sample(flat).rms()[1][0] < 0.02
     assert sample(flat).records[0].drift == np.inf
     assert sample(flat).with_drift(9).records[0].drift == 9
@@ -146,7 +147,7 @@ def test_slow_drift_is_taken_out(wave):
         (eqx.tree_at(lambda p: p.stretches, rough, ()), 9, "phase is of 0 trials"),
     ]:
         with pytest.raises(hj.DefinitionError, match=message):
-            hj.recordings.without_drift(wave, phase, "x", cycles)
+            without_drift(wave, phase, "x", cycles)
 
 
 def test_times_of_crossings(wave):

@@ -124,18 +124,6 @@ def test_what_is_wrong_is_said(system, message):
         check_system(system)
 
 
-def test_an_input_that_the_system_does_not_have():
-    class Bad(hj.Chart):
-        states = ("x",)
-        inputs = ("up",)
-
-        def field(self, t, q, u):
-            return u
-
-    with pytest.raises(hj.DefinitionError, match="chart 'a' uses input 'up'"):
-        check_system(Anything({"a": Bad()}))
-
-
 def test_a_guard_falls_at_its_event():
     rising = Structure(replaced(direction="rising"))
     assert rising.guard(0, 0.0, jnp.array([2.0, 0.0]), jnp.zeros(1)) == -2.0
@@ -154,11 +142,3 @@ def test_outputs_by_name_by_function_and_by_chart():
         z.require(1)
     with pytest.raises(hj.DefinitionError, match="there is no output 'y'; outputs are 'x', 'v'"):
         s.resolve_outputs("y")
-
-
-def test_states_that_a_chart_does_not_carry_have_values_there():
-    s = Structure(hj.models.VerticalHopper())
-    stance = s.chart_index("stance")
-    z = s.resolve_outputs(("yM", "ym"))
-    np.testing.assert_array_equal(z(stance, 0.0, jnp.array([2.0, 1.0]), jnp.zeros(1)), [2.0, 0.0])
-    assert s.state_names() == ("yM", "vM", "ym", "vm")

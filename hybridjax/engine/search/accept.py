@@ -13,17 +13,14 @@ from ..cubic import CubicCrossing, first_crossing
 from ..events import INSTANT, width
 from ..lanes import Lanes
 from ..watch import Watch
-from .locate import LANDING_TRIES
+from .locate import LANDING, LANDING_TRIES
 from .state import Aim, Attempt, State, Task
 
 
-# A landing may lie beyond the step in which the crossing was met by this part of that step. Higher:
-# zeros of the step after it are accepted. Lower: those at its very end are missed.
-_BEYOND_STEP = 1e-6
 # The next step has this part of the length that the error estimate asks for, and lies between these
-# multiples of the last one (the lowest where the estimate is no number). Nearer to 1: more steps
+# multiples of the last one (the lower where the estimate is no number). Nearer to 1: more steps
 # are rejected. Farther: more steps are taken.
-_CAUTION, _SHRINK, _GROW, _SHRINK_BLINDLY = 0.9, 0.2, 3.0, 0.1
+_CAUTION, _SHRINK, _GROW = 0.9, 0.2, 3.0
 
 
 class Verdict(NamedTuple):
@@ -81,7 +78,7 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     xp, within_error = namespace(t), accurate(new, task)
     # Which approaches succeed.
     tau = approach.tau + new.past
-    beyond = _BEYOND_STEP * approach.reach + INSTANT * task.span
+    beyond = LANDING * approach.reach + INSTANT * task.span
     inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
     falling = of_row(end.rate, aim.which) < 0
     lands = active & new.lands & falling & xp.where(approach.on, inside, within_error)
@@ -129,7 +126,7 @@ def next_step(s: Structure, h: Times, aim: Aim, error: Times, lanes: Lanes) -> T
     else:
         length = error ** xp.asarray(1 / np.array(orders))[lanes.chart]
     factor = xp.clip(_CAUTION / length, _SHRINK, _GROW)
-    step = aim.step * xp.where(xp.isfinite(length), factor, _SHRINK_BLINDLY)
+    step = aim.step * xp.where(xp.isfinite(length), factor, _SHRINK)
     return xp.where((aim.step < h) & (length <= 1), xp.maximum(h, step), step)
 
 

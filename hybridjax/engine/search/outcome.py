@@ -15,11 +15,6 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
-# A lane that is stuck blows up if its largest state changes by more than this part in that step;
-# otherwise its field jumps. Higher: fast growth is called a jump. Lower: rounding is called growth.
-_STILL = 1e-3
-
-
 def without_events(
     s: Structure, state: State, aim: Aim, new: Attempt, task: Task
 ) -> tuple[State, Tape]:
@@ -70,7 +65,8 @@ def with_events(
     h, stuck = _next_step(s, state, aim, new, verdict, fired, task)
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
-    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= _STILL * xp.max(xp.abs(lanes.q), axis=0)
+    # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
+    still = xp.max(xp.abs(new.q - lanes.q), axis=0) <= 1e-3 * xp.max(xp.abs(lanes.q), axis=0)
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
     result = state.result
     for failed, code in (

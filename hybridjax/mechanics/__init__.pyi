@@ -1,1 +1,0 @@
-from .mechanism import Mechanism as Mechanism

@@ -1,1 +1,0 @@
-from .coincidence import coincidences as coincidences

@@ -1,1 +1,0 @@
-from .family import Points as Points

@@ -1,5 +1,0 @@
-from .abstract import (
-    AbstractLevels as AbstractLevels,
-    AbstractSections as AbstractSections,
-    BoundSections as BoundSections,
-)
