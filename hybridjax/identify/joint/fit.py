@@ -294,7 +294,8 @@ def _fit_to_series(
         require_same("guess and data", guess, records)
         model = PeriodicModel.of(guess, scale)
         if innovations:
-            model = _with_gain(model, problem)
+            columns = zip(model.A, model.C, strict=True)
+            model = model._replace(K=[np.zeros((len(A), len(C))) for A, C in columns])
     model = _without_direct(model, direct)
     unknowns = local_coordinates(model, direct).size
     freedom = numbers - unknowns
@@ -332,18 +333,6 @@ class SeriesParts:
 
 def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:
     return model if direct else model._replace(D=[0.0 * D for D in model.D])
-
-
-def _with_gain(model: PeriodicModel, problem: SeriesProblem) -> PeriodicModel:
-    """Return the guess with K = 0, or the model of the subspace method with its dimensions, where
-    the data suffice for that and it is more likely."""
-    K = [np.zeros((len(A), len(C))) for A, C in zip(model.A, model.C, strict=True)]
-    plain = model._replace(K=K)
-    try:
-        other = subspace_model(problem.parts, model.dims, True)
-    except DefinitionError:
-        return plain
-    return min(plain, other, key=lambda x: np.linalg.slogdet(problem.reweighted(x).S)[1].sum())
 
 
 def _finished(
