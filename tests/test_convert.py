@@ -160,9 +160,8 @@ def experiments(model):
         periods=1,
         inputs=model.inputs,
         outputs=model.outputs,
-        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), events),
+        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), events, "clock"),
         cycle_outputs=rng.normal(size=(N, 1)),
-        label="clock",
     )
 
 

@@ -15,7 +15,7 @@ from .._core.execution import Execution
 from .._core.executor import from_host
 from .._core.memo import Memory, remembered
 from .._core.results import Result
-from ..engine.settings import EXPERIMENT, SINGLE_PRECISION_EXPERIMENT
+from ..engine.settings import EXPERIMENT
 from ..errors import ComputationError, DefinitionError
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -23,14 +23,13 @@ from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
-from .batches import divide, in_batches, precision_of
+from .batches import divide, in_batches
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
 from .events import EventList, EventTimes, in_order
 from .flow_batch import Course, IntervalEvents, course, flow_batch
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
-from .single_precision import plan_single
 from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
 
 
@@ -45,7 +44,6 @@ DesignLike = (
 _LARGE = 5_000_000
 # Experiments whose inputs are checked together, as an array may lie on disk. More need more memory.
 _CHECKED = 1024
-_ACCURACY = {"double": EXPERIMENT, "single": SINGLE_PRECISION_EXPERIMENT}
 
 
 @checked
@@ -60,7 +58,7 @@ class Options:
     start: StartName = "cycle"
     discard: Index | None = None
     process_noise: ProcessNoise | None = None
-    accuracy: Accuracy | None = None
+    accuracy: Accuracy = EXPERIMENT
     record_events: bool = False
     execution: Execution | None = None
 
@@ -99,7 +97,7 @@ class Campaign:
       linearization that predicts it, except for starts on the cycle.
     - `stepping`: tolerances and step schedule between sections.
     - `process_noise`, `record_events`: as in `run_experiments`.
-    - `execution`: precision, batch size and number of threads.
+    - `execution`: batch size and number of threads.
     - `large`: whether to wait for the optimized program.
     """
 
@@ -151,7 +149,7 @@ class Campaign:
     @property
     def at_sections(self) -> "_AtSections":
         """Outputs, compiled definitions and values at the sections."""
-        return _at_sections(self.placed, self.outputs, self.execution)
+        return _at_sections(self.placed, self.outputs)
 
     @remembered
     def _programs(self) -> tuple[TwoTiers, TwoTiers]:
@@ -208,7 +206,6 @@ class Campaign:
         result, failed_at, error = map(np.concatenate, each)
         merge = lambda *x: np.concatenate(x)  # noqa: E731
         log = jax.tree_util.tree_map(merge, *logs) if capacity else None
-        error = error.astype(float) + stepping.rounding
         return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, log
 
     def _require_outputs(self, y, result) -> None:
@@ -276,15 +273,13 @@ def prepare(
         )
     together = len(inputs) if chunk is None else min(chunk, len(inputs))
     execution = divide(together, options.execution or Execution())
-    precision = execution.precision
-    accuracy = _ACCURACY[precision] if options.accuracy is None else options.accuracy
     return Campaign(
         placed=placed,
         outputs=items,
         inputs=inputs,
         start=start,
         model=None if start == "cycle" else linearized(placed),
-        stepping=(plan_single if precision == "single" else plan_flow)(placed, accuracy),
+        stepping=plan_flow(placed, options.accuracy),
         process_noise=noise,
         record_events=options.record_events,
         execution=execution,
@@ -350,7 +345,6 @@ def _require_return(cycle: LimitCycle, placed: PlacedSections) -> None:
 class _AtSections(NamedTuple):
     outputs: Outputs
     course: Course
-    """In the precision of the campaign."""
     on_cycle: Float[np.ndarray, "N ny"]
     given: tuple[str | Output, ...]
     """The outputs by whose `id` this is found: they must not be collected."""
@@ -359,14 +353,14 @@ class _AtSections(NamedTuple):
 _resolved = Memory()
 
 
-def _at_sections(placed: PlacedSections, outputs, execution: Execution) -> _AtSections:
-    """Return outputs and course, made once for the same sections, outputs and precision."""
+def _at_sections(placed: PlacedSections, outputs) -> _AtSections:
+    """Return outputs and course, made once for the same sections and outputs."""
     names = tuple(x if isinstance(x, str) else id(x) for x in outputs)
 
     def make() -> _AtSections:
         z = placed.structure().resolve_outputs(outputs)
-        with precision_of(execution) as convert:
-            made = convert(course(placed, z.items))
-        return _AtSections(z, made, np.asarray(placed.observe(tuple(z.items))), outputs)
+        return _AtSections(
+            z, course(placed, z.items), np.asarray(placed.observe(tuple(z.items))), outputs
+        )
 
-    return _resolved.recall(placed, (names, execution.precision), make)
+    return _resolved.recall(placed, names, make)

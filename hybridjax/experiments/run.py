@@ -7,6 +7,7 @@ from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
 from .._core.pieces.run import Workers
 from .._core.progress import working
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import SectionsLike
@@ -34,7 +35,7 @@ def run_experiments(
     start: StartName = "cycle",
     discard: Index | None = None,
     process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy | None = None,
+    accuracy: Accuracy = EXPERIMENT,
     record_events: bool = False,
     execution: Execution | None = None,
 ) -> ExperimentData:
@@ -60,15 +61,14 @@ def run_experiments(
     - `process_noise`: a random input beside the excitation, which is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to their sizes (`LimitCycle.scale`). `data.error` estimates the
-        error of each experiment. Default: 1e-9, in single precision 1e-4.
+        error of each experiment. Default: 1e-9.
     - `record_events`: whether to record the times of events, as `data.events`. Default: False.
-    - `execution`: batches, threads, precision.
+    - `execution`: batches and threads.
 
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
 
-    **Raises:** `DefinitionError` for arguments that do not fit together and for an accuracy that
-    single precision cannot give; `ComputationError` for an unstable cycle, from which any
-    experiment would run away, and if a steady start is not found.
+    **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
+    unstable cycle, from which any experiment would run away, and if a steady start is not found.
     """
     options = Options(start, discard, process_noise, accuracy, record_events, execution)
     return prepare(cycle, sections, design, outputs, options).run()

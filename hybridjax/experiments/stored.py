@@ -273,7 +273,6 @@ class ExperimentJob:
             "process_noise": None if noise is None else dataclasses.asdict(noise),
             "record_events": campaign.record_events,
             "accuracy": campaign.stepping.accuracy,
-            "precision": campaign.execution.precision,
             "batch": campaign.execution.batch,
             "chunk": self.blocks.block[0],
             "experiments": self.blocks.shape[0],

@@ -94,10 +94,9 @@ class RationalFit(eqx.Module):
         if output is not None:
             chosen = [channel_index("output", output, self.outputs)]
         parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
-        pairs = np.concatenate([(part.true, part.estimated) for part in parts], axis=1)
-        return MultiplierComparison(
-            *pairs, tuple(np.repeat([self.outputs[k] for k in chosen], len(parts[0].true)))
-        )
+        true, estimated = np.concatenate([(part.true, part.estimated) for part in parts], axis=1)
+        names = tuple(self.outputs[k] for k in chosen for _ in parts[0].true)
+        return MultiplierComparison(true, estimated, names)
 
     def __repr__(self) -> str:
         rows = [
