@@ -155,9 +155,8 @@ def experiments(model):
         periods=1,
         inputs=model.inputs,
         outputs=model.outputs,
-        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9])),
+        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), "clock"),
         cycle_outputs=rng.normal(size=(N, 1)),
-        label="clock",
     )
 
 
