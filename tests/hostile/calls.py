@@ -241,7 +241,6 @@ def designs_data(t):
         dict(model=t.decaying, design=t.one_input, noise={"y": 1.0}, goal=t.study.goal),
     )
     yield hj.designs.draws, dict(fit=t.joint, count=1)
-    yield t.plan.sequence, dict(cycles=2)
     yield t.plan.strides_for, dict(standard_error=1.0)
 
 
