@@ -248,32 +248,6 @@ def test_period_2_of_the_buck_converter():
 
 
 @pytest.mark.slow
-def test_period_doubling_of_the_long_gait():
-    walker = m.SimplestWalker()
-    cycle = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
-    branch = hj.continuation(cycle, "slope", (0.005, 0.016))
-    (flip,) = branch.points
-    assert flip.kind == "flip"
-    np.testing.assert_allclose(flip.value, 0.0150884379411195, rtol=1e-11)
-    np.testing.assert_allclose(flip.multipliers, [-1, -0.297621361684963], rtol=1e-9)
-    doubled = branch[flip.index]
-    np.testing.assert_allclose(doubled.period, 3.91240921248050, rtol=1e-11)
-    np.testing.assert_allclose(
-        [doubled.state["th"], doubled.state["w"]], [0.237165863591579, -0.231927076424014],
-        rtol=1e-10,
-    )  # fmt: skip
-    # Two steps make one round of the gait beyond it.
-    beyond = branch[-1]
-    th, phi, w, p = np.asarray(beyond.anchor.q[:, 0])
-    guess = hj.Guess("step", (1.02 * th, 2 * 1.02 * th, 1.02 * w, 1.02 * p))
-    limping = hj.find_limit_cycle(
-        beyond.system, guess, section=hj.AtEvent("heelstrike"), multiplicity=2, settle=400.0
-    )
-    assert len(limping.event_sequence) == 2 and limping.stable
-    assert abs(float(limping.period) - 2 * float(beyond.period)) > 1e-6
-
-
-@pytest.mark.slow
 def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     """Driven less, the hopper stops hopping: the force of the ground, (m + M) g plus a sine of
     amplitude a r / (r - k), r = M w^2, just reaches zero."""
