@@ -40,7 +40,7 @@ hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
 hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
 hj.convert.to_lti(model).multipliers.shape
 hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modulus")).advice
-hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).sequence(64, "binary").u.shape
+hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).advice
 hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.FrequencyResponse((0.1, 1.0))).saved
 hj.designs.Limits(distortion=hj.designs.Distortion(cycle, phase, {"yM": 1e-5})).distortion
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
@@ -146,7 +146,7 @@ UNCHECKED = {
         "Plan.stride",
     },
     "made by this package": {
-        "Advice", "Branch", "Constrained", "EventTimes",
+        "Advice", "Branch", "Constrained", 
         "Finding", "Identification", "Impact", "ImpulseResponses",
         "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",

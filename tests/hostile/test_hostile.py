@@ -20,7 +20,7 @@ CALLED_BY_THE_ENGINE = {
     "ProcessNoise", "SLIPRunner", "Scheduled", "SectionList", "Settings", "TwoLeggedBar",
     "VerticalHopper",
 }  # fmt: skip
-SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
+SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
 
 
 def printed(*command):
