@@ -51,6 +51,14 @@ def test_fold_and_flip_of_the_juggler(juggling):
         again = hj.find_limit_cycle(cycle.system, cycle)
         np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
+    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude"}).ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v (m/s)")
+    lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
+    assert [x.get_linestyle() for x in lines] == ["--", "-", "--"]
+    rows = (0, *(x.index for x in branch.points), len(branch) - 1)
+    for line, first, last in zip(lines, rows, rows[1:], strict=False):
+        np.testing.assert_array_equal(line.get_xdata(), branch.values[first : last + 1])
+
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
     dataset, frame = hj.convert.to_xarray(branch), hj.convert.to_pandas(branch)

@@ -94,10 +94,6 @@ TOP = Crossing("v", "falling")
             r"section 1 \(xv falling\) is crossed 2 times in one period",
         ),
         (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
-        (
-            hj.KinematicPhase(4, position="x", velocity="v", center=(9.0, 0.0), anchor=TOP),
-            r"section 1 \(kinematic phase 1/4 after section 0\) is not reached from section 0",
-        ),
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
