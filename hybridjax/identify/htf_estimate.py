@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Index, Probability
+from .._core.boundary.kinds import Count, Probability
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
@@ -32,7 +32,6 @@ def estimate_htf(
     *,
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
-    highest: Index | None = None,
     half_integers: Literal["error", "skip"] = "error",
     threshold: Probability = SILENT_LINE,
 ) -> HTF:
@@ -58,12 +57,10 @@ def estimate_htf(
 
     - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
       `StoredExperiments` return them, of which only sums over experiments are kept.
-    - `harmonics`: the harmonics to estimate. Default: all N (with `highest`, all up to it).
+    - `harmonics`: the harmonics to estimate. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "auto", the default, is the variance that the experiments allow; "noise", from
       the repeats alone, and "total", from realizations, raise errors where they are not available.
-    - `highest`: harmonics beyond this one are taken as zero, as in designs with few experiments
-      (`multisine(highest_harmonic=...)`). Default: none.
     - `half_integers`: "error", the default, or "skip" multiples of 1/2 measured with one phase.
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
@@ -82,7 +79,7 @@ def estimate_htf(
             "pass repeats=2."
         )
     require_x64()
-    sums = spectral_sums(data, harmonics, highest=highest, threshold=threshold, repeats=repeats)
+    sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     unsolved = sums.one_phase()
     if unsolved.any() and half_integers == "error":
         raise DefinitionError(
@@ -123,14 +120,14 @@ def estimate_htf(
 
 @checked
 def missing_frequencies(
-    data: Experiments, threshold: Probability = SILENT_LINE, *, highest: Index | None = None
+    data: Experiments, threshold: Probability = SILENT_LINE
 ) -> Float[np.ndarray, " F"]:
     """Return the frequencies (cycles per period) that were excited but cannot be estimated.
 
     Their experiments failed, or not all inputs were applied there, or they lie on a multiple of
     1/2 and were measured with one phase only. Arguments as of `estimate_htf`.
     """
-    sums = spectral_sums(data, (), highest=highest, threshold=threshold)
+    sums = spectral_sums(data, (), threshold=threshold)
     return sums.f[~sums.solvable(sums.gram)]
 
 
