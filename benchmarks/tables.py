@@ -120,28 +120,9 @@ def derivatives(values: dict, baseline: dict) -> str:
     return markdown(("job", "", "seconds", "error", "compile"), rows)
 
 
-def precision(values: dict, baseline: dict) -> str:
-    """Single precision beside double, both asked for 1e-4."""
-    rows = []
-    for job in JOBS[:2]:
-        for count in (80, 1000, 10_000):
-            name = f"precision.{job}.experiments_{count}"
-            columns = (
-                "double_1e-04.cpu", "single_1e-04.cpu", "speedup", "double_1e-04.true_error",
-                "single_1e-04.true_error", "single_1e-04.bounded", "single_1e-04.median_ratio",
-            )  # fmt: skip
-            measured = [number(values.get(f"{name}.{x}")) for x in columns]
-            rows.append((job.replace(".", ", "), count, *measured))
-    head = (
-        "job", "experiments", "double, s", "single, s", "ratio", "error, double", "error, single",
-        "error <= estimate", "estimate / error",
-    )  # fmt: skip
-    return markdown(head, rows)
-
-
 TABLES: dict[str, Callable[[dict, dict], str]] = {
     "machines": machines, "experiments": experiments, "loops": loops,
-    "honesty": honesty, "precision": precision, "sizes": sizes, "derivatives": derivatives,
+    "honesty": honesty, "sizes": sizes, "derivatives": derivatives,
 }  # fmt: skip
 
 

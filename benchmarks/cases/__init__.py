@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 # In the order in which they run.
 NAMES = (
-    "experiments", "honesty", "precision", "sizes", "size", "jacobians", "gradients", "grid",
+    "experiments", "honesty", "sizes", "size", "jacobians", "gradients", "grid",
     "steps", "solvers", "walkers", "cores", "compile",
 )  # fmt: skip
 

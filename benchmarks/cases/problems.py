@@ -62,15 +62,13 @@ class Problem:
     def scaled(self, factor: float) -> "Problem":
         return dataclasses.replace(self, u=factor * self.u)
 
-    def run(
-        self, accuracy: float = 1e-9, workers: int = 1, precision: str = "double"
-    ) -> hj.ExperimentData:
+    def run(self, accuracy: float = 1e-9, workers: int = 1) -> hj.ExperimentData:
         """All experiments, as a user runs them, by the program that jobs find after a while."""
         campaign._LARGE = 0
         return hj.run_experiments(
             self.cycle, self.placed, self.u, self.outputs,
             discard=0, accuracy=accuracy,
-            execution=hj.Execution(workers=workers, precision=precision),
+            execution=hj.Execution(workers=workers),
         )  # fmt: skip
 
     def error(self, data: hj.ExperimentData) -> float:

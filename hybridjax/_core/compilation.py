@@ -44,15 +44,15 @@ from .vector_math import rewrite
 
 
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
-# the time. Options that an XLA does not have are left out.
+# the time.
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3.0
-# Seconds in a quick executable after which the optimized one is compiled, which takes 10 to 40.
-# Less: a script that is done waits at its end for a thread that compiles for no further job. More:
+# Seconds in a quick executable after which the optimized one is compiled, in about as much time.
+# Less: a script waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
-_WORTH_OPTIMIZING = 2.0
+_WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
@@ -146,17 +146,11 @@ def _loops_are_kernels() -> bool:
 @ft.cache
 def compiler_options() -> dict[str, Any]:
     """Return XLA's options for quick compilation."""
-
-    def accepted(options):
-        try:
-            jax.jit(lambda: 0, compiler_options=options)()
-        except Exception:  # the type depends on the version of XLA
-            return False
-        return True
-
-    if accepted(_QUICK):
-        return _QUICK
-    return {name: value for name, value in _QUICK.items() if accepted({name: value})}
+    try:
+        jax.jit(lambda: 0, compiler_options=_QUICK)()
+    except Exception:  # an XLA without one of them; the type depends on the version
+        return {}
+    return _QUICK
 
 
 class _Uncollected:

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,9 +20,6 @@ from .boundary.checked import checked
 from .boundary.kinds import ExperimentCount, WorkerCount
 from .executor import default_device, on_cpu
 from .precision import require_x64
-
-
-Precision = Literal["double", "single"]
 
 
 @checked
@@ -36,14 +33,10 @@ class Execution:
       compiles another program.
     - `workers`: threads that run such calls at the same time; by default all cores on CPU, and one
       on an accelerator.
-    - `precision`: "double" or "single". Single precision computes experiments in 32 bits, while the
-      cycle, the sections and the plan remain in 64. What rounding costs is measured on the cycle
-      and is part of `ExperimentData.error`.
     """
 
     batch: ExperimentCount | None = None
     workers: WorkerCount | None = None
-    precision: Precision = "double"
 
     @property
     def threads(self) -> int:

@@ -1,10 +1,7 @@
-"""Double precision: switched on by the user, required by the solvers. Single precision, where it
-will do."""
+"""Double precision: switched on by the user, required by the solvers."""
 
-import contextlib
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,29 +54,6 @@ def real(x: Any) -> jax.Array:
         return jnp.asarray(x, float)
     with jax.enable_x64(True):  # (No program is compiled for numbers of Python and NumPy.)
         return jax.device_put(np.asarray(x, float))
-
-
-def at_precision(double: float, single: float) -> float:
-    """A threshold that is a matter of rounding, for the precision that JAX computes in."""
-    return double if jax.config.read("jax_enable_x64") else single
-
-
-def single_precision() -> contextlib.AbstractContextManager:
-    """A context in which this thread computes in 32 bits, with what `single` returns."""
-    return jax.enable_x64(False)
-
-
-def single(tree: Any) -> Any:
-    """`tree` with its arrays rounded to 32 bits."""
-    narrow = {"f": np.float32, "i": np.int32}
-
-    def convert(x):
-        if not eqx.is_array(x):
-            return x
-        x = np.asarray(x)
-        return jax.device_put(x.astype(narrow.get(x.dtype.kind, x.dtype)))
-
-    return jax.tree_util.tree_map(convert, tree)
 
 
 def _is_double() -> bool:

@@ -22,15 +22,15 @@ from ..linear.ldtp import LDTP
 
 @checked
 def to_lti(model: LDTP) -> LDTP:
-    r"""The same system, with one sample for each period.
+    r"""Return the same system with one sample for each period.
 
     Sample k of the result has the state at section 0 of period k; the inputs `u[n]`, held from
     section n of that period on; and the outputs `y[n]` at section n of the *same* period, before
-    `u[n]` acts but for the feed-through D. So the outputs of a period depend on its own inputs: the
-    new D holds the responses within a period (zero for inputs that come later), C the way from
-    section 0 to each section, B that from each input to section 0 of the next period, A is the
-    monodromy matrix. Names are `u[0]`, ..., `u[N-1]` for an input `u`; all inputs of section 0 come
-    first, then those of section 1.
+    `u[n]` acts except through the feed-through D. So the outputs of a period depend on the inputs
+    of the same period: the new D holds the responses within a period (zero for later inputs), C the
+    map from section 0 to each section, B the map from each input to section 0 of the next period,
+    and A is the monodromy matrix. Names are `u[0]`, ..., `u[N-1]` for an input `u`; all inputs of
+    section 0 come first, then the inputs of section 1.
 
     Its response G at $z = e^{2 \pi i f}$, f in cycles per period, holds all harmonics:
     $H_m(f) = \frac{1}{N} \sum_{n, r} G_{n r}\, e^{-2 \pi i (f + m) n / N} e^{2 \pi i f r / N}$.
@@ -70,40 +70,35 @@ def _at_sections(names: tuple[str, ...], n_sections: int) -> tuple[str, ...]:
 
 @checked
 def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
-    """An object of python-control.
+    """Return an object of python-control.
 
     - An `LDTP` becomes a `control.StateSpace` of its lifted system (`to_lti`), with dt = `period`.
     - An `HTF` becomes a `control.FrequencyResponseData` with an output `y[m]` for each output y and
       harmonic m: `H_m` at the *input* frequency. All outputs of the first harmonic come first.
 
-    **Arguments:** `period`: in seconds, say; with 1 times are counted in periods.
+    **Arguments:** `period`: the length of a period, in seconds for example. Default: 1, so that
+    times are counted in periods.
 
     **Raises:** `DefinitionError` where python-control is not installed.
     """
     if isinstance(thing, LDTP):
         lti = to_lti(thing)
-        matrices = (np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D))
-        return package("control").StateSpace(
-            *matrices, period, inputs=_plain(lti.inputs), outputs=_plain(lti.outputs)
-        )
-    H = np.moveaxis(np.asarray(thing.H), 1, -1)
+        names = {"inputs": list(map(str, lti.inputs)), "outputs": list(map(str, lti.outputs))}
+        return package("control").StateSpace(*_matrices(lti), period, **names)
+    inputs = list(map(str, thing.inputs))
     outputs = [f"{y}[{m}]" for m in thing.harmonics for y in thing.outputs]
-    return package("control").FrequencyResponseData(
-        H.reshape(len(outputs), len(thing.inputs), -1),
-        2 * np.pi * np.asarray(thing.f) / period,
-        inputs=_plain(thing.inputs),
-        outputs=outputs,
-    )
+    H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
+    frequencies = 2 * np.pi * np.asarray(thing.f) / period
+    return package("control").FrequencyResponseData(H, frequencies, inputs=inputs, outputs=outputs)
 
 
 @checked
 def to_scipy(model: LDTP, *, period: Positive = 1.0) -> Any:
-    """The lifted system (`to_lti`) as `scipy.signal.dlti`, with dt = `period`."""
+    """Return the lifted system (`to_lti`) as `scipy.signal.dlti`, with dt = `period`."""
     from scipy.signal import dlti
 
-    lti = to_lti(model)
-    return dlti(*(np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D)), dt=period)
+    return dlti(*_matrices(to_lti(model)), dt=period)
 
 
-def _plain(names: tuple[str, ...]) -> list[str]:
-    return [str(x) for x in names]
+def _matrices(lti: LDTP) -> list[np.ndarray]:
+    return [np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D)]

@@ -21,41 +21,34 @@ Tabular = Recording | SectionData | HTF | LimitCycles | Branch | MultiplierEstim
 
 @checked
 def to_pandas(thing: Tabular) -> Any:
-    """A `pandas.DataFrame`.
+    """Return a `pandas.DataFrame`.
 
     - `Recording`, `SectionData`: a row for each sample, with time and trial;
       `Recording.from_frame` reads one trial of it.
     - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0`, ...
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
-    - Fits: a row for each multiplier, with its standard error; of a `RationalFit` one for each
+    - Fits: a row for each multiplier, with its standard error; of a `RationalFit` a row for each
       output and pole.
 
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
     """
     frame = package("pandas").DataFrame
     if isinstance(thing, MultiplierEstimate):
-        values = thing.multipliers
-        return frame(
-            {
-                "multiplier": values,
-                "modulus": np.abs(values),
-                "standard_error": thing.standard_errors,
-            }
-        )
+        values, errors = thing.multipliers, thing.standard_errors
+        return frame({"multiplier": values, "modulus": np.abs(values), "standard_error": errors})
     if isinstance(thing, RationalFit):
         outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
         poles, multipliers = thing.poles.ravel(), thing.multipliers.ravel()
         return frame({"output": outputs, "pole": poles, "multiplier": multipliers})
     dataset = to_xarray(thing)
     if isinstance(thing, HTF):
-        return dataset.drop_vars(
-            ["input_unit", "output_unit", "scatter.freedom"], errors="ignore"
-        ).to_dataframe()
+        extra = [x for x in ("input_unit", "output_unit", "scatter.freedom") if x in dataset]
+        return dataset.drop_vars(extra).to_dataframe()
     row = next(iter(dataset.data_vars.values())).dims[0]
-    columns = {}
+    table = {}
     for name, x in {**dataset.coords, **dataset.data_vars}.items():
         if x.dims == (row,):
-            columns[name] = x.values
+            table[name] = x.values
         elif x.dims[0] == row:
-            columns |= {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
-    return frame(columns)
+            table |= {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
+    return frame(table)

@@ -1,35 +1,67 @@
-"""Results as `xarray.Dataset`, and back."""
+"""Results as `xarray.Dataset`, and back.
+
+Axes of arrays have names in the annotations of fields; these become dimensions. Names of signals
+and numbers of harmonics become their coordinates. All other fields are JSON in an attribute.
+"""
 
 import json
+import types
+import typing
+from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
+import jax
+import numpy as np
+
+from .._core.archive import put_together, restored, signals_in, taken_apart
+from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.executor import is_traced
 from .._core.precision import require_x64
-from ..errors import DefinitionError
+from .._core.signal import Signal, unit_of
+from ..errors import DefinitionError, HybridJaxError
+from ..experiments.record import Record
 from ..io import KINDS, Saved
+from ..linear.ldtp import LDTP
 from ..orbits.branch import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
-from .families import from_branch, from_limit_cycles
-from .measured import from_recording, from_section_data, to_recording, to_section_data
-from .modules import REST, from_module, to_module
+from ..systems.system import unit_of_parameter
+
+
+# The attribute with all that has no place elsewhere, as JSON.
+_HEADER = "hybridjax"
+# Names of coordinates and of the variable of events, which no signal may have.
+_RESERVED = {"time", "trial", "event", "event_time", "event_trial"}
+# Dimensions, by the names of axes in annotations.
+_AXES = {
+    "S": "experiment", "n": "sample", "N": "section", "M": "harmonic", "F": "f",
+    "ny": "output", "nu": "input", "d": "multiplier",
+}  # fmt: skip
+_STATES = {
+    "A": ("section", "next_state", "state"),
+    "B": ("section", "next_state", "input"),
+    "C": ("section", "output", "state"),
+}
+# Dimensions whose coordinates are a field beside the arrays.
+_COORDINATES = {"input": "inputs", "output": "outputs", "harmonic": "harmonics"}
 
 
 @checked
 def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> Any:
-    """An `xarray.Dataset` with named dimensions, coordinates, and units.
+    """Return an `xarray.Dataset` with named dimensions, coordinates, and units.
 
-    - What `hj.save` writes: a variable for each array, such as `H` (harmonic, f, output, input) of
-      an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment, sample, input) of
-      `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and `output_unit`
-      beside them.
+    - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, f, output,
+      input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment, sample,
+      input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
+      `output_unit` beside them.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
     - `SectionData`: the same at sections, and the `average_cycle`.
-    - `LimitCycles` (along `system`) and `Branch` (along `point`): periods, multipliers and the
-      like; parameters are coordinates.
+    - `LimitCycles` (along `system`) and `Branch` (along `point`): periods, multipliers and
+      iterations; parameters are coordinates.
 
     **Raises:** `DefinitionError` where xarray is not installed, for traced or batched objects, and
     for signals that are called like a coordinate; `PrecisionError` in single precision.
@@ -37,44 +69,242 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
     if is_traced(thing):
         raise DefinitionError("to_xarray needs values: call it outside of jit and derivatives.")
     require_x64()
-    for kind, make in _MAKERS.items():
-        if isinstance(thing, kind):
-            return make(thing)
-    return from_module(thing)
+    if isinstance(thing, Recording):
+        return _from_recording(thing)
+    if isinstance(thing, SectionData):
+        return _from_section_data(thing)
+    if isinstance(thing, LimitCycles):
+        return _from_limit_cycles(thing, "system")
+    return _from_branch(thing) if isinstance(thing, Branch) else _from_module(thing)
 
 
 @checked
 def from_xarray(dataset: Any) -> Saved | Recording | SectionData:
-    """What `to_xarray` made a dataset of, bit by bit: one of those that `hj.save` writes, a
-    `Recording`, or `SectionData`. Harmonics, frequencies, experiments, samples and signals may have
-    been selected, and records of `SectionData`.
+    """Return the object of which `to_xarray` made a dataset, bit by bit: one of those that
+    `hj.save` writes, a `Recording`, or `SectionData`. Harmonics, frequencies, experiments, samples
+    and signals may have been selected, and records of `SectionData`.
 
-    There is no way back to `LimitCycles` and a `Branch`: their systems hold functions, which no
-    dataset does. `find_limit_cycles` and `continuation` find them again from the parameters.
+    There is no way back to `LimitCycles` and a `Branch`: their systems hold functions, which a
+    dataset cannot hold. `find_limit_cycles` and `continuation` find the cycles again from the
+    parameters.
 
-    **Raises:** `DefinitionError` for other datasets.
+    **Raises:** `DefinitionError` for other datasets; `PrecisionError` in single precision.
     """
     require_x64()
+    readers = dict.fromkeys(KINDS, _to_module)
+    readers |= {"Recording": _to_recording, "SectionData": _to_section_data}
     try:
-        rest = json.loads(dataset.attrs[REST])
-        kind = rest["kind"]
+        header = json.loads(dataset.attrs[_HEADER])
+        read = readers[header["kind"]]
     except (AttributeError, KeyError, TypeError, ValueError):
-        kind = None
-    if kind == Recording.__name__:
-        return to_recording(dataset, rest)
-    if kind == SectionData.__name__:
-        return to_section_data(dataset, rest)
-    if kind not in KINDS:
         raise DefinitionError(
             "`dataset` must be an xarray.Dataset that `to_xarray` made of a "
             f"{', '.join(KINDS)}, Recording or SectionData."
+        ) from None
+    try:
+        return read(dataset, header)
+    except (HybridJaxError, IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DefinitionError(f"the dataset is no {header['kind']}: {error}") from error
+
+
+def _from_module(module: eqx.Module) -> Any:
+    static, arrays = taken_apart(module)
+    coordinates: dict[str, Any] = {}
+    for dimension, field in _COORDINATES.items():
+        values = static.pop(field, None)
+        if values is not None:
+            coordinates[dimension] = [str(x) if isinstance(x, str) else int(x) for x in values]
+            if isinstance(values[0], str):
+                coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
+    variables = {name: (_axes(type(module), name), array) for name, array in arrays.items()}
+    coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
+    units = {str(name): name.unit for name in signals_in(static)}
+    header = {"kind": type(module).__name__, "static": static, "units": units}
+    return _dataset(variables, coordinates, header)
+
+
+def _to_module(dataset: Any, header: Mapping[str, Any]) -> Any:
+    kind, static = KINDS[header["kind"]], restored(header["static"], header["units"])
+    for dimension, field in _COORDINATES.items():
+        if dimension in dataset.coords:
+            static[field] = tuple(x.item() for x in dataset[dimension].values)
+        if f"{dimension}_unit" in dataset.coords:
+            units = dataset[f"{dimension}_unit"].values
+            static[field] = tuple(map(Signal, static[field], map(str, units)))
+    arrays = {
+        str(name): np.asarray(dataset[name].transpose(*_axes(kind, str(name))).values)
+        for name in {*dataset.data_vars, *({"f"} & set(dataset.coords))}
+    }
+    return put_together(kind, static, arrays)
+
+
+def _axes(kind: type, name: str) -> tuple[str, ...]:
+    """Return the dimensions of a field; `outer.inner` is one of a module in a field."""
+    if kind is LDTP and name in _STATES:
+        return _STATES[name]
+    hint: Any = kind
+    for part in name.split("."):
+        module = next(x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
+        hint = module.__dataclass_fields__[part].type
+    shaped = next(x for x in _options(hint) if hasattr(x, "dim_str"))
+    axes: list[str] = []
+    for axis in shaped.dim_str.split():
+        axis = _AXES.get(axis, axis)
+        axes.append(f"{axis}_{axes.count(axis) + 1}" if axis in axes else axis)
+    return tuple(axes)
+
+
+def _options(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+
+
+def _from_recording(recording: Recording) -> Any:
+    trials = recording.trials
+    variables = _signals(recording, np.concatenate([t.values for t in trials]))
+    events = [
+        (s, name, time)
+        for s, trial in enumerate(trials)
+        for name, times in trial.events.items()
+        for time in times
+    ]
+    variables["event"] = "occurrence", np.array([name for _, name, _ in events], str)
+    coordinates = {
+        "time": ("sample", np.concatenate([t.time for t in trials]), {"units": "s"}),
+        "trial": ("sample", np.repeat(np.arange(len(trials)), [len(t.time) for t in trials])),
+        "event_time": ("occurrence", np.array([x for *_, x in events], float), {"units": "s"}),
+        "event_trial": ("occurrence", np.array([s for s, *_ in events], int)),
+    }
+    header = {
+        "kind": "Recording",
+        "trials": [{"name": t.name, "events": list(t.events)} for t in trials],
+        "notes": recording.notes,
+    }
+    return _dataset(variables, coordinates, header)
+
+
+def _to_recording(dataset: Any, header: Mapping[str, Any]) -> Recording:
+    trials = []
+    names = [str(x) for x in dataset.data_vars if x != "event"]
+    units = {name: _unit(dataset, name) for name in names if _unit(dataset, name)}
+    for s in np.unique(dataset["trial"].values):
+        about, samples = header["trials"][s], dataset["trial"].values == s
+        occurrences = dataset["event_trial"].values == s
+        trial = Recording(
+            dataset["time"].values[samples],
+            {name: dataset[name].values[samples] for name in names},
+            events={
+                name: dataset["event_time"].values[occurrences & (dataset["event"].values == name)]
+                for name in about["events"]
+            },
+            units=units,
+            name=about["name"],
+            notes=header["notes"],
         )
-    return to_module(dataset, rest, KINDS[kind])
+        trials.append(trial)
+    return Recording.join(trials)
 
 
-_MAKERS: dict[type, Any] = {
-    Recording: from_recording,
-    SectionData: from_section_data,
-    LimitCycles: from_limit_cycles,
-    Branch: from_branch,
-}
+def _from_section_data(data: SectionData) -> Any:
+    records, N = data.records, data.n_sections
+    lengths = [len(r.u) for r in records]
+    values = [np.concatenate([r.u, r.y], axis=1) for r in records]
+    variables = _signals(data, np.concatenate(values))
+    cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
+    variables["average_cycle"] = ("phase", "signal"), cycle
+    sections = [(r.first_section + np.arange(n)) % N for r, n in zip(records, lengths, strict=True)]
+    coordinates = {
+        "time": ("sample", np.concatenate(data.times), {"units": "s"}),
+        "trial": ("sample", np.repeat(data.trials, lengths)),
+        "record": ("sample", np.repeat(np.arange(len(records)), lengths)),
+        "section": ("sample", np.concatenate(sections)),
+        "phase": np.arange(N) / N,
+        "signal": list(map(str, data.signals)),
+    }
+    header = {
+        "kind": "SectionData",
+        "inputs": list(map(str, data.inputs)),
+        "spikes": data.spikes,
+        "records": [{"drift": r.drift, "lead": r.lead} for r in records],
+    }
+    attributes = {"n_sections": N, "period": data.period, "bandwidth": data.bandwidth}
+    return _dataset(variables, coordinates, header).assign_attrs(attributes)
+
+
+def _to_section_data(dataset: Any, header: Mapping[str, Any]) -> SectionData:
+    records, times, trials = [], [], []
+    signals = [str(x) for x in dataset["signal"].values]
+    names = [Signal(name, _unit(dataset, name)) for name in signals]
+    values = np.stack([dataset[name].values for name in signals], axis=1)
+    nu, N = len(header["inputs"]), int(dataset.attrs["n_sections"])
+    about = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
+    for k in np.unique(dataset["record"].values):
+        samples = dataset["record"].values == k
+        about["first_section"] = int(dataset["section"].values[samples][0])
+        u, y = values[samples, :nu], values[samples, nu:]
+        records.append(Record(u, y, **about, **header["records"][k]))
+        times.append(dataset["time"].values[samples])
+        trials.append(int(dataset["trial"].values[samples][0]))
+    cycle = dataset["average_cycle"].transpose("phase", "signal").values
+    return SectionData(
+        tuple(records), tuple(times), tuple(trials), cycle[:, :nu], cycle[:, nu:],
+        float(dataset.attrs["period"]), float(dataset.attrs["bandwidth"]),
+        tuple(header["spikes"]),
+    )  # fmt: skip
+
+
+def _from_limit_cycles(cycles: LimitCycles, dimension: str) -> Any:
+    """Return the dataset of cycles, with those numbers of the systems that differ by coordinate: a
+    number of a part has its path, with dots, as name."""
+    variables: dict[str, Any] = {
+        name: (dimension, np.asarray(getattr(cycles, name)))
+        for name in ("period", "residual", "iterations", "result")
+    }
+    variables["multipliers"] = (dimension, "multiplier"), cycles.multipliers
+    parameters = {}
+    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(cycles.systems, eqx.is_array))[0]
+    for path, leaf in leaves:
+        name = ".".join(str(getattr(x, "name", x)) for x in path)
+        if leaf.shape == (len(cycles),):
+            unit = unit_of_parameter(cycles.systems, name)
+            parameters[name] = _variable(dimension, np.asarray(leaf), unit)
+    return package("xarray").Dataset(variables, parameters)
+
+
+def _from_branch(branch: Branch) -> Any:
+    """Return the dataset of the cycles, with the kinds of special points ("" for other points) and
+    the stability of the cycles."""
+    kinds = np.full(len(branch), "", dtype="U16")
+    for point in branch.points:
+        kinds[point.index] = point.kind
+    return _from_limit_cycles(branch.cycles, "point").assign(
+        multipliers=(("point", "multiplier"), branch.multipliers),
+        stable=("point", branch.stable),
+        kind=("point", kinds),
+    )
+
+
+def _dataset(variables: Mapping, coordinates: Mapping, header: Mapping[str, Any]) -> Any:
+    text = json.dumps(header, default=lambda x: x.item())
+    return package("xarray").Dataset(variables, coordinates, {_HEADER: text})
+
+
+def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any]:
+    """Return a variable for each signal, along the samples.
+
+    **Raises:** `DefinitionError` for signals that are called like a coordinate.
+    """
+    reserved = _RESERVED & set(data.signals)
+    if reserved:
+        raise DefinitionError(
+            f"the signal '{min(reserved)}' is called like a coordinate: rename it."
+        )
+    triples = zip(data.signals, data.units, values.T, strict=True)
+    return {str(name): _variable("sample", x, unit) for name, unit, x in triples}
+
+
+def _variable(dimension: str, values: np.ndarray, unit: str | None) -> tuple:
+    return dimension, values, {"units": unit} if unit else {}
+
+
+def _unit(dataset: Any, name: str) -> str:
+    return dataset[name].attrs.get("units", "")

@@ -9,13 +9,12 @@ from typing import NamedTuple
 from jaxtyping import Bool, Float
 
 from .._core.executor import namespace
-from .._core.precision import at_precision
 from .arrays import Array
 
 
-# An extremum within this part of the guard's values at the step's ends (in double and in single
-# precision) is a touch. Higher: passing near a guard is called grazing. Lower: grazing is missed.
-TOUCH = 1e-10, 1e-6
+# An extremum within this part of the guard's values at the step's ends is a touch. Higher: passing
+# near a guard is called grazing. Lower: grazing is missed.
+TOUCH = 1e-10
 # An extremum within this part of them is a near miss, for which the step is halved. Higher: more
 # steps. Lower: a guard that dips below zero within a step is missed.
 NEAR = 1e-2
@@ -75,7 +74,7 @@ def first_crossing(v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags)
         s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     scale = xp.maximum(xp.abs(v0), xp.abs(v1))
-    small = at_precision(*TOUCH) * scale
+    small = TOUCH * scale
     touch = near = xp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import cond, namespace, on_host, put, stop_gradient
 from .._core.lanes import put_rows
-from .._core.precision import at_precision
 from ..systems.kinds import Kind, Member
 from ..systems.structure import Structure, stacked
 from ..systems.transition import Scheduled
@@ -18,20 +17,20 @@ from .settings import ROUNDING
 from .watch import Watch
 
 
-# Parts of the time allowed (in double and in single precision).
+# Parts of the time allowed.
 # An instant: shorter steps are not taken, and landings may lie beyond a step by as much. Higher:
 # lanes are given up earlier. Lower: they are given up after many useless halvings.
-INSTANT = 1e-13, 1e-6
+INSTANT = 1e-13
 # A watched function counts as zero if its rate would have made its value in this time. Higher:
 # separate events are taken for simultaneous ones. Lower: simultaneous ones for separate ones.
-ZERO = 1e-12, 1e-6
+ZERO = 1e-12
 # A target's level counts once it is above the change that its rate makes in this time. Higher: a
 # level that falls right after the start is missed. Lower: one that was zero up to rounding is met.
-LEVEL_CLEAR = 1e-10, 1e-6
+LEVEL_CLEAR = 1e-10
 # Times of a schedule are equal if they differ by less than this part of its period, and numbers of
 # steps if they differ by less than it. Higher: a piece of flow that ends shortly before an event
 # has it. Lower: an event happens twice, or a step of rounding errors is taken.
-SAME_TIME = 1e-11, 1e-5
+SAME_TIME = 1e-11
 # Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
 # lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
@@ -46,9 +45,8 @@ _ZENO_SLOW = 3
 
 def width(t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]) -> Float[Array, "W L"]:
     """Values of watched functions that count as zero: their change in a time of rounding errors."""
-    zero, rounding = at_precision(*ZERO), at_precision(*ROUNDING)
     xp = namespace(rate)
-    return (zero * span + rounding * xp.abs(t)) * xp.abs(rate)
+    return (ZERO * span + ROUNDING * xp.abs(t)) * xp.abs(rate)
 
 
 def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
@@ -104,7 +102,7 @@ def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G
 
         n = s.dims[a]
         point = only(here, lanes.t), only(here, lanes.q[:n]), only(here, u)
-        noise = at_precision(*ROUNDING) * _guard_rounding(s, a, *point)
+        noise = ROUNDING * _guard_rounding(s, a, *point)
         return put_rows(out, rows, here, noise)
 
     xp = namespace(lanes.t)
@@ -188,14 +186,14 @@ def next_schedule(s: Structure, t: Times, chart: Index, end: Times) -> tuple[Tim
     Times that differ by rounding are one: an event that was due at t is past, and one that is due
     at `end` happens at `end`.
     """
-    xp, tie = namespace(t), at_precision(*SAME_TIME)
+    xp = namespace(t)
     best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
             offset, period = transition.guard.numbers(t)
-            k = xp.floor((t - offset) / period + tie) + 1
+            k = xp.floor((t - offset) / period + SAME_TIME) + 1
             time = offset + k * period
-            time = xp.where(xp.abs(time - end) <= tie * period, end, time)
+            time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
             sooner = (chart == s.chart_index(transition.source)) & (time < best)
             best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)
     return best, which

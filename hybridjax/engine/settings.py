@@ -12,7 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, PositiveScalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.executor import namespace
-from .._core.precision import at_precision, real
+from .._core.precision import real
 from .._core.text import fields
 from ..errors import DefinitionError
 from ..systems.solver import Solver, solvers
@@ -35,16 +35,12 @@ TRANSIENT = 1e-6
 # Accuracies of data: the error at every section, accumulated since the start of an experiment,
 # relative to the size of each state on the limit cycle.
 EXPERIMENT = 1e-9
-"""Experiments in double precision, and response functions."""
-SINGLE_PRECISION_EXPERIMENT = 1e-4
-"""Experiments in single precision."""
-STEADY_START = 1e-10
-"""Starts of periodic responses, relative to the sizes of time and states."""
+"""Experiments and response functions."""
 
 
-# Rounding errors of a time or a state, relative to it, in double and in single precision. Higher:
-# separate events are taken for simultaneous ones. Lower: an event happens again by rounding.
-ROUNDING = 4e-15, 2e-6
+# Rounding errors of a time or a state, relative to it. Higher: separate events are taken for
+# simultaneous ones. Lower: an event happens again by rounding.
+ROUNDING = 4e-15
 
 
 @checked
@@ -136,6 +132,6 @@ def tolerance(
     largest = xp.maximum(xp.abs(q), xp.abs(step.q))
     change = xp.abs(tau) * xp.maximum(xp.abs(step.f0), xp.abs(step.f1))
     # Rounding errors of the rate may be ten times as large at the stages as at the end of the step.
-    rounding = at_precision(*ROUNDING) * largest + 10.0 * xp.abs(tau) * rounding
+    rounding = ROUNDING * largest + 10.0 * xp.abs(tau) * rounding
     allowed = settings.rtol * largest + settings.atol * xp.maximum(largest, change) + rounding
     return xp.maximum(allowed, xp.finfo(largest.dtype).tiny)  # where all is at rest at zero

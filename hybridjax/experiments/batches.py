@@ -1,6 +1,5 @@
 """Many experiments through one compiled function: batches of one size, in threads."""
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,13 +9,12 @@ import numpy as np
 
 from .._core.execution import Execution, in_threads
 from .._core.executor import on_cpu
-from .._core.precision import single, single_precision
 from .._core.progress import counted
 
 
 # Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
 # them, more leave the cache. On accelerators: more need more memory.
-_BATCH, _BATCH_ON_ACCELERATOR = {"double": 320, "single": 640}, 16384
+_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
 # Fewer experiments than this are not split among workers: smaller batches cost more than they gain.
 _UNDIVIDED = 32
 # Batches are multiples of this, the width of vector instructions: others take up to a third longer.
@@ -30,7 +28,7 @@ def divide(S: int, execution: Execution) -> Execution:
     if execution.batch is not None:
         size = min(execution.batch, S)
     else:
-        most = _BATCH[execution.precision] if on_cpu() else _BATCH_ON_ACCELERATOR
+        most = _BATCH if on_cpu() else _BATCH_ON_ACCELERATOR
         # So many batches that all workers take equally many, and all batches of one size.
         rounds = -(-S // (most * workers))
         size = max(-(-S // (rounds * workers)), min(_UNDIVIDED, S))
@@ -48,7 +46,7 @@ def in_batches(
     """Yield rows and the results of `program` for them, batch after batch.
 
     **Arguments:** `program`: compiled, with experiments first in all that it returns. `arguments`:
-    returns its arguments for some experiments, in double precision. `execution`: from `divide`.
+    returns its arguments for some experiments. `execution`: from `divide`.
     `name`: of the experiments, for the progress line.
     """
     size = execution.batch or S
@@ -57,22 +55,10 @@ def in_batches(
         rows = slice(k, k + size)
         if k + size > S:  # the last batch is filled up with repetitions
             rows = np.arange(k, k + size) % S
-        with precision_of(execution) as convert:
-            out = program(*convert(arguments(rows)))
+        out = program(*arguments(rows))
         return jax.tree_util.tree_map(lambda x: np.asarray(x)[: S - k], out)
 
     starts = range(0, S, size)
     parts = in_threads(work, starts, execution.workers or 1)
     for k, part in counted(zip(starts, parts, strict=True), f"batches of {name}", len(starts)):
         yield slice(k, min(k + size, S)), part
-
-
-@contextlib.contextmanager
-def precision_of(execution: Execution):
-    """Enter the precision of `execution`; the context is a function that converts arguments to
-    it."""
-    if execution.precision == "double":
-        yield lambda tree: tree
-    else:
-        with single_precision():
-            yield single

@@ -24,7 +24,7 @@ from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..engine.watch import watch
 from ..errors import ComputationError
-from ..sections.place import PATIENCE
+from ..orbits.return_map import PATIENCE
 from ..sections.placed import PlacedSections
 
 
@@ -237,14 +237,12 @@ class Stepping(eqx.Module):
     - `plan`: the schedule. `settings`: tolerances.
     - `scales`: of time (the period) and of states (`LimitCycle.scale`) at each section.
     - `accuracy`: bound on the error of (t, q) at every section, relative to the scales.
-    - `rounding`: the error that the precision adds to that of the steps, relative to the scales.
     """
 
     plan: Plan
     settings: Settings
     scales: Float[np.ndarray, "N n"]
     accuracy: float = eqx.field(static=True)
-    rounding: float = eqx.field(static=True, default=0.0)
 
 
 _made = Memory()

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
-from .._core.pieces.run import Workers
+from .._core.pieces.run import DaskClient
 from .._core.progress import working
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import SectionsLike
@@ -34,8 +35,7 @@ def run_experiments(
     start: StartName = "cycle",
     discard: Index | None = None,
     process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy | None = None,
-    record_events: bool = False,
+    accuracy: Accuracy = EXPERIMENT,
     execution: Execution | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
@@ -60,17 +60,15 @@ def run_experiments(
     - `process_noise`: a random input beside the excitation, which is not recorded.
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to their sizes (`LimitCycle.scale`). `data.error` estimates the
-        error of each experiment. Default: 1e-9, in single precision 1e-4.
-    - `record_events`: whether to record the times of events, as `data.events`. Default: False.
-    - `execution`: batches, threads, precision.
+        error of each experiment. Default: 1e-9.
+    - `execution`: batches and threads.
 
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
 
-    **Raises:** `DefinitionError` for arguments that do not fit together and for an accuracy that
-    single precision cannot give; `ComputationError` for an unstable cycle, from which any
-    experiment would run away, and if a steady start is not found.
+    **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
+    unstable cycle, from which any experiment would run away, and if a steady start is not found.
     """
-    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    options = Options(start, discard, process_noise, accuracy, execution)
     return prepare(cycle, sections, design, outputs, options).run()
 
 
@@ -84,7 +82,7 @@ def stream_experiments(
     *,
     chunk: ExperimentCount = _CHUNK,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
 ) -> Iterator[ExperimentData] | StoredExperiments:
     """Run experiments chunk by chunk, in memory that does not depend on their number.
 
@@ -107,9 +105,7 @@ def stream_experiments(
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
         holds the experiments of one call only.
     - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
-        `design`, so pass a `Design` or a small array. Or `(rank, size)` if several processes fill
-        one store without Dask: this process runs the chunks rank, rank + size, ...; processes of
-        rank 1 and more wait until the first has begun the store.
+        `design`, so pass a `Design` or a small array.
 
     **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
     `StoredExperiments`.

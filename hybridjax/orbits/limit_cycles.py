@@ -157,17 +157,14 @@ def find_limit_cycles(
     - `guess`: a limit cycle of a similar system.
     - `scale`: sizes of states by name. Default: those of the guess.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
-    - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`). The
-        precision is always double.
+    - `execution`: systems per compiled call (`batch`, Default: 250) and threads (`workers`).
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
 
-    **Raises:** `DefinitionError` for systems that do not belong together, or single precision.
+    **Raises:** `DefinitionError` for systems that do not belong together.
     """
     execution = Execution() if execution is None else execution
-    if execution.precision != "double":
-        raise DefinitionError("limit cycles are found in double precision only.")
     systems = _stacked(systems)
     require_x64(systems)
     settings = Settings() if settings is None else settings

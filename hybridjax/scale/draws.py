@@ -9,7 +9,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, ExperimentCount, Path, Seed
 from .._core.pieces.description import function_digest, versions
-from .._core.pieces.run import DaskClient, Workers, call, fill
+from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
@@ -32,7 +32,7 @@ def monte_carlo(
     *,
     chunk: Count | None = None,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
 ) -> Any:
     """Draw a random computation many times.
 
@@ -91,9 +91,9 @@ class Draws:
             "piece": list(self.blocks.block),
         }
 
-    def begin(self, client: DaskClient | None) -> tuple["Draws", Layout]:
+    def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
-        variables = call(self, "first", client)
+        variables = self.first()
         number = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout

@@ -7,7 +7,6 @@ from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace
 from ..._core.lanes import pick
-from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..arrays import Array, Index, Mask, Times
 from ..cubic import CubicCrossing, first_crossing
@@ -79,7 +78,7 @@ def accept(s: Structure, state: State, aim: Aim, new: Attempt, t: Times, task: T
     xp, within_error = namespace(t), accurate(new, task)
     # Which approaches succeed.
     tau = approach.tau + new.past
-    beyond = LANDING * approach.reach + at_precision(*INSTANT) * task.span
+    beyond = LANDING * approach.reach + INSTANT * task.span
     inside = (tau >= -beyond) & (tau <= approach.reach + beyond)
     falling = of_row(end.rate, aim.which) < 0
     lands = active & new.lands & falling & xp.where(approach.on, inside, within_error)

@@ -3,7 +3,6 @@
 import numpy as np
 
 from ..._core.executor import namespace, put
-from ..._core.precision import at_precision
 from ...systems.structure import Structure
 from ..events import SAME_TIME, next_schedule
 from .state import Aim, State, Task
@@ -26,7 +25,7 @@ def take_aim(s: Structure, state: State, task: Task) -> Aim:
         schedule = xp.where(scheduled <= target.time, which, -1)
     left = xp.maximum(due - lanes.t, 0.0)
     steps = xp.where(xp.isfinite(left), left / state.h, 2.0)
-    pieces = xp.ceil(steps - at_precision(*SAME_TIME))
+    pieces = xp.ceil(steps - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 from ..._core.executor import namespace
 from ..._core.lanes import pick
-from ..._core.precision import at_precision
 from ..arrays import Mask, States, Times
 from ..cubic import root_near_end
 from ..runge_kutta import Step
@@ -17,10 +16,10 @@ from .state import Aim
 # rejected as too inaccurate. Lower: more steps until a lane lands.
 _LANDING_REACH = 0.25
 # A landing is accurate to this part of the step: its last correction is at most as large (or as
-# large as that part of the time allowed, in double and in single precision), and it lies no farther
-# beyond the step in which the crossing was met. Corrections square their error. Higher: a crossing
-# is off by more than a replay corrects to rounding. Lower: landings are repeated.
-LANDING, _LANDING_OF_SPAN = 1e-6, (1e-14, 5e-6)
+# large as that part of the time allowed), and it lies no farther beyond the step in which the
+# crossing was met. Corrections square their error. Higher: a crossing is off by more than a replay
+# corrects to rounding. Lower: landings are repeated.
+LANDING, _LANDING_OF_SPAN = 1e-6, 1e-14
 # Attempts to land on a crossing before the step in which it was met is halved. Higher: they cost
 # time where the cubic interpolant is no guide to the crossing. Lower: steps are halved too early.
 LANDING_TRIES = 8
@@ -57,7 +56,7 @@ def land(
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
     error = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
-    rounding = at_precision(*_LANDING_OF_SPAN) * span
+    rounding = _LANDING_OF_SPAN * span
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + rounding
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
     return Landing(

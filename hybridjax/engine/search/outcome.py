@@ -3,7 +3,6 @@
 from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace, put
-from ..._core.precision import at_precision
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ..arrays import Array, Index, Mask, Times
@@ -191,12 +190,12 @@ def _next_step(
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
     rejected = too_long | verdict.refine | verdict.lost
-    return h, rejected & (h < at_precision(*INSTANT) * task.span)
+    return h, rejected & (h < INSTANT * task.span)
 
 
 def level_counts(watched: Watch, span: Times) -> Mask:
     """Test whether the target's level is clearly positive, so that its next fall counts."""
-    return watched.value[-1] > at_precision(*LEVEL_CLEAR) * span * abs(watched.rate[-1])
+    return watched.value[-1] > LEVEL_CLEAR * span * abs(watched.rate[-1])
 
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:

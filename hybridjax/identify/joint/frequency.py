@@ -84,6 +84,10 @@ class FrequencyProblem(NamedTuple):
         waves = np.exp(-2j * np.pi / N * np.outer(np.arange(N), m)) / N
         size = ends[-1] + (N * ny if direct else 0)
         gram, along = np.zeros((nu, size, size)), np.zeros((nu, size))
+        try:
+            error = self.errors(model)
+        except np.linalg.LinAlgError:
+            return model
         for rows in _chunks(len(self.f), size * len(m) * ny):
             J = np.zeros((size, len(m), rows.stop - rows.start, ny), complex)
             np.concatenate(_after(model, self.f[rows], m), out=J[: ends[-1]])
@@ -92,18 +96,17 @@ class FrequencyProblem(NamedTuple):
                 for i in range(ny):
                     D[:, i, :, :, i] = waves[:, :, None]
             for j in range(nu):
-                weight = self.weight[:, rows, :, j]
-                columns = (J * weight).reshape(size, -1).view(float)
-                target = np.ascontiguousarray(weight * self.target[:, rows, :, j])
+                columns = (J * self.weight[:, rows, :, j]).reshape(size, -1).view(float)
                 gram[j] += columns @ columns.T
-                along[j] += columns @ target.ravel().view(float)
+                along[j] += columns @ np.ascontiguousarray(error[:, rows, :, j]).ravel().view(float)
         try:
             each = [NormalEquations(g, a).step(0.0)[0] for g, a in zip(gram, along, strict=True)]
         except np.linalg.LinAlgError:
             return model
-        x = np.stack(each, axis=1)
-        B = [x[a:b] for a, b in pairwise(ends)]
-        D = list(x[ends[-1] :].reshape(N, ny, nu)) if direct else model.D
+        change = np.stack(each, axis=1)
+        B = [B + change[a:b] for B, (a, b) in zip(model.B, pairwise(ends), strict=True)]
+        changes = change[ends[-1] :].reshape(-1, ny, nu)
+        D = [D + x for D, x in zip(model.D, changes, strict=True)] if direct else model.D
         return model._replace(B=B, D=D)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:

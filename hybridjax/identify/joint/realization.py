@@ -1,6 +1,6 @@
 """State-space models from measured responses: minimal, with dimensions that vary."""
 
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -14,20 +14,20 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
+from ..descent import ROUNDING
+from ..htf_errors import SMALLEST_ERROR
 from ..series.fit import SeriesFit
+from .frequency import FrequencyProblem
+from .model import PeriodicModel
 
 
-# Singular values below this part of the largest one are rounding errors. Doubled: states that are
-# seen twice as little are left out of exact models.
-_ROUNDING = 1e-12
+Names = tuple[str, ...] | None
+
 # Factor by which a singular value must exceed the largest that noise alone makes, on average.
-# Doubled: states must be twice as strong to be found.
+# Larger: weak states are missed; smaller: noise makes states.
 _NOISE_MARGIN = 1.1
-# Sections that a state is seen through at least, by default. Doubled: more averaging, more lags.
-_SHORTEST_HORIZON = 8
-# Smallest standard deviation of an HTF, relative to the largest HTF: rounding. Doubled: outputs
-# without noise count half as much beside noisy ones.
-_SMALLEST_ERROR = 1e-15
+# Sections in which a state is observed, at least, by default. Smaller: less averaging.
+SHORTEST_HORIZON = 8
 
 
 @checked
@@ -40,18 +40,18 @@ def realize(
     outputs: SignalNames | None = None,
     inputs: SignalNames | None = None,
 ) -> LDTP:
-    r"""A minimal periodic state-space model with the responses given.
+    r"""Return a minimal periodic state-space model with given responses.
 
-    The state at a section is what the outputs from there on remember of the inputs before it, so
-    that its dimension is a rank at each section on its own.
+    The state at a section is the memory of earlier inputs in the outputs from there on. Its
+    dimension is a rank at each section.
 
-    - *From Markov parameters* (an array (N, lags, ny, nu) as `LDTP.impulse_response` gives it, or a
-      `SeriesFit`):
-      the rank of the Hankel matrix at section n of the responses, `[i, j]`, at section n + i to
-      an input at n - 1 - j (Ho and Kalman 1966, for each section of the period).
-    - *From HTFs* on any frequencies: the outputs at sections n, ..., n + p in response to
-      $e^{i w n}$ are $O_n X_n(w)$ plus what the inputs in this stretch add; the latter is
-      projected out, and $O_n$ is the range of the rest (subspace identification from frequency
+    - *Markov parameters* (an array (N, lags, ny, nu) as of `LDTP.impulse_response`, or a
+      `SeriesFit`): the dimension is the rank of the Hankel matrix at section n of the responses,
+      `[i, j]`, at section n + i to an input at n - 1 - j (Ho and Kalman 1966, for each section of
+      the period).
+    - *HTFs* at any frequencies: the outputs at sections n, ..., n + p in response to
+      $e^{i w n}$ are $O_n X_n(w)$ plus the response to the inputs in these sections. The latter is
+      projected out, and $O_n$ is the range of the remainder (subspace identification from frequency
       responses, McKelvey, Akcay and Ljung 1996, at each section; Uyanik et al. 2019 treat
       periodic systems by lifting). Given A and C, B and D are a linear least-squares problem.
 
@@ -59,17 +59,16 @@ def realize(
 
     **Arguments:**
 
-    - `source`: exact or estimated. HTFs: harmonics that are not there count as zero.
-    - `dims`: dimension of the state at all sections, or at each; None finds it by the singular
-      values: those above rounding errors, or, where the source has variances, above what noise
-      alone would make. States that are drowned in noise are left out.
-    - `order`: no dimension found is smaller; the number of multipliers expected.
-    - `horizon`: p, the sections that a state is seen through; default two periods, at least 8,
-      where the source is that long. Long ones average more noise.
+    - `source`: exact or estimated responses. Missing harmonics of HTFs count as zero.
+    - `dims`: dimension of the state at all sections, or at each. Default: the number of singular
+      values above rounding errors or, if the source has variances, above noise.
+    - `order`: the number of multipliers expected, a lower bound of dimensions. Default: 1.
+    - `horizon`: p, the number of sections in which a state is observed. A longer horizon averages
+      more noise. Default: two periods, at least 8, if the source is that long.
     - `outputs`, `inputs`: names, for an array.
 
     **Raises:** `DefinitionError` for too few lags or frequencies for the horizon, or more
-    dimensions than the horizon can show.
+    dimensions than the horizon supports.
     """
     require_x64()
     if isinstance(source, HTF):
@@ -89,8 +88,8 @@ def realize(
             raise DefinitionError(
                 f"{lags} lags are too few for a horizon of {p} sections: {2 * p + 1} are needed."
             )
-        outputs = names("outputs", outputs, markov.shape[2])
-        inputs = names("inputs", inputs, markov.shape[3])
+        outputs = names("outputs", cast(Names, outputs), markov.shape[2])
+        inputs = names("inputs", cast(Names, inputs), markov.shape[3])
     ny, nu = markov.shape[2:]
     scale = _scale(np.sqrt(np.mean(markov**2, axis=(0, 1, 3))) if spread is None else spread)
     markov = markov / scale[:, None]
@@ -109,17 +108,17 @@ def realize(
 
 
 def _horizon(horizon: int | None, N: int) -> int:
-    return max(_SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
+    return max(SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
 
 
 def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
     return np.where(scale > 0, scale, 1.0)
 
 
-def given_dims(dims, N: int, name: str = "dims") -> list[int] | None:
-    """One for each section; None where none are given.
+def given_dims(dims: Any, N: int, name: str = "dims") -> list[int] | None:
+    """Return one dimension for each section; None if none are given.
 
-    **Raises:** `DefinitionError` for another number of them.
+    **Raises:** `DefinitionError` for another number of dimensions.
     """
     if dims is None:
         return None
@@ -129,14 +128,16 @@ def given_dims(dims, N: int, name: str = "dims") -> list[int] | None:
     return [int(d) for d in chosen]
 
 
-def _bases(matrices, dims: list[int] | None, order: int, edge: float, ny: int):
-    """O_n: orthonormal bases of the ranges of each section's matrix."""
+def _bases(
+    matrices: list[np.ndarray], dims: list[int] | None, order: int, edge: float, ny: int
+) -> list[np.ndarray]:
+    """Return O_n, orthonormal bases of the ranges of each section's matrix."""
     bases = []
     most = min(matrices[0].shape[0] - ny, matrices[0].shape[1])
     for n, matrix in enumerate(matrices):
         left, s, _ = np.linalg.svd(matrix, full_matrices=False)
-        found = int((s > max(edge, _ROUNDING * s[0])).sum())
-        d = max(order, found, 1) if dims is None else dims[n]
+        rank = int((s > max(edge, ROUNDING * s[0])).sum())
+        d = max(order, rank, 1) if dims is None else dims[n]
         if d > most:
             raise DefinitionError(
                 f"section {n} would have {d} dimensions, but the horizon and the data show {most} "
@@ -146,26 +147,28 @@ def _bases(matrices, dims: list[int] | None, order: int, edge: float, ny: int):
     return bases
 
 
-def _shifted(bases: list[np.ndarray], ny: int):
-    """A and C from O_n: its first rows are C[n], the others O_{n+1} A[n]."""
+def _shifted(bases: list[np.ndarray], ny: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return A and C from O_n: its first rows are C[n], the others O_{n+1} A[n]."""
     after = [*bases[1:], bases[0]]
     A = [np.linalg.lstsq(O[:-ny], now[ny:])[0] for O, now in zip(after, bases, strict=True)]
     return A, [O[:ny] for O in bases]
 
 
-def _from_htf(htf: HTF, dims, order: int, horizon: int | None) -> LDTP:
-    f, H, N = np.asarray(htf.f), np.asarray(htf.H), htf.n_sections
-    if not np.isfinite(H).all():
+def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
+    f, N = np.asarray(htf.f), htf.n_sections
+    if not np.isfinite(htf.H).all():
         raise DefinitionError("the HTFs hold NaN or infinity.")
-    ny, nu = H.shape[2:]
-    p = min(_horizon(horizon, N), len(f) - 1) if horizon is None else _horizon(horizon, N)
-    if 2 * len(f) <= p + 1:
+    F, ny, nu = htf.H.shape[1:]
+    p = min(_horizon(horizon, N), F - 1) if horizon is None else _horizon(horizon, N)
+    if 2 * F <= p + 1:
         raise DefinitionError(
-            f"{len(f)} frequencies are too few for a horizon of {p} sections: more than "
+            f"{F} frequencies are too few for a horizon of {p} sections: more than "
             f"{(p + 1) // 2} are needed."
         )
-    m = np.array(all_harmonics(N))[np.isin(all_harmonics(N), htf.harmonics)]
-    G = np.einsum("nm,mfij->nfij", np.exp(2j * np.pi * np.outer(np.arange(N), m) / N), H)
+    m = np.array(all_harmonics(N))
+    H = np.zeros((N, F, ny, nu), complex)
+    H[np.isin(m, htf.harmonics)] = htf.H
+    G = np.tensordot(np.exp(2j * np.pi * np.outer(np.arange(N), m) / N), H, 1)
     if htf.variance is None:
         scale, edge = _scale(np.sqrt(np.mean(np.abs(G) ** 2, axis=(0, 1, 3)))), 0.0
         weight = np.broadcast_to(1 / scale[:, None], G.shape[1:])
@@ -173,61 +176,34 @@ def _from_htf(htf: HTF, dims, order: int, horizon: int | None) -> LDTP:
         # Real and imaginary part have half of the variance each.
         spread = np.sqrt(np.asarray(htf.variance).sum(axis=0) / 2)
         scale = _scale(np.sqrt((spread**2).mean(axis=(0, 2))))
-        weight = 1 / np.maximum(spread, _SMALLEST_ERROR * np.abs(G).max())
-        edge = _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * len(f) * nu))
-    z = np.exp(2j * np.pi / N * f)
+        weight = 1 / np.maximum(spread, SMALLEST_ERROR * np.abs(G).max())
+        edge = _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * F * nu))
 
-    # One weight for each column, that of its noise: the rows of an input stay what they were.
+    # One weight for each column, that of its noise, keeps the rows of an input as they are.
     column = np.sqrt(np.mean(weight**2 * scale[:, None] ** 2, axis=1)).T.ravel()  # (nu F)
-    powers = z ** np.arange(p + 1)[:, None]
-    inputs = np.kron(np.eye(nu), powers) * column
-    _, s, vh = np.linalg.svd(_real(inputs), full_matrices=False)
-    Q = vh[s > _ROUNDING * s[0]]
+    powers = np.exp(2j * np.pi / N * f) ** np.arange(p + 1)[:, None]
+    _, s, vh = np.linalg.svd(_real(np.kron(np.eye(nu), powers) * column), full_matrices=False)
+    Q = vh[s > ROUNDING * s[0]]
     matrices = []
     for n in range(N):
         Y = np.stack([G[(n + i) % N] * powers[i][:, None, None] for i in range(p + 1)])
         Y = Y.transpose(0, 2, 3, 1).reshape((p + 1) * ny, -1) * column
         Y = _real(Y / np.tile(scale, p + 1)[:, None])
-        for _ in range(2):  # the second time for accuracy
+        for _ in range(2):  # the second time removes rounding errors
             Y = Y - (Y @ Q.T) @ Q
         matrices.append(Y)
-    bases = _bases(matrices, given_dims(dims, N), order, edge, ny)
-    A, C = _shifted(bases, ny)
-    C = [scale[:, None] * c for c in C]
-    B, D = _inputs(A, C, G, z, weight)
-    return LDTP.from_blocks(A, B, C, D, htf.inputs, htf.outputs)
+    A, C = _shifted(_bases(matrices, given_dims(dims, N), order, edge, ny), ny)
+    D = [np.zeros((ny, nu))] * N
+    B, K = ([np.zeros((len(a), columns)) for a in A] for columns in (nu, 0))
+    model = PeriodicModel(A, B, C, D, K)
+    unit = scale[:, None]
+    problem = FrequencyProblem(
+        f, tuple(m.tolist()), H / unit, np.broadcast_to(weight * unit, H.shape)
+    )
+    for _ in range(2):  # the second time removes rounding errors
+        model = problem.refined(model, True)
+    return model.to_ldtp(scale, htf.inputs, htf.outputs)
 
 
 def _real(x: Complex[np.ndarray, "a b"]) -> Float[np.ndarray, "a b2"]:
     return np.concatenate([x.real, x.imag], axis=1)
-
-
-def _inputs(A, C, G, z, weight):
-    """B and D by least squares: given A and C, the responses G are linear in them."""
-    N, F, ny, nu = G.shape
-    after = [A[n].shape[0] for n in range(N)]
-    place = np.concatenate([[0], np.cumsum(after)])
-    columns = place[-1] + N * ny
-    triangles = [np.zeros((0, columns + 1)) for _ in range(nu)]
-    for n in range(N):
-        # C (I - Phi z^-N)^-1 A[n-1] ... A[n-r+1] z^-r multiplies B[n-r].
-        Phi = np.eye(A[n].shape[1])
-        for i in range(N):
-            Phi = A[(n + i) % N] @ Phi
-        resolvent = np.linalg.inv(np.eye(len(Phi)) - Phi * z[:, None, None] ** -N)
-        row = C[n] @ resolvent
-        block = np.zeros((F, ny, columns), complex)
-        for r in range(1, N + 1):
-            k = (n - r) % N
-            block[:, :, place[k] : place[k + 1]] += row * z[:, None, None] ** -r
-            row = row @ A[k]
-        block[:, range(ny), place[-1] + n * ny + np.arange(ny)] = 1.0
-        for j in range(nu):
-            rows = np.concatenate([block, G[n, :, :, j, None]], axis=2) * weight[:, :, j, None]
-            rows = rows.reshape(F * ny, -1)
-            stacked = np.concatenate([triangles[j], rows.real, rows.imag])
-            triangles[j] = np.linalg.qr(stacked, mode="r")
-    x = np.stack([np.linalg.lstsq(t[:, :-1], t[:, -1])[0] for t in triangles], axis=1)
-    B = [x[place[n] : place[n + 1]] for n in range(N)]
-    D = [x[place[-1] + n * ny : place[-1] + (n + 1) * ny] for n in range(N)]
-    return B, D
