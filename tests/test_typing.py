@@ -149,7 +149,7 @@ UNCHECKED = {
         "ReturnMap.turn_with_jacobian", "Structure", "Winding.when",
     },
     "made by this package": {
-        "Advice", "Branch", "Constrained", "EventTimes",
+        "Advice", "Branch", "Constrained", 
         "Finding", "Identification", "Impact", "ImpulseResponses",
         "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",

@@ -36,7 +36,6 @@ def run_experiments(
     discard: Index | None = None,
     process_noise: ProcessNoise | None = None,
     accuracy: Accuracy = EXPERIMENT,
-    record_events: bool = False,
     execution: Execution | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
@@ -62,7 +61,6 @@ def run_experiments(
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to their sizes (`LimitCycle.scale`). `data.error` estimates the
         error of each experiment. Default: 1e-9.
-    - `record_events`: whether to record the times of events, as `data.events`. Default: False.
     - `execution`: batches and threads.
 
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
@@ -70,7 +68,7 @@ def run_experiments(
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
     unstable cycle, from which any experiment would run away, and if a steady start is not found.
     """
-    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    options = Options(start, discard, process_noise, accuracy, execution)
     return prepare(cycle, sections, design, outputs, options).run()
 
 

@@ -45,8 +45,7 @@ def estimate_htf(
     coincides with its own mirror image, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`;
     both unknowns are solved for, from two or more experiments with different phases. Inputs that
     excite one line together need as many experiments to be separated. Failed experiments are left
-    out (`missing_frequencies` lists the frequencies lost), and with several inputs only frequencies
-    that were measured from each of them are kept.
+    out, and with several inputs only frequencies that were measured from each of them are kept.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
     (Pintelon and Schoukens 2012, ch. 3), with its `variance`. Frequencies that
@@ -119,19 +118,6 @@ def estimate_htf(
         f, lines.H, sums.harmonics, setup.n_sections, setup.inputs, setup.outputs, "estimate",
         variance=total, noise_variance=noise, scatter=scatter,
     )  # fmt: skip
-
-
-@checked
-def missing_frequencies(
-    data: Experiments, threshold: Probability = SILENT_LINE, *, highest: Index | None = None
-) -> Float[np.ndarray, " F"]:
-    """Return the frequencies (cycles per period) that were excited but cannot be estimated.
-
-    Their experiments failed, or not all inputs were applied there, or they lie on a multiple of
-    1/2 and were measured with one phase only. Arguments as of `estimate_htf`.
-    """
-    sums = spectral_sums(data, (), highest=highest, threshold=threshold)
-    return sums.f[~sums.solvable(sums.gram)]
 
 
 class _LineEstimates(NamedTuple):

@@ -19,7 +19,7 @@ from .multiplier_estimate import (
     MultiplierComparison,
     Multipliers,
     channel_index,
-    compare_by_output,
+    compare_multipliers,
 )
 
 
@@ -90,7 +90,13 @@ class RationalFit(eqx.Module):
 
         **Raises:** `DefinitionError` for an output that is not there.
         """
-        return compare_by_output(list(self.multipliers), true, self.outputs, output)
+        chosen = range(len(self.outputs))
+        if output is not None:
+            chosen = [channel_index("output", output, self.outputs)]
+        parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
+        true, estimated = np.concatenate([(part.true, part.estimated) for part in parts], axis=1)
+        names = tuple(self.outputs[k] for k in chosen for _ in parts[0].true)
+        return MultiplierComparison(true, estimated, names)
 
     def __repr__(self) -> str:
         rows = [

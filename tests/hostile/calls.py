@@ -7,7 +7,6 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax.experiments.design.multisine import single_cosine
-from hybridjax.identify.htf_estimate import missing_frequencies
 from hybridjax.identify.joint.noise import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
@@ -174,7 +173,6 @@ def experiments(t):
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield missing_frequencies, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))

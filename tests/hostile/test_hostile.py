@@ -20,7 +20,7 @@ CALLED_BY_THE_ENGINE = {
     "ProcessNoise", "ReturnMap", "SLIPRunner", "Scheduled", "SectionList", "Settings", "Structure",
     "TwoLeggedBar", "VerticalHopper", "Winding",
 }  # fmt: skip
-SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
+SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
 
 
 def printed(*command):

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.identify.series.arx import delayed_outputs
 from hybridjax.identify.series.covariance import gradient_covariance
-from hybridjax.identify.series.linearization import each_part, linearize
+from hybridjax.identify.series.linearization import each_fit, linearize
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import PreparedRecords
 
@@ -155,7 +155,7 @@ def slopes_of(problem, solution):
         x = part.y[:, :, n, fit.outputs, None]
         slopes[n] = fit.samples(solution.c, regression, x)[1].ravel()
 
-    each_part(problem, solution, section, lambda k, results: None)
+    each_fit(problem, solution, section)
     return np.stack([slopes[n] for n in sorted(slopes)], axis=1)
 
 
@@ -194,7 +194,7 @@ OUTLIERS = {
 def test_robust_losses(small, kind):
     """As accurate as squares for Gaussian errors, more with outliers; regions hold."""
     true, runs, rms = small.multipliers, 4, {}
-    for loss in ("squares", "huber", "student"):
+    for loss in ("squares", "huber"):
         fits = []
         for seed in range(runs):
             data = record(small, 4 * 50, seed)
@@ -236,19 +236,6 @@ def test_experiments_are_used_from_their_start(small):
     assert fits[0].compare(small.multipliers).max_error < 1e-8
     for fit in fits[1:]:
         np.testing.assert_array_equal(fit.coefficients, fits[0].coefficients)
-
-
-def test_data_that_are_read_in_parts_give_the_same_bits(small):
-    """An iterable that is no sequence is read anew in each pass."""
-    records = [record(small, 4 * (40 + k), k, 0.1) for k in range(4)]
-
-    class Stored:
-        def __iter__(self):
-            return iter(records)
-
-    read, kept = hj.fit_series(Stored(), 2), hj.fit_series(records, 2)
-    np.testing.assert_array_equal(read.coefficients, kept.coefficients)
-    np.testing.assert_array_equal(read.covariance, kept.covariance)
 
 
 def test_a_chirp_excites_enough(hopper, multipliers):

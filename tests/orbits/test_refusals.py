@@ -87,6 +87,6 @@ def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     traced = jax.jit(lambda omega: hj.find_limit_cycle(slower(omega), hopper_cycle).anchor)(omega)
     np.testing.assert_allclose(traced.t, cycle.anchor.t, rtol=1e-14)
     np.testing.assert_allclose(traced.q, cycle.anchor.q, rtol=1e-9)
-    bare = candidate_cycle(slower(omega), hopper_cycle, with_factors=False)
+    bare = candidate_cycle(slower(omega), hopper_cycle)
     np.testing.assert_allclose(bare.anchor.t, cycle.anchor.t, rtol=1e-14)
     np.testing.assert_allclose(bare.anchor.q, cycle.anchor.q, rtol=1e-9)

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
@@ -325,6 +324,8 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
 def _lower(phase, free, line, size, length: int):
     """Return the free phases of one signal that minimize its peak."""
+    from scipy.optimize import minimize  # (a third of a second, needed by few designs)
+
     spectrum, best, least = np.zeros(length // 2 + 1, complex), phase[free], np.inf
 
     def signal(x):

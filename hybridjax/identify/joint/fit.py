@@ -1,6 +1,5 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import equinox as eqx
@@ -282,7 +281,7 @@ def _fit_to_series(
             "(`lead`), those of an LDTP on earlier ones only: use `fit_series`."
         )
     N, ny, scale = records.n_sections, len(records.outputs), records.scale
-    parts = SeriesParts(records)
+    parts = [SeriesPart.of(grid, scale) for grid in records.grids]
     first = [n for part in parts for n in part.first.tolist()]
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
@@ -315,20 +314,6 @@ def _fit_to_series(
     fitted = model.to_ldtp(scale, records.inputs, records.outputs)
     harmonics = all_harmonics(N)
     return _finished(point, converged, fitted, scale, harmonics, freedom, False, sources)
-
-
-class SeriesParts:
-    """The grids of records by section, which can be iterated over again and again."""
-
-    def __init__(self, records: PreparedRecords):
-        self._records = records
-        self._kept = list(self._read()) if records.in_memory else None
-
-    def _read(self) -> Iterator[SeriesPart]:
-        return (SeriesPart.of(grid, self._records.scale) for grid in self._records)
-
-    def __iter__(self) -> Iterator[SeriesPart]:
-        return self._read() if self._kept is None else iter(self._kept)
 
 
 def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:

@@ -1,6 +1,6 @@
 """A first periodic model of time series: regression on the past, then a common state."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,12 +21,10 @@ _SHRINKAGE = 1e-6
 # Largest modulus of a multiplier of a start, and of the errors of its predictions. Larger:
 # predictions overflow.
 _LARGEST_MODULUS = 0.99
-# Samples that are used, of data that are read in parts. Larger: memory.
-_SAMPLES = 200_000
 
 
 def subspace_model(
-    parts: Iterable[SeriesPart], dims: Sequence[int], innovations: bool
+    parts: Sequence[SeriesPart], dims: Sequence[int], innovations: bool
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K.
 
@@ -101,22 +99,15 @@ class _Section:
 
 
 def _signals(
-    parts: Iterable[SeriesPart],
+    parts: Sequence[SeriesPart],
 ) -> tuple[Float[np.ndarray, "R n columns"], Float[np.ndarray, "R n ny"], Bool[np.ndarray, "R n"]]:
-    """Return inputs and outputs of some records side by side, with zeros for missing samples; the
+    """Return inputs and outputs of all records side by side, with zeros for missing samples; the
     outputs, with NaN there; and whether a sample lies inside of a record."""
-    chosen: list[SeriesPart] = []
-    size = 0
-    for part in parts:
-        if size and size + part.y[..., 0].size > _SAMPLES:
-            break
-        chosen.append(part)
-        size += part.y[..., 0].size
-    longest = max(part.shape[1] for part in chosen)
+    longest = max(part.shape[1] for part in parts)
 
     def flat(name: str) -> np.ndarray:  # (N R T k) -> (R, T N, k)
         out = []
-        for part in chosen:
+        for part in parts:
             x = getattr(part, name)
             x = np.pad(x, [(0, 0), (0, 0), (0, longest - x.shape[2]), (0, 0)])
             out.append(np.moveaxis(x, 0, 2).reshape(x.shape[1], -1, x.shape[3]))

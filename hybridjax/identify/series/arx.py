@@ -41,7 +41,7 @@ def delayed_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
         return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
 
-    def regress(part: CycleGrid, _: None, n: int) -> list[SectionRegression]:
+    def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
         inputs = lagged_inputs(part.u, n, problem.lags, problem.records.lead) @ problem.to_lags[n]
         later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
         sampled = part.sampled[:, :, n]
@@ -53,11 +53,11 @@ def delayed_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         ]
 
     gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
-    for section in sum_up(problem, np.zeros(0), past, regress, lambda part: None):
+    for section in sum_up(problem, np.zeros(0), past, regress):
         for each in section:
-            gram[each.outputs] += each.products
+            gram[each.fit.outputs] += each.products
             rows = round(each.freedom) - each.fit.root.shape[1]
-            freedom += max(rows, 0) * len(each.outputs)
+            freedom += max(rows, 0) * len(each.fit.outputs)
     return DelayedOutputs(gram, freedom)
 
 
