@@ -5,23 +5,19 @@ from collections.abc import Iterator
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
-from .._core.pieces.run import Workers
+from .._core.pieces.run import DaskClient
 from .._core.progress import working
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import DesignLike, Options, prepare
+from .campaign import CHUNK, DesignLike, Options, prepare
 from .data import ExperimentData
 from .noise import ProcessNoise
 from .plan import Accuracy
 from .start import StartName
 from .stored import StoredExperiments, store_experiments
-
-
-# Experiments of a chunk. More need more memory; fewer leave batches and threads unfilled.
-_CHUNK = 640
 
 
 @checked
@@ -80,9 +76,9 @@ def stream_experiments(
     outputs: OutputNames,
     options: Options = Options(),  # noqa: B008 (immutable)
     *,
-    chunk: ExperimentCount = _CHUNK,
+    chunk: ExperimentCount = CHUNK,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
 ) -> Iterator[ExperimentData] | StoredExperiments:
     """Run experiments chunk by chunk, in memory that does not depend on their number.
 
@@ -105,9 +101,7 @@ def stream_experiments(
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
         holds the experiments of one call only.
     - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
-        `design`, so pass a `Design` or a small array. Or `(rank, size)` if several processes fill
-        one store without Dask: this process runs the chunks rank, rank + size, ...; processes of
-        rank 1 and more wait until the first has begun the store.
+        `design`, so pass a `Design` or a small array.
 
     **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
     `StoredExperiments`.

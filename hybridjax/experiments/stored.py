@@ -13,7 +13,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Path
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, digest_of, function_digest, versions
-from .._core.pieces.run import DaskClient, Workers, fill
+from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
@@ -22,7 +22,7 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import Campaign, DesignLike, Options, prepare
+from .campaign import CHUNK, Campaign, DesignLike, Options, prepare
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
 
@@ -121,10 +121,10 @@ def store_experiments(
     options: Options,
     chunk: int,
     store: Any,
-    workers: Workers | None,
+    client: DaskClient | None,
 ) -> StoredExperiments:
     """Run the experiments that are missing in a store; see `stream_experiments`."""
-    fill(prepare_pieces(*arguments, options, chunk), store, workers)
+    fill(prepare_pieces(*arguments, options, chunk), store, client)
     return StoredExperiments(store)
 
 
@@ -161,7 +161,7 @@ class ExperimentJob:
             "failed_at": data.failed_at, "error": data.error,
         }  # fmt: skip
 
-    def begin(self, client: DaskClient | None) -> tuple["ExperimentJob", Layout]:
+    def begin(self) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
         campaign, description = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
@@ -244,5 +244,5 @@ def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
         arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
         return digest_of(*map(array_digest, arrays), repr(source.input_names))
-    parts = (source[k : k + 1024] for k in range(0, len(source), 1024))  # (may lie on disk)
+    parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
     return digest_of(*map(array_digest, parts))

@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Index, Probability
+from .._core.boundary.kinds import Count, Probability
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF, Scatter
+from .descent import ROUNDING
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
@@ -21,8 +22,6 @@ _SAME_PHASES = 1e-6
 # Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
 # errors of constant size are too small; the mean of more is normally distributed.
 _FEW_REALIZATIONS = 16
-# Residuals of a line, relative to its power, that are rounding and have no shape.
-_NO_RESIDUAL = 1e-13
 
 
 @checked
@@ -32,7 +31,6 @@ def estimate_htf(
     *,
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
-    highest: Index | None = None,
     half_integers: Literal["error", "skip"] = "error",
     threshold: Probability = SILENT_LINE,
 ) -> HTF:
@@ -57,12 +55,10 @@ def estimate_htf(
 
     - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
       `StoredExperiments` return them, of which only sums over experiments are kept.
-    - `harmonics`: the harmonics to estimate. Default: all N (with `highest`, all up to it).
+    - `harmonics`: the harmonics to estimate. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "auto", the default, is the variance that the experiments allow; "noise", from
       the repeats alone, and "total", from realizations, raise errors where they are not available.
-    - `highest`: harmonics beyond this one are taken as zero, as in designs with few experiments
-      (`multisine(highest_harmonic=...)`). Default: none.
     - `half_integers`: "error", the default, or "skip" multiples of 1/2 measured with one phase.
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
@@ -81,7 +77,7 @@ def estimate_htf(
             "pass repeats=2."
         )
     require_x64()
-    sums = spectral_sums(data, harmonics, highest=highest, threshold=threshold, repeats=repeats)
+    sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     unsolved = sums.one_phase()
     if unsolved.any() and half_integers == "error":
         raise DefinitionError(
@@ -184,7 +180,7 @@ def _roundness(
     power = np.einsum("kii->ki", gram).real[None, :, None]
     energy, turned = (x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned))
     square = energy - np.abs(H) ** 2 * power
-    square = np.where(square > _NO_RESIDUAL * energy, square, 0.0)
+    square = np.where(square > ROUNDING * energy, square, 0.0)
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
 
 

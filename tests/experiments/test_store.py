@@ -87,14 +87,6 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
-def test_processes_share_the_chunks(arguments, whole, tmp_path):
-    for rank in (0, 1):
-        options, store = Options(**BATCH), tmp_path / "records.zarr"
-        stored = stream(*arguments, options, store=store, chunk=40, client=(rank, 2))
-        assert stored.missing() == ([] if rank else [1])
-    np.testing.assert_array_equal(records(stored), whole.y)
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [
@@ -133,7 +125,7 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     design = single_cosine([0.25, 0.75], 32, 4)
     options = Options(start=start)
     job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
-    _, layout = job.begin(None)
+    _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     here, there = job.run(0, None), sent.run(0, 1)
     assert here.keys() == there.keys()
@@ -147,7 +139,3 @@ def test_what_is_no_store(tmp_path, arguments):
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.DefinitionError, match="file"):
         stream(*arguments, store=tmp_path / "file")
-    with pytest.raises(hj.DefinitionError, match="0 <= rank < size"):
-        stream(*arguments, store=tmp_path / "s", client=(2, 2))
-    with pytest.raises(hj.DefinitionError, match="a `client` needs a `store`"):
-        stream(*arguments, client=(0, 2))

@@ -158,7 +158,6 @@ def experiments(t):
     yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
     u = np.zeros((1, 8, 1))
     yield t.response, dict(u=u)
-    yield t.response.steady_start, dict(u=u)
     yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
