@@ -74,14 +74,6 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
 
 
-def test_mapped_over_parameters_and_differentiated():
-    many = X + jnp.linspace(0.0, 0.1, 4)[:, None] * jnp.array([1.0, 1, 0, 1, 0, 1])
-    found, value = compiled(jax.vmap(with_value(jax.jacrev)))(many)
-    np.testing.assert_allclose(value, jax.vmap(ball_exact)(many), rtol=1e-12)
-    exact = jax.vmap(jax.jacrev(ball_exact))(many)
-    np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-12)
-
-
 def hopper(x):
     """Body of the lossy hopper after a touchdown; x = (q, input, retention, stiffness, end)."""
     system = hj.models.VerticalHopper(retention=x[5], k=x[6])
