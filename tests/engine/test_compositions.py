@@ -147,6 +147,20 @@ def test_section_map_in_closed_form(relay_map):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "second",
+    [
+        lambda f: jax.jacrev(jax.jacrev(f)),
+        lambda f: jax.jacfwd(jax.jit(jax.jacrev(f))),
+    ],
+    ids=["reverse over reverse", "forward over a jit of reverse"],
+)
+def test_second_derivatives_in_closed_form(relay_map, second):
+    found = compiled(second(lambda v: relay(relay_map, v)))(V)
+    assert_equal_derivatives(found, jax.hessian(exact)(V), 1e-9)
+
+
+@pytest.mark.slow
 def test_third_derivatives_in_closed_form(relay_map):
     """Two corrections onto the event are right to third order."""
     direction = W - V
@@ -157,3 +171,16 @@ def test_third_derivatives_in_closed_form(relay_map):
 
     found = compiled(along(lambda v: relay(relay_map, v)))(0.0)
     assert_equal_derivatives(found, along(exact)(0.0), 1e-8)
+
+
+@pytest.mark.slow
+def test_a_map_that_does_not_arrive(relay_map):
+    """Without transformations it raises; with them, values and derivatives are NaN."""
+    lost = jnp.array([-3.0, 0.3])
+    with pytest.raises(hj.ComputationError, match="not reached from section 0"):
+        relay_map(lost)
+    (_, result), tangents = compiled(
+        lambda q: jax.jvp(lambda q: (relay_map(q).q, relay_map(q).result), (q,), (q,))
+    )(lost)
+    assert result != hj.Result.OK
+    assert np.isnan(tangents[0]).all()

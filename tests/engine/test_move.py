@@ -56,17 +56,6 @@ def ball_exact(x):
 X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
 
 
-def with_value(derivative):
-    """The derivative of `ball` together with its value."""
-    return derivative(lambda x: (ball(x),) * 2, has_aux=True)
-
-
-def test_forward_mode_has_a_closed_form():
-    found, value = compiled(with_value(jax.jacfwd))(X)
-    np.testing.assert_allclose(value, ball_exact(X), rtol=1e-13)
-    np.testing.assert_allclose(found, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
-
-
 def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     found, first = compiled(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
     np.testing.assert_allclose(first, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)

@@ -62,7 +62,9 @@ def test_radau_is_a_collocation_method(stages):
     [diffrax.Euler(), diffrax.SemiImplicitEuler(), diffrax.KenCarp4(), diffrax.ReversibleHeun()],
 )
 def test_solvers_that_do_not_fit(solver):
-    with pytest.raises(hj.DefinitionError, match=f"error estimate.* not an? {type(solver).__name__}"):
+    with pytest.raises(
+        hj.DefinitionError, match=f"error estimate.* not an? {type(solver).__name__}"
+    ):
         as_method(solver)
 
 
