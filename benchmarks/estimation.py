@@ -12,7 +12,7 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
   first 20 cycles discarded, with the transient fitted and removed, and with it interpolated between
   lines that are not excited, by local polynomials (odd lines, all 84 cycles). All 620 lines or odd
   ones.
-- `crest`: crest factors of signals of 31 lines. `leakage`: of 2 M + 1 experiments, M = 2.
+- `crest`: crest factors of signals of 31 lines.
 - `discs`: how often 95 % discs about means of some complex errors hold zero. Errors are normal, of
   constant modulus (`constant`), or sums of both, with the rms of the normal part relative to the
   other. Discs of `size` look at the size of the scatter alone, those of `shape` are
@@ -39,7 +39,7 @@ import hybridjax as hj
 
 HARMONICS = (-2, -1, 0, 1, 2)
 N = 32
-STEPS = ("crest", "discs", "leakage", "periodic", "unknown", "coverage")
+STEPS = ("crest", "discs", "periodic", "unknown", "coverage")
 SEED = {"isochron": 41 * 10**6, "kinematic": 57 * 10**6}
 # rms of the inputs where distortion is a small and a large part of the variance, and realizations.
 COVERAGE = {
@@ -143,15 +143,6 @@ def discs(draws: int = 200_000) -> None:
             print(f"estimation.discs.{count}.{kind}.wider {radii[1].mean() / radii[0].mean():.3f}")
 
 
-def leakage(family: Family) -> None:
-    design = hj.multisine(highest_harmonic=2)
-    data = hj.experiments.simulate_experiments(family.model, design, start="periodic")
-    estimate = hj.estimate_htf(data, 0, highest=2)
-    errors = estimate.harmonic_errors(family.model.htf(estimate.f, 0))[0]
-    for output, value in zip(OUTPUTS, errors, strict=True):
-        family.show(f"leakage.{design.experiments}_experiments.H0.{output}", value)
-
-
 def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> None:
     design = hj.multisine(periods=32, seed=1).scaled(rms)
     f = design.frequencies
@@ -206,7 +197,7 @@ def main() -> None:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         family = Family(name, cycle, definition)
-        for step in (leakage, periodic, unknown):
+        for step in (periodic, unknown):
             if step.__name__ not in options.skip:
                 step(family)
         if "coverage" not in options.skip:

@@ -368,7 +368,7 @@ def losses(draws=200, strides=200):
     print(f"\nLosses of fit_series: {draws} draws, {strides} strides, 8 sections")
     system = LINEAR["a complex pair"]
     for label, noise in NOISES_OF_LOSSES.items():
-        for loss in ("squares", "huber", "student"):
+        for loss in ("squares", "huber"):
             about = dict(loss=loss)
             coverage_of(f"{label}, {loss}", *system, noise, draws, strides, **about)
 

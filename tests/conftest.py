@@ -30,6 +30,24 @@ import hybridjax as hj
 from hybridjax._core import compilation
 
 
+# Files whose fast tests cover each capability once, for `-m core`.
+CORE = (
+    "test_layers", "test_budget", "test_words", "test_release", "linear/test_ldtp",
+    "linear/test_htf", "engine/test_move", "systems/test_system", "orbits/test_cycle",
+    "sections/test_linearize", "experiments/test_design", "experiments/test_run",
+    "identify/test_nonparametric", "identify/test_structured", "identify/test_rational",
+    "recordings/test_recording", "designs/test_optimal_design", "fitting/test_parameters",
+    "_core/test_boundary", "plot/test_plots", "test_io",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        name = item.nodeid.removeprefix("tests/").partition(".py")[0]
+        if name in CORE and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.core)
+
+
 def pytest_xdist_auto_num_workers(config):
     """A single process for a part of the tests: starting others takes longer than the tests."""
     if config.args != config.getini("testpaths"):

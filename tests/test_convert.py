@@ -9,7 +9,6 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
-from hybridjax.experiments.events import EventTimes
 
 from .sessions import blocks, same_output
 
@@ -149,10 +148,6 @@ def test_scipy(model):
 def experiments(model):
     rng = np.random.default_rng(2)
     u = rng.normal(size=(2, 2 * N, 2))
-    events = EventTimes(
-        rng.normal(size=(2, 3)), np.array([[0, 1, -1]] * 2), np.array([[0, 4, -1]] * 2),
-        np.array([0.5]), np.array([1]), np.array(1.0), N, ("land", "leave"),
-    )  # fmt: skip
     return hj.ExperimentData(
         u,
         np.stack([model.simulate(x) for x in u]),
@@ -160,7 +155,7 @@ def experiments(model):
         periods=1,
         inputs=model.inputs,
         outputs=model.outputs,
-        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), events, "clock"),
+        simulated=Simulated(np.array([-1, -1]), np.array([1e-9, 2e-9]), "clock"),
         cycle_outputs=rng.normal(size=(N, 1)),
     )
 

@@ -5,6 +5,7 @@ import functools
 import graphlib
 import importlib
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -117,3 +118,17 @@ def test_public_names_resolve_and_have_docstrings(namespace):
         thing = getattr(namespace, name)
         if not isinstance(thing, str | dict | float):
             assert thing.__doc__, name
+
+
+def test_old_names_give_the_new_ones():
+    table = (ROOT / "_core" / "moved.txt").read_text().splitlines()
+    rows = [row.partition(" -> ") for row in table if " -> " in row]
+    for old in (key for keys, _, _ in rows for key in keys.split(", ")):
+        owner = hybridjax
+        with pytest.raises(AttributeError, match="is gone"):
+            for part in old.split("."):
+                owner = getattr(owner, part)
+    for new in re.findall(r"\bhj\.((?:\w+\.)*\w+)", " ".join(new for _, _, new in rows)):
+        owner = hybridjax
+        for part in new.split("."):
+            owner = getattr(owner, part)

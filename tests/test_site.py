@@ -37,8 +37,8 @@ def test_every_public_name_is_in_the_reference_once():
 # in annotations, and bases of what stands in an example.
 GIVEN = UNCHECKED["made by this package"] | {
     "AbstractLevels", "AbstractObservation", "Arrival", "BranchEnd", "BranchPoint", "Coincidence",
-    "ComputationError", "CyclePoint", "Design", "Event", "ExperimentEvent", "FamilyLike",
-    "FileFormatError", "HTF", "HeldOut", "IntervalEvents", "LDTP",
+    "ComputationError", "CyclePoint", "Design", "Event", "FamilyLike",
+    "FileFormatError", "HTF", "HeldOut", "LDTP",
     "PhaseDefinition", "PrecisionError", "Response", "SectionsLike",
     "Simulated", "StoredExperiments", "Structure",
 }  # fmt: skip

@@ -40,7 +40,7 @@ hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
 hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
 hj.convert.to_lti(model).multipliers.shape
 hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modulus")).advice
-hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).sequence(64, "binary").u.shape
+hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).advice
 hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.FrequencyResponse((0.1, 1.0))).saved
 hj.designs.Limits(distortion=hj.designs.Distortion(cycle, phase, {"yM": 1e-5})).distortion
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
@@ -81,7 +81,6 @@ ANYTHING = {
     "charts of a system take whatever their subclass declares": {"Chart.field"},
     "returned by users' functions": {"HybridSystem.period"},
     "of a library that is an extra": {"sweep.maps"},
-    "pytrees of any kind": {"Structure.by_lane"},
     "looked at by the function itself, which names what it can do": {
         "save.thing",
         "Recording.__init__.time",
@@ -144,20 +143,18 @@ UNCHECKED = {
     },
     "checked with the system, by what takes it": {"HybridSystem"},
     "the package's own": {
-        "Plan.stride", "ReturnMap.at_phase_of", "ReturnMap.departure", "ReturnMap.held",
-        "ReturnMap.judge", "ReturnMap.sizes_in", "ReturnMap.travel", "ReturnMap.turn",
-        "ReturnMap.turn_with_jacobian", "Structure", "Winding.when",
+        "Plan.stride",
     },
     "made by this package": {
-        "Advice", "Branch", "Constrained", "EventTimes",
+        "Advice", "Branch", "Constrained", 
         "Finding", "Identification", "Impact", "ImpulseResponses",
         "Inspection",
         "IntervalForecast", "LDTPFit", "Lanes",
         "LimitCycle",
         "LimitCycles", "NaturalMultipliers", "Phase",
         "PhaseResponse", "PlacedSections", "Plan", "Plot",
-        "ResponseFunction", "ReturnMap", "SectionData", "SectionMap", "SeriesFit",
-        "Stepping", "Trajectory", "Trial", "Winding",
+        "ResponseFunction", "SectionData", "SectionMap", "SeriesFit",
+        "Stepping", "Trajectory", "Trial",
     },
 }  # fmt: skip
 
@@ -169,7 +166,7 @@ def test_public_functions_check_what_they_are_given(name, function):
     maker = name.removesuffix(".__init__")
     if maker != name and function.__module__.startswith("hybridjax.models"):
         return  # (`HybridSystem.__new__` checks these: tests/systems)
-    if maker in set().union(*UNCHECKED.values()) or name.startswith("Structure."):
+    if maker in set().union(*UNCHECKED.values()):
         assert not hasattr(function, "kinds"), f"{name} is checked: take it off the list"
     else:
         assert function.kinds.by_name, f"{name} is not checked"

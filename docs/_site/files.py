@@ -22,11 +22,13 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown: str, page, **_) -> str:
-    """Links of docs/ to what stands beside it."""
+    """Links between docs/ and the files beside it."""
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"\]\((?:\.\./)+(notebooks/\w+)\.ipynb", rf"]({up}\1.md", markdown)
     for name, target in LISTS.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
+    if page.file.src_uri in LISTS.values():
+        markdown = markdown.replace("](docs/", "](")
     return markdown
 
 

@@ -44,7 +44,7 @@ from .vector_math import rewrite
 
 
 # No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
-# the time. Options that an XLA does not have are left out.
+# the time.
 _QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
@@ -146,17 +146,11 @@ def _loops_are_kernels() -> bool:
 @ft.cache
 def compiler_options() -> dict[str, Any]:
     """Return XLA's options for quick compilation."""
-
-    def accepted(options):
-        try:
-            jax.jit(lambda: 0, compiler_options=options)()
-        except Exception:  # the type depends on the version of XLA
-            return False
-        return True
-
-    if accepted(_QUICK):
-        return _QUICK
-    return {name: value for name, value in _QUICK.items() if accepted({name: value})}
+    try:
+        jax.jit(lambda: 0, compiler_options=_QUICK)()
+    except Exception:  # an XLA without one of them; the type depends on the version
+        return {}
+    return _QUICK
 
 
 class _Uncollected:

@@ -10,9 +10,7 @@ PERIODS = 10**7
 """Cycles, periods and samples in one record or experiment; experiments of a design; systems of a
 sweep; any whole number in the header of a file."""
 ORDER = 1000
-"""Multipliers of a model."""
-WORKERS = 10**4
-"""Threads."""
+"""Multipliers of a model; threads."""
 WINDOW = 2**26
 """Samples of one input in one window of a design."""
 RECORDED = 2**29

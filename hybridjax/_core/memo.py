@@ -1,7 +1,6 @@
 """Values that are computed once for an object, and forgotten with it."""
 
 import functools
-import threading
 import weakref
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar, cast, overload
@@ -21,40 +20,27 @@ class Memory:
     """
 
     def __init__(self):
-        self._lock = threading.Lock()
-        self._values: dict[int, tuple[weakref.ref, dict[Hashable, Any]]] = {}
+        self._values: dict[int, dict[Hashable, Any]] = {}
 
     def __len__(self) -> int:
         return len(self._values)
 
     def recall(self, owner: Any, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value that `make` gave when it was first asked for.
+        """Return the value that `make` returned at the first call for this owner and key.
 
-        Nothing is locked while it is made, so that `make` may ask for other values, and use
-        threads. Threads that ask for the same value at the same time may each make it; all of them
-        get the one that was there first.
+        Nothing is locked while it is made, so that `make` may recall other values, and use threads.
+        Threads that recall the same value at the same time may each make it; all of them get the
+        value that was stored first.
         """
-        values = self._of(owner)
+        name = id(owner)
+        if name not in self._values:
+            # (Several threads may come this far: single operations of a dictionary are atomic.)
+            self._values.setdefault(name, {})
+            weakref.finalize(owner, self._values.pop, name, None).atexit = False
+        values = self._values[name]
         if key in values:
             return values[key]
         return values.setdefault(key, make())
-
-    def _of(self, owner: Any) -> dict[Hashable, Any]:
-        name = id(owner)
-        with self._lock:
-            entry = self._values.get(name)
-            # (An object that died may have left its id to this one.)
-            if entry is None or entry[0]() is not owner:
-                entry = weakref.ref(owner, functools.partial(self._forget, name)), {}
-                self._values[name] = entry
-            return entry[1]
-
-    def _forget(self, name: int, dead: weakref.ref) -> None:
-        # No lock: this may be called anywhere, also inside of `_of`. Single operations of a
-        # dictionary are whole; what has been replaced by an heir of the id stays.
-        entry = self._values.get(name)
-        if entry is not None and entry[0] is dead:
-            self._values.pop(name, None)
 
 
 class remembered(Generic[Owner, Value]):  # noqa: N801 (a decorator, as `property` is)

@@ -21,9 +21,9 @@ from .boundary.checked import checked
 
 Item = TypeVar("Item")
 
-# Seconds until the line appears (less: it flickers in short calls), and between updates (less:
-# takes time of the call; more of either: nothing is shown for long).
-_DELAY, _PERIOD = 1.0, 0.25
+# Seconds until the line appears, and between updates. Less: it flickers in short calls. More:
+# nothing is shown for long.
+_DELAY = 1.0
 _LINE = "{desc}, {elapsed}"
 _COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"
 
@@ -139,7 +139,7 @@ def _keep(ended: threading.Event) -> None:
             bar.bar_format = _COUNTED if counted else _LINE
             name, *steps = [running[0].name, *filter(None, map(str, running))]
             bar.set_description_str(f"{name}: {', '.join(steps)}" if steps else name)
-            if ended.wait(_PERIOD):
+            if ended.wait(_DELAY):
                 return
 
 

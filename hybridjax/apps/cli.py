@@ -1,13 +1,10 @@
 """The command line. Nothing heavy is imported before the arguments are known to be good."""
 
-import _thread
 import argparse
-import contextlib
 import math
 import os
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 from .. import __version__
@@ -133,32 +130,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from ..errors import HybridJaxError
 
     try:
-        with _interruptible():
-            return options.run(options)
+        return options.run(options)
     except HybridJaxError as error:
         sys.exit(f"hybridjax: {error}")
     except KeyboardInterrupt:
         print("hybridjax: interrupted.", file=sys.stderr)
         sys.exit(130)
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """An interruption that Python ignores, since it came in a callback (as JAX has one in the
-    collector of garbage), comes again."""
-    usual = sys.unraisablehook
-
-    def hook(unraisable):
-        if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            threading.Timer(0.1, _thread.interrupt_main).start()  # when the callback is over
-        else:
-            usual(unraisable)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = usual
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""What `reproduce` says of its results: numbers, the paper's observations, a table."""
+"""The report of `reproduce`: numbers, the paper's observations, a table."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ OUTPUTS = ("yM", "vM")
 
 
 def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> dict:
-    """Every number of the table, ready for JSON."""
+    """Return every number of the table, ready for JSON."""
     true = cycle.multipliers
     summary = {
         "version": __version__,
@@ -64,11 +64,13 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
 
 
 def _observations(families: Mapping[str, Any]) -> list[dict]:
-    """The paper's observations (Secs. VI-C1 to C3), each with what is measured here."""
-    found = []
+    """Return the paper's observations (Secs. VI-C1 to C3), each with the values measured here."""
+    from scipy.signal import find_peaks  # (half a second)
+
+    observations = []
 
     def note(claim, holds, measured):
-        found.append({"claim": claim, "holds": bool(holds), "measured": measured})
+        observations.append({"claim": claim, "holds": bool(holds), "measured": measured})
 
     def top(family, m):
         return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
@@ -97,16 +99,14 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     for name, family in families.items():
         f = np.asarray(family.exact.f)
         size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
-        peaks = [f[_peaks(size[:, k], 0.01)] for k in range(len(OUTPUTS))]
+        peaks = [f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))]
         peaks = [p[(p > 1.5) & (p < 2.5)] for p in peaks]
         places = [", ".join(f"{x:.3g}" for x in p) or "none" for p in peaks]
+        places = [f"{place} ({output})" for output, place in zip(OUTPUTS, places, strict=True)]
         note(
             f"{name}: bumps of H_0 around f = 2",
             any(len(p) for p in peaks),
-            "local maxima of |H_0| for f in (1.5, 2.5): "
-            + "; ".join(
-                f"{where} ({output})" for output, where in zip(OUTPUTS, places, strict=True)
-            ),
+            f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}",
         )
         power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
@@ -132,69 +132,44 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         f"{', '.join(f'{z:.6f}' for z in exact)}: with the paper's parameters the real part is "
         "negative, the printed sign was lost",
     )
-    return found
-
-
-def _peaks(values: np.ndarray, prominence: float) -> list[int]:
-    """Where local maxima are that stand out by so much from the lowest points between them and
-    larger values on either side. (`scipy.signal` has it, and is half a second of imports.)"""
-    found = []
-    for k in range(1, len(values) - 1):
-        if values[k - 1] < values[k] > values[k + 1]:
-            left, right = values[k::-1], values[k:]
-            lowest = []
-            for side in (left, right):
-                larger = np.flatnonzero(side > values[k])
-                lowest.append(side[: larger[0] if len(larger) else None].min())
-            if values[k] - max(lowest) >= prominence:
-                found.append(k)
-    return found
+    return observations
 
 
 def table(summary: dict) -> str:
-    """The summary as text."""
-    true = [_number(z) for z in summary["limit_cycle"]["multipliers"]]
+    """Return the summary as text."""
+    true = complex(*summary["limit_cycle"]["multipliers"][0])
     rows = ["", "Floquet multipliers", f"  {'':38}{'lambda':>28}  |error|"]
+    rows.append(f"  {'Jacobian of the return map':38}{true:>28.9f}")
 
-    def row(label, z, error):
+    def row(label, values, error=None):
+        z = min((complex(*pair) for pair in values), key=lambda z: abs(z - true))
+        error = abs(z - true) if error is None else error
         rows.append(f"  {label:38}{z:>28.9f}  {error:.1e}")
 
-    def nearest(values):
-        return min(values, key=lambda z: abs(z - true[0]))
-
-    rows.append(f"  {'Jacobian of the return map':38}{true[0]:>28.9f}")
     for name, family in summary["families"].items():
-        z = nearest(_number(v) for v in family["multipliers_from_linearization"])
-        row(f"product of A[n], {name}", z, abs(z - true[0]))
+        row(f"product of A[n], {name}", family["multipliers_from_linearization"])
         for output, fit in family["multipliers_fit_2p1z"].items():
-            z = nearest(_number(v) for v in fit["multipliers"])
-            row(f"2 poles 1 zero, {name}, {output}", z, fit["error"])
+            row(f"2 poles 1 zero, {name}, {output}", fit["multipliers"], fit["error"])
             bias = fit["error_of_the_same_fit_to_the_exact_htf"]
             rows.append(f"  {'    the same fit to the exact H_0':38}{'':28}  {bias:.1e}")
-        z = nearest(_number(v) for v in family["multipliers_fit_structured"])
-        row(f"structured, {name}", z, family["multipliers_fit_structured_error"])
+        error = family["multipliers_fit_structured_error"]
+        row(f"structured, {name}", family["multipliers_fit_structured"], error)
     rows += ["", "Largest error of the estimated HTF, relative to max|H_0| of the output"]
     for name, family in summary["families"].items():
         for output, errors in family["htf_error_of_max_H_0"].items():
-            rows.append(
-                f"  {name:10} {output:4} " + "  ".join(f"{m}: {e:.1e}" for m, e in errors.items())
-            )
+            sizes = "  ".join(f"{m}: {e:.1e}" for m, e in errors.items())
+            rows.append(f"  {name:10} {output:4} {sizes}")
     rows += ["", "Observations of the paper"]
     for item in summary["observations"]:
         rows.append(f"  [{'yes' if item['holds'] else 'no ':3}] {item['claim']}")
         rows.append(f"        {item['measured']}")
     seconds = summary["seconds"]
     slow = ", ".join(f"{k} {v:.1f}" for k, v in seconds.items() if k != "total" and v > 0.5)
-    rows += ["", f"Time: {seconds['total']:.1f} s ({slow})", ""]
-    return "\n".join(rows)
+    return "\n".join([*rows, "", f"Time: {seconds['total']:.1f} s ({slow})", ""])
 
 
 def _complex(values) -> list[list[float]]:
     return [[float(z.real), float(z.imag)] for z in np.asarray(values).ravel()]
-
-
-def _number(pair) -> complex:
-    return complex(*pair)
 
 
 def _pairs(values) -> str:

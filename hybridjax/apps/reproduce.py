@@ -44,7 +44,7 @@ from .paper_report import OUTPUTS, summarize, table
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """What is done. The defaults are the paper's."""
+    """The sizes and parameters of a run. The defaults are the paper's."""
 
     families: tuple[str, ...] = ("isochron", "kinematic")
     experiments: int = 80
@@ -57,13 +57,13 @@ class Protocol:
 
 
 class Family(NamedTuple):
-    """Everything that was found with one family of sections."""
+    """All results with one family of sections."""
 
     placed: PlacedSections
     ldtp: LDTP
     exact: HTF
     experiments: str
-    """What became of them."""
+    """The outcome of the experiments in words."""
     estimate: HTF
     rational: RationalFit
     rational_exact: RationalFit
@@ -71,16 +71,16 @@ class Family(NamedTuple):
 
 
 class _Clock:
-    """Prints what is being done, since `begin` (the same in all processes), and keeps how long it
-    took."""
+    """A log that prints finished steps with the time since `begin`, which is the same in all
+    processes, and keeps their durations."""
 
     def __init__(self, begin: float):
         self.begin, self.last = begin, time.time()
         self.seconds: dict[str, float] = {}
 
-    def done(self, what: str, text: str) -> None:
+    def done(self, step: str, text: str) -> None:
         now = time.time()
-        self.seconds[what] = now - self.last
+        self.seconds[step] = now - self.last
         print(f"[{now - self.begin:6.1f} s] {text}", flush=True)
         self.last = now
 
@@ -108,7 +108,7 @@ def reproduce(
 
 
 def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
-    """Of all that is written."""
+    """Return the names of all files that are written."""
     cycles = [f"fig1_cycle_{family}" for family in families]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = [f"{figure}.{format}" for figure in figures for format in formats]
@@ -154,36 +154,34 @@ def _set_up() -> None:
 
 
 def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
-    known = [x.name for x in own_fields(VerticalHopper)]
+    names = [x.name for x in own_fields(VerticalHopper)]
     for name in parameters:
-        if name not in known:
+        if name not in names:
             raise DefinitionError(
-                f"the hopper has no parameter '{name}'; parameters are {', '.join(known)}."
+                f"the hopper has no parameter '{name}'; parameters are {', '.join(names)}."
             )
     return VerticalHopper(**parameters)
 
 
 def _design(protocol: Protocol) -> Design:
-    """The paper's design, with second-order products kept off the lines where there is room."""
+    """Return the paper's design, without second-order products on the lines if there is room."""
     if protocol.keep >= protocol.cycles:
         raise DefinitionError(
             f"--keep {protocol.keep} of --cycles {protocol.cycles} leaves no cycle to discard: the "
             "transient must die out first."
         )
     f_max = min(10.0, protocol.n_sections / 2 - 1 / protocol.keep)
-    band = (0.0, f_max)
-    arguments = (protocol.n_sections, protocol.keep, band, protocol.amplitude, protocol.seed)
     cosines = 2 * f_max * protocol.keep / protocol.experiments
     room = cosines <= protocol.keep / 4  # a quarter of the classes in each experiment
     return paper_design(
-        *arguments,
-        division="sum-free" if room else "random",
-        experiments=protocol.experiments,
-    )
+        protocol.n_sections, protocol.keep, (0.0, f_max), protocol.amplitude, protocol.seed,
+        division="sum-free" if room else "random", experiments=protocol.experiments,
+    )  # fmt: skip
 
 
 def _find(hopper: VerticalHopper) -> LimitCycle:
-    """The hopper's cycle by Newton from its own guess, or after the paper's 60 s of settling."""
+    """Return the hopper's cycle, by Newton from its own guess, or after 60 s of settling as in the
+    paper."""
     try:
         return find_limit_cycle(hopper)
     except ComputationError:
@@ -202,7 +200,7 @@ def _sections(name: str, count: int) -> AbstractSections:
 def _identify(
     name: str, cycle: LimitCycle, design: Design, protocol: Protocol, begin: float
 ) -> tuple[Family, dict[str, float]]:
-    """All of one family of sections, and how long it took."""
+    """Return all results with one family of sections, and the durations of the steps."""
     _set_up()
     clock = _Clock(begin)
     placed = place_sections(cycle, _sections(name, protocol.n_sections))
@@ -221,16 +219,17 @@ def _identify(
     rational, rational_exact = fit_rational(estimate), fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)
     clock.done(f"fits_{name}", f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
-    found = Family(
-        placed, ldtp, exact, data.summary(), estimate, rational, rational_exact, structured
+    experiments = data.summary()
+    return (
+        Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured),
+        clock.seconds,
     )
-    return found, clock.seconds
 
 
 def _draw(
-    what: str, things: tuple, out: Path, formats: Sequence[Format], begin: float
+    kind: str, results: tuple, out: Path, formats: Sequence[Format], begin: float
 ) -> dict[str, float]:
-    """Some of the figures, and how long they took."""
+    """Write the figures of one kind, and return their durations."""
     import matplotlib  # here, since it is heavy
 
     matplotlib.use("Agg")  # files only: no window is opened, and none is needed
@@ -238,7 +237,7 @@ def _draw(
 
     _set_up()
     clock = _Clock(begin)
-    for name in paper_figures.save(out, formats, getattr(paper_figures, what)(*things)):
+    for name in paper_figures.save(out, formats, getattr(paper_figures, kind)(*results)):
         clock.done(name, name)
     return clock.seconds
 
@@ -308,7 +307,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
 
 
 def _on_grid(estimate: HTF, f) -> np.ndarray:
-    """H on the frequencies f, NaN where a failed experiment left it unknown."""
+    """Return H on the frequencies f: NaN where a failed experiment left it unknown."""
     H = np.full((len(estimate.harmonics), len(f), *estimate.H.shape[2:]), np.nan, complex)
     H[:, np.isin(np.asarray(f), np.asarray(estimate.f))] = np.asarray(estimate.H)
     return H

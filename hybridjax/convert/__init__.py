@@ -1,6 +1,6 @@
 """To the objects of other libraries, and back: xarray, pandas, python-control, scipy."""
 
-import lazy_loader
+from .._core.moved import attach
 
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

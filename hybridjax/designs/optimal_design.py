@@ -1,23 +1,11 @@
-r"""The result of `optimal_design`, and random sequences with the spectrum of a design.
-
-A Gaussian sequence may have any spectrum. The sign of a Gaussian sequence with the correlation
-$\rho$ has the correlation $\frac{2}{\pi} \arcsin \rho$ (Van Vleck and Middleton, Proc. IEEE 54,
-1966). For a binary sequence the correlation of the Gaussian is therefore
-$\sin(\frac{\pi}{2} \rho)$, where this is a correlation at all; else its spectrum is negative
-somewhere, where it is replaced by zero, and the result reports the spectrum of the binary sequence,
-which differs from the wanted one.
-"""
-
-from typing import Literal
+"""The result of `optimal_design`."""
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked_methods
-from .._core.boundary.kinds import PeriodCount, Positive, Seed
-from .._core.text import fields
-from ..errors import DefinitionError
+from .._core.boundary.kinds import Positive
 from ..experiments.design.design import Design
 from .candidates import Powers
 
@@ -25,20 +13,6 @@ from .candidates import Powers
 # Ratio of strides from which on `advice` recommends the design. Larger: designs that save a third
 # are called nearly optimal. Smaller: savings within the uncertainty of the model are advertised.
 _WORTH_IT = 1.5
-
-
-class RandomInput(eqx.Module):
-    """A random input for a recording.
-
-    **Fields:** `u` (n, nu), at the sections, from section 0 on; `power` (K,), the mean square of
-    such sequences around each cosine of the plan.
-    """
-
-    u: Float[np.ndarray, "n nu"]
-    power: Powers
-
-    def __repr__(self) -> str:
-        return fields(self)
 
 
 @checked_methods
@@ -116,41 +90,6 @@ class OptimalDesign(eqx.Module):
         standard error."""
         return int(np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2))
 
-    def sequence(
-        self,
-        cycles: PeriodCount,
-        kind: Literal["gaussian", "binary"] = "gaussian",
-        seed: Seed = 0,
-    ) -> RandomInput:
-        """Return a random input with the spectrum of `design`, for a recording (`fit_series`).
-
-        **Arguments:** `cycles`: its length. `kind`: Gaussian values, or two values of the same
-        size, whose spectrum only approximates that of the design: `RandomInput.power` has it.
-        Default: `"gaussian"`.
-
-        **Raises:** `DefinitionError` for an odd number of samples, and for fewer cycles than the
-        periods of the design, which do not resolve its lines.
-        """
-        N, P = self.design.n_sections, self.design.periods
-        if cycles < P:
-            raise DefinitionError(
-                f"{cycles} cycles do not resolve lines that differ by 1/{P}: take {P} or more."
-            )
-        if N * cycles % 2:
-            raise DefinitionError(f"{cycles} cycles of {N} sections are an odd number of samples.")
-        # Each line has the frequencies of the sequence that are nearest to it.
-        nearest = np.rint(np.arange(N * cycles // 2 + 1) * P / cycles).astype(int)
-        lines = np.rint(self.frequencies * P).astype(int)
-        rng, inputs, power = np.random.default_rng(seed), [], np.zeros(len(lines))
-        for i in range(len(self.design.input_names)):
-            members = self.channels == i
-            wanted = np.zeros(max(nearest.max(), lines.max()) + 1)
-            wanted[lines[members]] = self.power[members]
-            u, spectrum = random_sequence(wanted, nearest, kind, rng)
-            inputs.append(u)
-            power[members] = np.bincount(nearest, spectrum, len(wanted))[lines[members]]
-        return RandomInput(np.stack(inputs, axis=1), power)
-
     @property
     def advice(self) -> str:
         """The worth of this design, in a sentence."""
@@ -189,52 +128,3 @@ class OptimalDesign(eqx.Module):
             if old > 0
         ]
         return "\n".join([*rows, f"  {self.design!r}".replace("\n", "\n  ")])
-
-
-def random_sequence(
-    wanted: Float[np.ndarray, " lines"],
-    nearest: Int[np.ndarray, " n"],
-    kind: Literal["gaussian", "binary"],
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, " length"], Float[np.ndarray, " n"]]:
-    """Return a sequence, and its spectrum: mean squares at the frequencies of its discrete Fourier
-    transform.
-
-    **Arguments:** `wanted`: mean square around each line; `nearest`: the line of each frequency.
-    """
-    length, total = 2 * (len(nearest) - 1), wanted.sum()
-    if not total:
-        return np.zeros(length), np.zeros(len(nearest))
-    spectrum = (wanted / np.maximum(np.bincount(nearest, minlength=len(wanted)), 1))[nearest]
-    spectrum[[0, -1]] = 0.0
-    spectrum *= total / spectrum.sum()
-    if kind == "gaussian":
-        return _gaussian(spectrum, length, rng), spectrum
-    hidden = _spectrum(np.sin(np.pi / 2 * _correlation(spectrum / total)))
-    hidden = np.maximum(hidden, 0.0)
-    rho = _correlation(hidden / hidden.sum())
-    u = np.sqrt(total) * np.sign(_gaussian(hidden, length, rng))
-    return u, total * _spectrum(2 / np.pi * np.arcsin(np.clip(rho, -1, 1)))
-
-
-def _gaussian(
-    spectrum: Float[np.ndarray, " n"], length: int, rng: np.random.Generator
-) -> Float[np.ndarray, " length"]:
-    z = rng.normal(size=(2, len(spectrum))) * np.sqrt(spectrum)
-    return np.fft.irfft((z[0] + 1j * z[1]) * length / 2, length)
-
-
-def _correlation(spectrum: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the correlation at lags 0 to L/2 from mean squares at frequencies."""
-    inner = spectrum.copy()
-    inner[1:-1] /= 2
-    length = 2 * (len(spectrum) - 1)
-    return np.fft.irfft(inner * length, length)[: len(spectrum)]
-
-
-def _spectrum(correlation: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return mean squares at frequencies from the correlation at lags 0 to L/2."""
-    both = np.concatenate([correlation, correlation[-2:0:-1]])
-    spectrum = np.fft.rfft(both).real / len(both)
-    spectrum[1:-1] *= 2
-    return spectrum

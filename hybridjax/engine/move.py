@@ -49,13 +49,9 @@ def glide(
     settings: Settings,
     setout: Stride,
     result: Index,
-    event_log: int = 0,
 ) -> Moved:
-    """The same as `move`, for lanes most of which are expected to arrive in one step.
-
-    `event_log` is the number of events of each lane that are kept in `Moved.log`.
-    """
-    options = Options(glide=True, event_log=event_log)
+    """The same as `move`, for lanes most of which are expected to arrive in one step."""
+    options = Options(glide=True)
     return _flow(s, lanes, u, target, settings, setout, result, options).moved
 
 

@@ -36,8 +36,6 @@ TRANSIENT = 1e-6
 # relative to the size of each state on the limit cycle.
 EXPERIMENT = 1e-9
 """Experiments and response functions."""
-STEADY_START = 1e-10
-"""Starts of periodic responses, relative to the sizes of time and states."""
 
 
 # Rounding errors of a time or a state, relative to it. Higher: separate events are taken for

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Float, Int
 
-from .._core.executor import cond, namespace, on_host, put
+from .._core.executor import namespace, on_host, put
 from .arrays import Array
 from .lanes import Lanes
 
@@ -45,37 +45,3 @@ def write_row(tape: Tape, i: Int[Array, ""], row: Tape) -> Tape:
             x[i] = y
         return tape
     return Tape(*(put(x, i, y.astype(x.dtype)) for x, y in zip(tape, row, strict=True)))
-
-
-class EventLog(NamedTuple):
-    """The first K events of each lane in a piece of flow, in order. (Times have no derivatives.)
-
-    Where more than K happened, `count` is larger than K, and the log lacks the later ones. An event
-    that made its lane fail is in the log, too.
-    """
-
-    time: Float[Array, "K L"]
-    """NaN where there is none."""
-    event: Int[Array, "K L"]
-    """The transition's index; -1 where there is none."""
-    count: Int[Array, " L"]
-    """Number of events."""
-
-
-def blank_log(size: int, lanes: Lanes) -> EventLog:
-    """A log for `size` events of each lane, still without any."""
-    xp, L = namespace(lanes.t), lanes.t.shape[0]
-    events = xp.full((size, L), -1, xp.int32)
-    return EventLog(xp.full((size, L), xp.nan), events, xp.zeros(L, xp.int32))
-
-
-def log_events(log: EventLog, row: Tape) -> EventLog:
-    """The log, with the events of one row of a tape."""
-    xp, fired = namespace(row.code), row.code >= 0
-
-    def write():
-        at = fired & (xp.arange(len(log.time))[:, None] == log.count)
-        time = xp.where(at, row.t, log.time)
-        return EventLog(time, xp.where(at, row.code, log.event), log.count + fired)
-
-    return cond(fired.any(), write, lambda: log)

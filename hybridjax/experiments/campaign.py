@@ -26,8 +26,7 @@ from ..systems.structure import Outputs
 from .batches import divide, in_batches
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
-from .events import EventList, EventTimes, in_order
-from .flow_batch import Course, IntervalEvents, course, flow_batch
+from .flow_batch import Course, course, flow_batch
 from .noise import ProcessNoise
 from .plan import Accuracy, Stepping, plan_flow
 from .start import StartName, linearized, on_cycle, periodic_start, predict, settle_batch
@@ -42,8 +41,9 @@ DesignLike = (
 # compile and saves 2 microseconds per sample. Fewer: short runs wait in vain. More: runs of 20 s
 # take twice as long.
 _LARGE = 5_000_000
-# Experiments whose inputs are checked together, as an array may lie on disk. More need more memory.
-_CHECKED = 1024
+# Experiments of a chunk, also when inputs on disk are checked. More need more memory; fewer leave
+# batches and threads unfilled.
+CHUNK = 640
 
 
 @checked
@@ -51,7 +51,7 @@ _CHECKED = 1024
 class Options:
     """Options of experiments, the keyword arguments of `run_experiments`.
 
-    **Fields:** `start`, `discard`, `process_noise`, `accuracy`, `record_events` and `execution`,
+    **Fields:** `start`, `discard`, `process_noise`, `accuracy` and `execution`,
     with the defaults and the meaning that they have in `run_experiments`.
     """
 
@@ -59,7 +59,6 @@ class Options:
     discard: Index | None = None
     process_noise: ProcessNoise | None = None
     accuracy: Accuracy = EXPERIMENT
-    record_events: bool = False
     execution: Execution | None = None
 
 
@@ -96,7 +95,7 @@ class Campaign:
     - `inputs`: source of the inputs. `start`: the kind of initial condition. `model`: the
       linearization that predicts it, except for starts on the cycle.
     - `stepping`: tolerances and step schedule between sections.
-    - `process_noise`, `record_events`: as in `run_experiments`.
+    - `process_noise`: as in `run_experiments`.
     - `execution`: batch size and number of threads.
     - `large`: whether to wait for the optimized program.
     """
@@ -108,7 +107,6 @@ class Campaign:
     model: LDTP | None
     stepping: Stepping
     process_noise: ProcessNoise | None
-    record_events: bool
     execution: Execution
     large: bool
 
@@ -126,12 +124,7 @@ class Campaign:
         applied = u
         if self.process_noise is not None:
             applied = u + self.process_noise.draw(u.shape, N, rows.start)
-        capacity = 1 + int(self._cycle_log.count.max()) if self.record_events else 0
-        while True:
-            y, result, failed_at, error, log = self._respond(applied, start, capacity, execution)
-            if log is None or (most := int(log.count.max(initial=0))) <= capacity:
-                break
-            capacity = 2 ** (most - 1).bit_length()  # as few sizes, and so programs, as possible
+        y, result, failed_at, error = self._respond(applied, start, execution)
         self._require_outputs(y, result)
         z, label = self.at_sections.outputs, self.placed.family.label
         return ExperimentData(
@@ -142,7 +135,7 @@ class Campaign:
             inputs=z.structure.inputs,
             outputs=z.names,
             result=result,
-            simulated=Simulated(failed_at, error, self._events(log), label),
+            simulated=Simulated(failed_at, error, label),
             cycle_outputs=self.at_sections.on_cycle,
         )
 
@@ -186,27 +179,24 @@ class Campaign:
             )
         return np.where(np.isnan(change), predicted, start.T)
 
-    def _respond(self, u, start, capacity: int, execution: Execution):
-        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
-        errors, and the first `capacity` events between any two sections."""
+    def _respond(self, u, start, execution: Execution):
+        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures
+        and errors."""
         stepping, N, base = self.stepping, self.placed.n_sections, self.at_sections.on_cycle
 
         def arguments(rows):
             # (Nobody changes them before the program is done, so they may share memory.)
             x, held = jax.device_put((start[:, rows], u[rows]))
             course = self.at_sections.course
-            return course, stepping.plan, x, held, stepping.settings, capacity
+            return course, stepping.plan, x, held, stepping.settings
 
         S, n, _ = u.shape
         y, parts = np.empty((S, n // N, *base.shape)), []
         for rows, part in in_batches(self._programs[0], arguments, S, execution, "experiments"):
             np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
-            parts.append((part.result, part.failed_at, part.error, part.log))
-        *each, logs = zip(*parts, strict=True)
-        result, failed_at, error = map(np.concatenate, each)
-        merge = lambda *x: np.concatenate(x)  # noqa: E731
-        log = jax.tree_util.tree_map(merge, *logs) if capacity else None
-        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error, log
+            parts.append((part.result, part.failed_at, part.error))
+        result, failed_at, error = map(np.concatenate, zip(*parts, strict=True))
+        return y.reshape(S, n, -1), result.astype(int), failed_at.astype(int), error
 
     def _require_outputs(self, y, result) -> None:
         finite = np.isfinite(y)
@@ -218,29 +208,6 @@ class Campaign:
             "an output is NaN although its experiment ran well: it is not defined everywhere "
             "that the experiments go."
         )
-
-    @remembered
-    def _cycle_log(self) -> IntervalEvents:
-        """Events of one period of the limit cycle, by the same steps as in experiments."""
-        placed, stepping = self.placed, self.stepping
-        u = np.zeros((1, placed.n_sections, len(placed.cycle.system.inputs)))
-        capacity = max(len(placed.cycle.event_sequence), 1)
-        silent = dataclasses.replace(self.at_sections.course, outputs=())
-        flow = TwoTiers(flow_batch, large=False)
-        arguments = *from_host((on_cycle(placed), u)), stepping.settings, capacity
-        return jax.device_get(flow(silent, stepping.plan, *arguments).log)
-
-    def cycle_events(self) -> EventList:
-        """Return the events of one period of the limit cycle, as those of one experiment."""
-        return in_order(self._cycle_log, self.placed.n_sections, float(self.placed.cycle.period))
-
-    def _events(self, log: IntervalEvents | None) -> EventTimes | None:
-        if log is None:
-            return None
-        N, period, cycle = self.placed.n_sections, self.placed.cycle.period, self.cycle_events()
-        names = tuple(t.name for t in self.at_sections.outputs.structure.transitions)
-        listed, at = in_order(log, N, float(period)), (cycle.time[0], cycle.event[0])
-        return EventTimes(*listed, *at, np.asarray(period), n_sections=N, names=names)
 
 
 def prepare(
@@ -281,7 +248,6 @@ def prepare(
         model=None if start == "cycle" else linearized(placed),
         stepping=plan_flow(placed, options.accuracy),
         process_noise=noise,
-        record_events=options.record_events,
         execution=execution,
         large=one_program or len(inputs) * inputs.cycles * N > _LARGE,
     )
@@ -309,8 +275,8 @@ def check_inputs(design: DesignLike, discard: int, n_sections: int, nu: int) -> 
             f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
             f"the {n_sections} sections; got {u.shape}."
         )
-    for k in range(0, len(u), _CHECKED):
-        finite = np.isfinite(np.asarray(u[k : k + _CHECKED], float)).all(axis=(1, 2))
+    for k in range(0, len(u), CHUNK):
+        finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
         if not finite.all():
             raise DefinitionError(
                 "`design` has NaN or infinity in the input of experiment "

@@ -15,13 +15,11 @@ from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import fields, listed
 from ..errors import DefinitionError
-from .events import EventTimes
 from .record import Record
 
 
-# Experiments that the notebook summary evaluates, and cycles of the one that it draws. More: the
-# summary of large data takes seconds. Fewer: its rms values scatter, and the picture is empty.
-_EVALUATED, _DRAWN = 64, 4
+# Cycles that the notebook summary draws. Fewer: the picture is empty. More: it is illegible.
+_DRAWN = 4
 # Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
 # recorded inputs separates pairs. Larger: even-order distortion is left in the odd part.
 _OPPOSITE = 1e-9
@@ -36,13 +34,11 @@ class Simulated(eqx.Module):
     - `failed_at`: (S,) the sample at which an experiment failed, -1 where it did not.
     - `error`: (S,) estimates of the largest error of the states at any section, relative to their
       sizes (`LimitCycle.scale`), or None.
-    - `events`: times of events, or None.
     - `label`: name of the section family.
     """
 
     failed_at: Int[np.ndarray, " S"]
     error: Float[np.ndarray, " S"] | None = None
-    events: EventTimes | None = None
     label: str = eqx.field(static=True, default="")
 
     def __repr__(self) -> str:
@@ -61,7 +57,7 @@ class ExperimentData(eqx.Module):
       `u[:, i]` acts. NaN from the failure on where an experiment failed.
     - `result`: (S,) codes of `Result`.
     - `simulated`: results that only a simulation has, or None; also available as `failed_at`,
-      `error`, `events` and `label`.
+      `error` and `label`.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
     - `inputs`, `outputs`: names, or units by name.
@@ -130,10 +126,9 @@ class ExperimentData(eqx.Module):
                 f"{N} sections."
             )
         each = self.result, self.failed_at, self.error
-        if any(x.shape != (S,) for x in each) or (self.events and len(self.events.time) != S):
+        if any(x.shape != (S,) for x in each):
             raise DefinitionError(
-                f"result, failed_at, error and events must have one entry for each of {S} "
-                "experiments."
+                f"result, failed_at and error must have one entry for each of {S} experiments."
             )
         if self.cycle_outputs is not None and self.cycle_outputs.shape != (N, ny):
             raise DefinitionError(
@@ -174,11 +169,6 @@ class ExperimentData(eqx.Module):
         (`LimitCycle.scale`); NaN if not known."""
         error = None if self.simulated is None else self.simulated.error
         return np.full(len(self.u), np.nan) if error is None else error
-
-    @property
-    def events(self) -> EventTimes | None:
-        """Times of events (`run_experiments(record_events=True)`), or None if not known."""
-        return None if self.simulated is None else self.simulated.events
 
     @property
     def label(self) -> str:
@@ -226,26 +216,27 @@ class ExperimentData(eqx.Module):
             "window": f"the last {self.periods} periods",
             "sections": self.label,
         }
-        good = np.flatnonzero(self.ok)
-        rows = good[:: max(1, len(good) // _EVALUATED)]
-        if not len(rows):
+        if not self.ok.any():
             return card("ExperimentData", self.summary(), facts(about))
-        signals = [(x, self.u[rows, :, k]) for k, x in enumerate(self.inputs)]
-        signals += [(y, self.y[rows, :, k]) for k, y in enumerate(self.outputs)]
+        signals = [(x, self.u[self.ok, :, k]) for k, x in enumerate(self.inputs)]
+        signals += [(y, self.y[self.ok, :, k]) for k, y in enumerate(self.outputs)]
         sizes = [
             (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
             for x, v in signals
         ]
-        part = "" if len(rows) == len(good) else f" of {len(rows)} of them"
         k = slice(self.window.start, self.window.start + _DRAWN * self.n_sections)
-        t = np.arange(n)[k] / self.n_sections
         drawn = [
-            picture([Curve(t, v[0, k], color=color)], "cycles", with_unit(x, unit_of(x)))
-            for (x, v), color in zip(
-                (signals[0], signals[len(self.inputs)]), (COLORS[-1], COLORS[0]), strict=True
+            picture(
+                [Curve(np.arange(n)[k] / self.n_sections, v[0, k], color=color)],
+                "cycles",
+                with_unit(x, unit_of(x)),
+            )
+            for (x, v), color in (
+                (signals[0], COLORS[-1]),
+                (signals[len(self.inputs)], COLORS[0]),
             )
         ]
-        rms = table(("signal", f"rms{part}", "largest"), sizes)
+        rms = table(("signal", "rms", "largest"), sizes)
         return card("ExperimentData", self.summary(), facts(about), rms, *drawn)
 
     def odd_part(self) -> "ExperimentData":
@@ -253,7 +244,7 @@ class ExperimentData(eqx.Module):
 
         Even-order distortion is the same for u and -u and cancels; so do offsets, such as an error
         of the limit cycle. Experiments 2k and 2k + 1 are a pair, as in a design
-        `with_negatives()`. A pair with a failed member counts as failed. Events are left out.
+        `with_negatives()`. A pair with a failed member counts as failed.
 
         **Raises:** `DefinitionError` for experiments that are no such pairs.
         """

@@ -26,17 +26,6 @@ from .plan import Plan
 _LEAST_ERROR = 1e-13
 
 
-class IntervalEvents(NamedTuple):
-    """Events of S experiments between consecutive sections, the first K of each interval."""
-
-    time: Float[Array, "S n K"]
-    """Time since the limit cycle passed section 0 at the start of this period."""
-    event: Int[Array, "S n K"]
-    """Indices of transitions; beyond `count` without meaning, as their times."""
-    count: Int[Array, "S n"]
-    """Number of events, which may exceed K."""
-
-
 class Response(NamedTuple):
     """The response of S experiments of n samples."""
 
@@ -51,8 +40,6 @@ class Response(NamedTuple):
     end: Float[Array, "S m"]
     """Times and states on section 0 after the last sample, the time counted within one period as
     that of the start is; NaN after a failure."""
-    log: IntervalEvents | None
-    """Events, if they were asked for."""
 
 
 class Course(eqx.Module):
@@ -84,14 +71,12 @@ def flow_batch(
     start: Float[Array, "m S"],
     u: Float[Array, "S n nu"],
     settings: Settings,
-    event_log: int = 0,
 ) -> Response:
     """Flow S experiments from section 0 through n sections under inputs held between them, n a
     multiple of N.
 
-    `start` holds times and (padded) states at section 0; `event_log`, how many events between two
-    sections are kept. Differentiable in both modes; reverse mode stores the states at the sections,
-    and computes what lies between them again.
+    `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse mode
+    stores the states at the sections and recomputes the flow between them.
     """
     s, period, sequence = Structure(course.system), course.period, course.event_sequence
     z = s.resolve_outputs(course.outputs)
@@ -112,7 +97,7 @@ def flow_batch(
         target = section_target(course.bound, course.lanes, period, *to)
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
-        moved = glide(s, lanes, u, target, settings, stride, result, event_log)
+        moved = glide(s, lanes, u, target, settings, stride, result)
         # An event may change places with a section, but none may be left out or come in addition.
         due = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1
@@ -124,23 +109,14 @@ def flow_batch(
             (moved.lanes.t - turns * period, moved.lanes.events - turns * one_turn),
         )
         ok = result == Result.OK
-        log = moved.log
-        if log is not None:  # times since the cycle's start
-            log = IntervalEvents(log.time - first.t, log.event, log.count)
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
-        return (lanes, result), (
-            y,
-            ok,
-            jax.lax.stop_gradient(share),
-            log,
-        )
+        return (lanes, result), (y, ok, jax.lax.stop_gradient(share))
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
     begin = (lanes, jnp.zeros(S, jnp.int32))
-    (lanes, result), (y, ok, shares, log) = jax.lax.scan(section, begin, xs)
+    (lanes, result), (y, ok, shares) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = _LEAST_ERROR + jnp.max(each_turn, axis=0)
     end = jnp.where(result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan)
-    y, log = jax.tree_util.tree_map(lambda x: jnp.moveaxis(x, -1, 0), (y, log))
-    return Response(y, result, failed_at, error, end.T, log)
+    return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T)

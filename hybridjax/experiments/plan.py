@@ -24,7 +24,7 @@ from ..engine.search.state import Stride
 from ..engine.settings import Settings
 from ..engine.watch import watch
 from ..errors import ComputationError
-from ..sections.place import PATIENCE
+from ..orbits.return_map import PATIENCE
 from ..sections.placed import PlacedSections
 
 

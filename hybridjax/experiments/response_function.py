@@ -4,16 +4,15 @@ import dataclasses
 from typing import Annotated
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Numbers, Positive
+from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
 from .._core.precision import require_x64
 from .._core.text import listed
-from ..engine.settings import EXPERIMENT, STEADY_START
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
@@ -22,7 +21,6 @@ from ..systems.output import Output, OutputNames
 from ..systems.system import HybridSystem
 from .flow_batch import Response, course, flow_batch
 from .plan import Accuracy, Stepping, plan_flow
-from .start import settle
 
 
 # Steps that a derivative may use between two sections, and in a period of the cycle. Fewer:
@@ -79,67 +77,6 @@ class ResponseFunction(eqx.Module):
         return flow_batch(
             course(placed, self.outputs), self.stepping.plan, start, u, self.stepping.settings
         )
-
-    def steady_start(
-        self,
-        u: Annotated[Numbers, Reals("S n nu")],
-        system: HybridSystem | None = None,
-        *,
-        accuracy: Positive = STEADY_START,
-    ) -> Float[Array, "m S"]:
-        r"""Return the starts from which responses repeat with their inputs.
-
-        ```python
-        start = response.steady_start(u)
-        y = response(u, start).y        # periodic from the first sample on
-        ```
-
-        A start is a zero of $F(x) - x$, with F the nonlinear response over one window of the input,
-        found by Newton's method with the exact Jacobian. Its derivatives with respect to inputs and
-        parameters follow from $(I - F_x)\, dx = F_\theta\, d\theta$ at the solution, in both modes,
-        and under `jit`. `run_experiments(start="steady")` computes it for data without derivatives.
-
-        **Arguments:**
-
-        - `u`: one window of the input, with n a multiple of N.
-        - `system`: a system with other parameter values. The sections do not move with it.
-        - `accuracy`: of the start, relative to the sizes of time and states. Default: 1e-10.
-
-        **Returns:** times and states on section 0, (m, S); NaN for experiments that fail or have no
-        such start nearby.
-
-        **Raises:** `DefinitionError` for inputs of another shape.
-        """
-        require_x64(system)
-        u, m = self._inputs(u), 1 + self.placed.lanes.q.shape[0]
-        cycle = self.placed.section_zero[:, None]
-        # Time is a state on state-based sections of clocked systems only.
-        moves = jnp.ones((m, 1)).at[0].set(jnp.where(self.placed.time_is_state[0], 1.0, 0.0))
-        silent = dataclasses.replace(self, outputs=())
-
-        def defect(x, u, system):
-            return (silent(u, x, system).end.T - x) * moves
-
-        def newton(x, u, system):
-            def column(e):
-                direction = jnp.broadcast_to(e[:, None], x.shape)
-                return jax.jvp(lambda x: defect(x, u, system), (x,), (direction,))
-
-            values, slopes = jax.lax.map(column, jnp.eye(m))
-            slope = jnp.transpose(slopes, (2, 1, 0)) - jnp.diag(1 - moves[:, 0])
-            return solve(slope, values[0]), slope
-
-        def solve(slope, defect):
-            return jnp.linalg.solve(slope, -defect.T[..., None])[..., 0].T
-
-        fixed = jax.lax.stop_gradient((u, system))
-        begin = jnp.broadcast_to(jax.lax.stop_gradient(cycle), (m, len(u)))
-        size = jnp.asarray(self.stepping.scales)[0][:, None]
-        blank = jnp.zeros((len(u), m, m))
-        settled = settle(lambda x: newton(x, *fixed), begin, size, accuracy, blank)
-        start = jnp.where(settled.change <= accuracy, settled.start, jnp.nan)
-        start, slope = jax.lax.stop_gradient((start, settled.slope))
-        return start + solve(slope, defect(start, u, system))
 
     def _inputs(self, u: Numbers) -> Float[Array, "S n nu"]:
         u = jnp.asarray(u, float)

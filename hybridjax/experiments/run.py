@@ -5,23 +5,19 @@ from collections.abc import Iterator
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Index, Path
 from .._core.execution import Execution
-from .._core.pieces.run import Workers
+from .._core.pieces.run import DaskClient
 from .._core.progress import working
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import DesignLike, Options, prepare
+from .campaign import CHUNK, DesignLike, Options, prepare
 from .data import ExperimentData
 from .noise import ProcessNoise
 from .plan import Accuracy
 from .start import StartName
 from .stored import StoredExperiments, store_experiments
-
-
-# Experiments of a chunk. More need more memory; fewer leave batches and threads unfilled.
-_CHUNK = 640
 
 
 @checked
@@ -36,7 +32,6 @@ def run_experiments(
     discard: Index | None = None,
     process_noise: ProcessNoise | None = None,
     accuracy: Accuracy = EXPERIMENT,
-    record_events: bool = False,
     execution: Execution | None = None,
 ) -> ExperimentData:
     """Excite the system around its limit cycle and record its outputs at the sections.
@@ -62,7 +57,6 @@ def run_experiments(
     - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
         every section, relative to their sizes (`LimitCycle.scale`). `data.error` estimates the
         error of each experiment. Default: 1e-9.
-    - `record_events`: whether to record the times of events, as `data.events`. Default: False.
     - `execution`: batches and threads.
 
     **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes.
@@ -70,7 +64,7 @@ def run_experiments(
     **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
     unstable cycle, from which any experiment would run away, and if a steady start is not found.
     """
-    options = Options(start, discard, process_noise, accuracy, record_events, execution)
+    options = Options(start, discard, process_noise, accuracy, execution)
     return prepare(cycle, sections, design, outputs, options).run()
 
 
@@ -82,9 +76,9 @@ def stream_experiments(
     outputs: OutputNames,
     options: Options = Options(),  # noqa: B008 (immutable)
     *,
-    chunk: ExperimentCount = _CHUNK,
+    chunk: ExperimentCount = CHUNK,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
 ) -> Iterator[ExperimentData] | StoredExperiments:
     """Run experiments chunk by chunk, in memory that does not depend on their number.
 
@@ -107,9 +101,7 @@ def stream_experiments(
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
         holds the experiments of one call only.
     - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
-        `design`, so pass a `Design` or a small array. Or `(rank, size)` if several processes fill
-        one store without Dask: this process runs the chunks rank, rank + size, ...; processes of
-        rank 1 and more wait until the first has begun the store.
+        `design`, so pass a `Design` or a small array.
 
     **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
     `StoredExperiments`.

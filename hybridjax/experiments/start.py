@@ -1,12 +1,11 @@
 """Initial conditions of experiments: on the limit cycle, or in a periodic response."""
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._core.executor import from_host, to_host
 from .._core.memo import Memory
@@ -90,61 +89,24 @@ def settle_batch(
     predicted: Prediction,
 ) -> tuple[Float[Array, "S m"], Float[Array, " S"]]:
     r"""Return starts whose responses to the repeated window `u` are periodic, and the last Newton
-    steps relative to the sizes of the states.
+    steps relative to the sizes of the states (NaN for experiments that fail). An experiment that
+    has converged is not changed any more.
 
     The Jacobian is that of the linearization, $\Phi^P$, as accurate as the response is linear.
     """
 
-    def step(x):
-        defect = (flow_batch(course, plan, x, u, settings).end.T - x) * predicted.moves
-        return defect + predicted.gain @ defect, None
-
-    settled = settle(step, start, predicted.size, predicted.accuracy)
-    return settled.start.T, settled.change
-
-
-class NewtonState(NamedTuple):
-    """The iterate of Newton's method for S experiments."""
-
-    start: Float[Array, "m S"]
-    """Times and states on section 0."""
-    change: Float[Array, " S"]
-    """The last step, relative to the sizes of the states; NaN for experiments that failed."""
-    slope: Float[Array, "S m m"] | None
-    """The derivatives of that step, if `step` returns them."""
-
-
-def settle(
-    step: Callable[[Float[Array, "m S"]], tuple[Float[Array, "m S"], Array | None]],
-    start: Float[Array, "m S"],
-    size: Float[Array, "m #S"],
-    accuracy: float | Float[Array, ""],
-    slope: Float[Array, "S m m"] | None = None,
-) -> NewtonState:
-    """Iterate Newton's method in all experiments until no step exceeds `accuracy` times `size`. An
-    experiment that has converged is not changed any more.
-
-    **Arguments:** `step` returns Newton's step and its derivatives or None; `slope`: an array of
-    the shape of these derivatives.
-    """
-
     def unfinished(carry):
-        settled, k = carry
-        return (k < MOST_STEPS) & jnp.any(settled.change > accuracy)
+        _, change, k = carry
+        return (k < MOST_STEPS) & jnp.any(change > predicted.accuracy)
 
-    def advance(carry):
-        settled, k = carry
-        active = settled.change > accuracy  # False where the change is NaN
-        move, slope = step(settled.start)
-        change = jnp.max(jnp.abs(move) / size, axis=0)
-        new = NewtonState(settled.start + move, change, slope)
-        return jax.tree_util.tree_map(lambda x, y: _choose(active, x, y), new, settled), k + 1
+    def step(carry):
+        x, change, k = carry
+        active = change > predicted.accuracy  # False where the change is NaN
+        defect = (flow_batch(course, plan, x, u, settings).end.T - x) * predicted.moves
+        move = defect + predicted.gain @ defect
+        size = jnp.max(jnp.abs(move) / predicted.size, axis=0)
+        return jnp.where(active, x + move, x), jnp.where(active, size, change), k + 1
 
-    begin = NewtonState(start, jnp.full(start.shape[1], jnp.inf), slope)
-    return jax.lax.while_loop(unfinished, advance, (begin, 0))[0]
-
-
-def _choose(active: Bool[Array, " S"], x: Array, y: Array) -> Array:
-    """Return `x` for active experiments, else `y`. Experiments are the first of three axes, or the
-    last of one or two."""
-    return jnp.where(active[:, None, None] if x.ndim == 3 else active, x, y)
+    begin = start, jnp.full(start.shape[1], jnp.inf), 0
+    start, change, _ = jax.lax.while_loop(unfinished, step, begin)
+    return start.T, change

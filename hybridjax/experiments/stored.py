@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -13,27 +13,21 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Path
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, digest_of, function_digest, versions
-from .._core.pieces.run import DaskClient, Workers, fill
+from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Constant, Layout, Variable, ZarrStore, absolute
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
 from ..engine.describe import describe
-from ..errors import ComputationError, DefinitionError
+from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import Campaign, DesignLike, Options, prepare
+from .campaign import CHUNK, Campaign, DesignLike, Options, prepare
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
-from .events import EventTimes
 
 
 _KIND = "experiments"
-# Events that are kept of an experiment, for each of the limit cycle in the same time. More: files
-# are larger. Fewer: experiments with additional events end the run.
-_MORE_EVENTS = 2
-# The arrays of `EventTimes` in a store, with the value beyond the last event.
-_EVENTS = {"event_time": np.nan, "event": -1, "event_sample": -1}
 
 
 @checked
@@ -75,14 +69,6 @@ class StoredExperiments:
         if k >= len(self):
             raise IndexError(f"there are {len(self)} chunks, and none of number {k}.")
         x, about = self._store.read(k), self._about
-        events = None
-        if "event" in x:
-            width = max(int((x["event"] >= 0).sum(axis=1).max(initial=0)), 1)
-            time, event, sample = (x[name][:, :width] for name in _EVENTS)
-            names = tuple(about["transitions"])
-            cycle = self._of_cycle("time"), self._of_cycle("event"), self._of_cycle("period")
-            N = self.n_sections
-            events = EventTimes(time, event, sample, *cycle, n_sections=N, names=names)
         return ExperimentData(
             x["u"],
             x["y"],
@@ -91,8 +77,8 @@ class StoredExperiments:
             inputs=tuple(Signal(*named) for named in about["inputs"]),
             outputs=tuple(Signal(*named) for named in about["outputs"]),
             result=x["result"],
-            simulated=Simulated(x["failed_at"], x["error"], events, about["label"]),
-            cycle_outputs=self._of_cycle("outputs"),
+            simulated=Simulated(x["failed_at"], x["error"], about["label"]),
+            cycle_outputs=self._cycle_outputs,
         )
 
     def __iter__(self) -> Iterator[ExperimentData]:
@@ -119,8 +105,8 @@ class StoredExperiments:
         return summary(result, failed_at, self.n_sections, limit)
 
     @functools.cached_property
-    def _of_cycle(self) -> Callable[[str], Any]:
-        return functools.cache(lambda name: self._store.array(f"cycle_{name}"))
+    def _cycle_outputs(self) -> np.ndarray | None:
+        return self._store.array("cycle_outputs")
 
     def __repr__(self) -> str:
         ready = len(self) - len(self.missing())
@@ -135,10 +121,10 @@ def store_experiments(
     options: Options,
     chunk: int,
     store: Any,
-    workers: Workers | None,
+    client: DaskClient | None,
 ) -> StoredExperiments:
     """Run the experiments that are missing in a store; see `stream_experiments`."""
-    fill(prepare_pieces(*arguments, options, chunk), store, workers)
+    fill(prepare_pieces(*arguments, options, chunk), store, client)
     return StoredExperiments(store)
 
 
@@ -170,31 +156,12 @@ class ExperimentJob:
         """Return the records of chunk k."""
         (rows,) = self.blocks.slices(k)
         data = self.campaign.run(rows, Execution(workers=workers).threads)
-        values = {
+        return {
             "u": data.u, "y": data.y, "result": data.result,
             "failed_at": data.failed_at, "error": data.error,
         }  # fmt: skip
-        events = data.events
-        if events is not None:
-            E = self.event_count
-            if events.time.shape[1] > E:
-                worst = rows.start + int(np.argmax(events.count))
-                raise ComputationError(
-                    f"experiment {worst} has more than {E} events, over {_MORE_EVENTS} for each of "
-                    "the limit cycle: run it without `record_events`."
-                )
-            arrays = events.time, events.event, events.sample
-            for (name, fill), x in zip(_EVENTS.items(), arrays, strict=True):
-                values[name] = np.pad(x, ((0, 0), (0, E - x.shape[1])), constant_values=fill)
-        return values
 
-    @property
-    def event_count(self) -> int:
-        """Number of events that are kept of each experiment."""
-        each = len(self.campaign.placed.cycle.event_sequence)
-        return max(_MORE_EVENTS * each * self.campaign.inputs.cycles, 1)
-
-    def begin(self, client: DaskClient | None) -> tuple["ExperimentJob", Layout]:
+    def begin(self) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
         campaign, description = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
@@ -215,20 +182,6 @@ class ExperimentJob:
             "output": (("output",), np.array(list(map(str, values.outputs.names))), {}),
             "cycle_outputs": (("section", "output"), values.on_cycle, {}),
         }
-        if campaign.record_events:
-            cycle, axis = campaign.cycle_events(), (("occurrence",), (self.event_count,))
-            unit = {"units": placed.cycle.system.time_unit or "1"}
-            names = {"flag_meanings": " ".join(description["data"]["transitions"])}
-            variables |= {
-                "event_time": Variable("<f8", *axis, unit),
-                "event": Variable("<i8", *axis, names),
-                "event_sample": Variable("<i8", *axis),
-            }
-            constants |= {
-                "cycle_time": (("cycle_event",), np.asarray(cycle.time[0]), {}),
-                "cycle_event": (("cycle_event",), np.asarray(cycle.event[0]), {}),
-                "cycle_period": ((), np.asarray(placed.cycle.period), {}),
-            }
         coordinates = "input", "output"
         layout = Layout(
             ("experiment",), self.blocks, variables, constants, coordinates, description
@@ -271,7 +224,6 @@ class ExperimentJob:
             "design": _design(inputs.source),
             "start": campaign.start,
             "process_noise": None if noise is None else dataclasses.asdict(noise),
-            "record_events": campaign.record_events,
             "accuracy": campaign.stepping.accuracy,
             "batch": campaign.execution.batch,
             "chunk": self.blocks.block[0],
@@ -283,7 +235,6 @@ class ExperimentJob:
                 "inputs": [[str(x), unit_of(x)] for x in z.structure.inputs],
                 "outputs": [[str(x), unit_of(x)] for x in z.names],
                 "label": placed.family.label,
-                "transitions": [t.name for t in z.structure.transitions],
             },
             "outputs": [x if isinstance(x, str) else function_digest(x) for x in z.items],
         }
@@ -293,5 +244,5 @@ def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
         arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
         return digest_of(*map(array_digest, arrays), repr(source.input_names))
-    parts = (source[k : k + 1024] for k in range(0, len(source), 1024))  # (may lie on disk)
+    parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
     return digest_of(*map(array_digest, parts))

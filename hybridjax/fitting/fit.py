@@ -1,31 +1,24 @@
 """Physical parameters from data, by Levenberg-Marquardt through the limit cycle."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Path, Seed
-from .._core.pieces.description import array_digest, digest_of, versions
-from .._core.pieces.run import DaskClient, fill
-from .._core.pieces.store import Blocks, Layout, Variable
+from .._core.boundary.kinds import Count, Seed
 from .._core.progress import counted, working
 from .._core.results import Result
-from ..engine.describe import describe
 from ..errors import ComputationError, DefinitionError
-from ..orbits.cycle import LimitCycle, rough
+from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..systems.system import Guess, HybridSystem
 from .model_fit import Identifiability, ModelFit, ParameterGuesses, diagnose
 from .observations import AbstractObservation
 from .problem import (
-    MAX_STEPS,
     FitProblem,
     Free,
     Parameters,
@@ -60,8 +53,6 @@ def fit_model(
     guess: Guess | LimitCycle | None = None,
     guesses: Count = 1,
     seed: Seed = 0,
-    store: Path | None = None,
-    client: DaskClient | None = None,
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
 
@@ -87,14 +78,12 @@ def fit_model(
         with factors between exp(-0.2) and exp(0.2). Once one has converged to a cost that the data
         explain (as expected from their standard deviations, or without these 1e-12 of the squared
         data), no more are tried. Default: 1. `seed` of these. Default: 0.
-    - `store`, `client`: as in `sweep`; a guess is a piece. With one of them all guesses are tried.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: no error
     is raised where a fit does not converge.
 
     **Raises:** `DefinitionError` for parameters, bounds or data that do not fit the system;
-    `ComputationError` if no guess has a limit cycle on which the data can be observed; and as
-    `sweep` for a store or a client.
+    `ComputationError` if no guess has a limit cycle on which the data can be observed.
 
     The function is compiled at the first call for each class of systems and type of data; calls
     with other values of parameters and data reuse it.
@@ -103,15 +92,18 @@ def fit_model(
     p = problem.parameters
     x0 = np.asarray(p.encode(p.read(system)))
     around = _SPREAD * np.random.default_rng(seed).uniform(-1, 1, (guesses - 1, len(x0)))
-    job = Guesses(problem, _several(data), system, near, np.stack([x0, *(x0 + around)]))
-    tried = job.until_good() if store is None and client is None else job.all(store, client)
-    best = int(np.argmin(tried.cost))
-    if tried.cost[best] == np.inf:
+    ends: list[End] = []
+    for start in counted(np.stack([x0, *(x0 + around)]), "guesses", guesses):
+        ends.append(_descend(problem, system, start, near))
+        if ends[-1].explains(problem.weighted):
+            break
+    best = min(ends, key=lambda end: end.cost)
+    if best.cost == np.inf:
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
-            f"({Result(int(tried.result[best])).message}): give another system, or more `guesses`."
+            f"({Result(best.result).message}): give another system, or more `guesses`."
         )
-    return _summary(job, tried, best)
+    return _summary(problem, system, near, ends, best)
 
 
 @checked
@@ -183,145 +175,71 @@ def _sizes(values: Array) -> Array:
     return jnp.where(values == 0, 1.0, jnp.abs(values))
 
 
-class Tried(NamedTuple):
-    """The results of S guesses."""
+class End(NamedTuple):
+    """The result of one guess."""
 
-    fitted: Float[np.ndarray, "S p"]
-    """Fitted coordinates."""
-    cost: Float[np.ndarray, " S"]
+    start: Float[np.ndarray, " p"]
+    """Coordinates of the guess,"""
+    x: Float[np.ndarray, " p"]
+    """and of the fit."""
+    cost: float
     """Infinite where there is no limit cycle, or no observation on it."""
-    residuals: Int[np.ndarray, " S"]
+    residuals: int
     """Number of residuals."""
-    steps: Int[np.ndarray, " S"]
-    result: Int[np.ndarray, " S"]
+    steps: int
+    result: int
+
+    def explains(self, weighted: bool) -> bool:
+        """Test whether the fit has converged to a cost that the data explain."""
+        freedom = max(self.residuals - len(self.x), 1)
+        likely = freedom + _LIKELY * np.sqrt(2 * freedom)
+        goal = likely if weighted else _PERFECT * self.residuals
+        return bool(self.result == Result.OK and self.cost <= goal)
 
 
-@dataclasses.dataclass(frozen=True)
-class Guesses:
-    """Fits from several guesses, one after the other or as pieces of work.
-
-    **Fields:** `problem`; `given`, its observations before preparation; `system`, whose parameters
-    are replaced; `near`, a limit cycle to search around; coordinates `x` of each guess.
-    """
-
-    problem: FitProblem
-    given: tuple[AbstractObservation, ...]
-    system: HybridSystem
-    near: LimitCycle
-    x: Float[np.ndarray, "S p"]
-
-    def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
-        """Return the fit from guess k."""
-        x = self.x[k]
-        cycle = self.cycle(x, self.near)
-        cost, count, steps, result = np.inf, 0, 0, int(cycle.result)
-        if result == Result.OK:
-            end = levenberg_marquardt(self.problem, jnp.asarray(x), cycle)
-            r, steps = np.asarray(end.residuals), int(end.steps)
-            count = len(r)
-            result = int(Result.NOT_CONVERGED)
-            if np.isfinite(r).all():  # (else there is a cycle, but no observation on it)
-                x, cost = np.asarray(end.x), float(r @ r)
-                result = int(Result.OK) if end.converged else result
-        values = zip(Tried._fields, (x, cost, count, steps, result), strict=True)
-        return {name: np.asarray(value)[None] for name, value in values}
-
-    def cycle(self, x: Float[np.ndarray, " p"], near: LimitCycle) -> LimitCycle:
-        """Return the cycle with the parameters at x, converged or not."""
-        p = self.problem.parameters
-        system = p.insert(self.system, p.decode(jnp.asarray(x)))
-        return find_limit_cycle(system, near, throw=False)
-
-    def until_good(self) -> Tried:
-        """Return the results of the guesses up to the first that explains the data."""
-        results: list[dict[str, np.ndarray]] = []
-        S, p = self.x.shape
-        for k in counted(range(S), "guesses", S):
-            results.append(self.run(k, None))
-            last = Tried(**results[-1])
-            goal = _PERFECT * last.residuals[0]
-            if self.problem.weighted:
-                freedom = max(last.residuals[0] - p, 1)
-                goal = freedom + _LIKELY * np.sqrt(2 * freedom)
-            if last.result[0] == Result.OK and last.cost[0] <= goal:
-                break
-        return Tried(*(np.concatenate([x[name] for x in results]) for name in Tried._fields))
-
-    def all(self, store: Any, client: Any) -> Tried:
-        """Return the results of all guesses, by workers or in a store; see `fit_model`."""
-        data = fill(self, store, client).dataset()
-        return Tried(*(data[name].values for name in Tried._fields))
-
-    def begin(self, client: DaskClient | None) -> tuple["Guesses", Layout]:
-        """Return the job, and the form of its results."""
-        S, p = self.x.shape
-        variables = {
-            "fitted": Variable("<f8", ("parameter",), (p,)),
-            "cost": Variable("<f8"),
-            **dict.fromkeys(("residuals", "steps", "result"), Variable("<i8")),
-        }
-        constants = {"parameter": (("parameter",), np.array(self.problem.parameters.names), {})}
-        blocks, about = Blocks((S,), (1,)), self.description
-        return self, Layout(("guess",), blocks, variables, constants, ("parameter",), about)
-
-    def arrays(self) -> list[np.ndarray]:
-        """Return the arrays that were computed before the first guess."""
-        return [np.asarray(x) for x in jax.tree_util.tree_leaves(self._computed()[0])]
-
-    def resume(self, layout: Layout, arrays: list[np.ndarray]) -> "Guesses":
-        """Return the job with these arrays of another call."""
-        computed, static = self._computed()
-        tree = jax.tree_util.tree_structure(computed)
-        restored = jax.tree_util.tree_unflatten(tree, [jnp.asarray(x) for x in arrays])
-        problem, near = eqx.combine(restored, static)
-        return dataclasses.replace(self, problem=problem, near=near)
-
-    def _computed(self) -> Any:
-        return eqx.partition((self.problem, self.near), eqx.is_array)
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """JSON from which these fits can be told from others."""
-        parameters = self.problem.parameters
-        return {
-            "kind": "guesses",
-            "versions": versions(),
-            "model": describe(self.system),
-            "guess": rough(self.near),
-            "free": list(parameters.names),
-            "bounds": [array_digest(parameters.low), array_digest(parameters.high)],
-            "data": [_digest(x) for x in self.given],
-            "guesses": array_digest(self.x),
-            "max_steps": MAX_STEPS,
-        }
+def _cycle_at(
+    problem: FitProblem, system: HybridSystem, x: Float[np.ndarray, " p"], near: LimitCycle
+) -> LimitCycle:
+    """Return the cycle with the parameters at x, converged or not."""
+    p = problem.parameters
+    return find_limit_cycle(p.insert(system, p.decode(jnp.asarray(x))), near, throw=False)
 
 
-def _digest(data: AbstractObservation) -> str:
-    leaves = jax.tree_util.tree_leaves(eqx.filter(data, eqx.is_array))
-    return digest_of(type(data).__qualname__, *map(array_digest, leaves))
+def _descend(
+    problem: FitProblem, system: HybridSystem, start: Float[np.ndarray, " p"], near: LimitCycle
+) -> End:
+    cycle = _cycle_at(problem, system, start, near)
+    if cycle.result != Result.OK:
+        return End(start, start, np.inf, 0, 0, int(cycle.result))
+    end = levenberg_marquardt(problem, jnp.asarray(start), cycle)
+    r, steps = np.asarray(end.residuals), int(end.steps)
+    if not np.isfinite(r).all():  # there is a cycle, but no observation on it
+        return End(start, start, np.inf, len(r), steps, int(Result.NOT_CONVERGED))
+    result = Result.OK if end.converged else Result.NOT_CONVERGED
+    return End(start, np.asarray(end.x), float(r @ r), len(r), steps, int(result))
 
 
-def _summary(job: Guesses, tried: Tried, best: int) -> ModelFit:
-    parameters, weighted = job.problem.parameters, job.problem.weighted
+def _summary(
+    problem: FitProblem, system: HybridSystem, near: LimitCycle, ends: list[End], best: End
+) -> ModelFit:
+    parameters, weighted = problem.parameters, problem.weighted
+    start, fitted, cost, _, steps, result = map(np.array, zip(*ends, strict=True))
     decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
-    guesses = ParameterGuesses(
-        decode(job.x[: len(tried.cost)]), decode(tried.fitted), tried.cost, tried.steps,
-        tried.result,
-    )  # fmt: skip
-    x = jnp.asarray(tried.fitted[best])
-    # (By way of the guess: the first cycle may be too far away.)
-    cycle = job.cycle(tried.fitted[best], job.cycle(job.x[best], job.near))
-    end = evaluate(job.problem, x, cycle)
+    guesses = ParameterGuesses(decode(start), decode(fitted), cost, steps, result)
+    x = jnp.asarray(best.x)
+    # The cycle of the guess is nearer than the first one, which may be too far away.
+    cycle = _cycle_at(problem, system, best.x, _cycle_at(problem, system, best.start, near))
+    end = evaluate(problem, x, cycle)
     residuals, values = np.asarray(end.residuals), decode(x)
     size = np.asarray(_sizes(jnp.asarray(values)))
     sensitivity = _relative(parameters, x, end.jacobian)
     identified = diagnose(parameters.names, sensitivity)
-    rank, cost = identified.rank, float(tried.cost[best])
+    rank = identified.rank
     freedom = len(residuals) - rank
-    unit = 1.0 if weighted else max(cost / max(freedom, 1), np.finfo(float).tiny)
+    unit = 1.0 if weighted else max(best.cost / max(freedom, 1), np.finfo(float).tiny)
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(
         cycle.system, cycle, parameters.names, values, unit * root @ root.T,
-        residuals, cost, freedom, identified, guesses, int(tried.result[best]), job.problem,
+        residuals, best.cost, freedom, identified, guesses, best.result, problem,
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -43,10 +43,6 @@ class AbstractObservation(eqx.Module):
     as all fields that may change without another compilation). Residuals should be dimensionless:
     where there are no standard deviations, divide by the size of the measured values.
 
-    **Class variable:** `uses_factors`: whether residuals depend on the cycle's own `factors` or
-    `legs`. If no observation of a fit does, these are not computed, and the fit compiles in a
-    third of the time. Default: True.
-
     For example, multipliers, by the coefficients of their polynomial (the multipliers themselves
     have no derivative where two meet):
 
@@ -55,7 +51,6 @@ class AbstractObservation(eqx.Module):
         seen: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
-        uses_factors: ClassVar[bool] = False  # `linearize` finds Jacobians of its own
 
         def residuals(self, cycle):
             polynomial = hj.linearize(cycle, self.sections).characteristic_polynomial()
@@ -64,18 +59,17 @@ class AbstractObservation(eqx.Module):
     """
 
     weighted: eqx.AbstractVar[Bool[Array, ""]]
-    uses_factors: ClassVar[bool] = True
 
     @abc.abstractmethod
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         """Return the prediction from this limit cycle minus the measurement, weighted.
 
         The method is called under JAX transformations and differentiated in forward mode, once. The
-        parameters of `cycle.system`, `period`, `anchor` and, if `uses_factors` (NaN otherwise),
-        `legs` and `factors` have derivatives by the free parameters, and so have results of
-        `linearize` and `place_sections`. Functions that need concrete values raise an error, such
-        as `cycle.multipliers`: use `linearize(...).monodromy()`, `characteristic_polynomial()`, or
-        `hj.spectral_radius`.
+        parameters of `cycle.system`, `period` and `anchor` have derivatives by the free parameters,
+        and so have results of `linearize` and `place_sections`; `cycle.legs` and `cycle.factors`
+        are NaN, since they would triple the time of compilation. Functions that need concrete
+        values raise an error, such as `cycle.multipliers`: use `linearize(...).monodromy()`,
+        `characteristic_polynomial()`, or `hj.spectral_radius`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.
@@ -109,7 +103,6 @@ class ObservedHTF(AbstractObservation):
     sections: AbstractSections
     weights: Float[Array, "M F ny nu"]
     weighted: Bool[Array, ""]
-    uses_factors: ClassVar[bool] = False
 
     def __init__(self, htf: HTF, sections: FamilyLike):
         """**Arguments:** `htf`: of outputs and inputs of the system, by name. `sections`: the
@@ -167,7 +160,6 @@ class ObservedSeries(AbstractObservation):
     scale: Float[Array, " ny"]
     weighted: Bool[Array, ""]
     flow: tuple[Plan, Settings] | None
-    uses_factors: ClassVar[bool] = False
 
     def __init__(self, data: ExperimentData, sections: FamilyLike, std: Deviations | None = None):
         """**Arguments:** `data`: from experiments with `start="cycle"`. `sections`: their family.
@@ -245,7 +237,6 @@ class ObservedCycle(AbstractObservation):
     scales: tuple[Float[Array, "..."], ...]
     which: tuple[str, ...] = eqx.field(static=True)
     weighted: Bool[Array, ""]
-    uses_factors: ClassVar[bool] = False
 
     def __init__(
         self,

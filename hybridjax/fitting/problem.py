@@ -16,7 +16,6 @@ from .._core.compilation import quick_jit
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..orbits.find import find_limit_cycle
 from ..orbits.newton import MAX_STEPS as NEWTON_STEPS, root
 from ..systems.system import HybridSystem
 from .observations import AbstractObservation
@@ -123,16 +122,12 @@ def _number(system: HybridSystem, name: str) -> float:
     return float(value)
 
 
-def candidate_cycle(
-    system: HybridSystem, guess: LimitCycle, with_factors: bool = True
-) -> LimitCycle:
+def candidate_cycle(system: HybridSystem, guess: LimitCycle) -> LimitCycle:
     """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation.
 
-    Derivatives of a cycle's factors are second derivatives of the flow. Without them it is traced
-    and compiled in a third of the time: `factors` and `legs` are NaN then.
+    `factors` and `legs` are NaN: derivatives of a cycle's factors are second derivatives of the
+    flow, and take two thirds of the time of compilation.
     """
-    if with_factors:
-        return find_limit_cycle(system, guess)
     map = guess.return_map.at_phase_of(system)
     q, turn, steps = root(map, False, NEWTON_STEPS)
     period = map.expected if map.base is None else map.turn(q).period
@@ -164,8 +159,7 @@ class FitProblem(eqx.Module):
     def residuals(self, x: Float[Array, " p"], guess: LimitCycle) -> Float[Array, " r"]:
         """Return the residuals, infinite where there is no limit cycle, or no observation on it."""
         system = self.parameters.insert(guess.system, self.parameters.decode(x))
-        with_factors = any(observation.uses_factors for observation in self.observations)
-        cycle = candidate_cycle(system, guess, with_factors)
+        cycle = candidate_cycle(system, guess)
         r = jnp.concatenate([observation.residuals(cycle) for observation in self.observations])
         return jnp.where((cycle.result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
 

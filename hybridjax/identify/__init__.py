@@ -1,6 +1,6 @@
 """Estimates beyond the usual: fits, their bounds and errors, models from measured responses."""
 
-import lazy_loader
+from .._core.moved import attach
 
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

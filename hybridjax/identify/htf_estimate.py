@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, Index, Probability
+from .._core.boundary.kinds import Count, Probability
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF, Scatter
+from .descent import ROUNDING
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
@@ -21,8 +22,6 @@ _SAME_PHASES = 1e-6
 # Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
 # errors of constant size are too small; the mean of more is normally distributed.
 _FEW_REALIZATIONS = 16
-# Residuals of a line, relative to its power, that are rounding and have no shape.
-_NO_RESIDUAL = 1e-13
 
 
 @checked
@@ -32,7 +31,6 @@ def estimate_htf(
     *,
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
-    highest: Index | None = None,
     half_integers: Literal["error", "skip"] = "error",
     threshold: Probability = SILENT_LINE,
 ) -> HTF:
@@ -45,8 +43,7 @@ def estimate_htf(
     coincides with its own mirror image, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`;
     both unknowns are solved for, from two or more experiments with different phases. Inputs that
     excite one line together need as many experiments to be separated. Failed experiments are left
-    out (`missing_frequencies` lists the frequencies lost), and with several inputs only frequencies
-    that were measured from each of them are kept.
+    out, and with several inputs only frequencies that were measured from each of them are kept.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
     (Pintelon and Schoukens 2012, ch. 3), with its `variance`. Frequencies that
@@ -58,12 +55,10 @@ def estimate_htf(
 
     - `data`: the experiments; or parts of them one after the other, as `stream_experiments` and
       `StoredExperiments` return them, of which only sums over experiments are kept.
-    - `harmonics`: the harmonics to estimate. Default: all N (with `highest`, all up to it).
+    - `harmonics`: the harmonics to estimate. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "auto", the default, is the variance that the experiments allow; "noise", from
       the repeats alone, and "total", from realizations, raise errors where they are not available.
-    - `highest`: harmonics beyond this one are taken as zero, as in designs with few experiments
-      (`multisine(highest_harmonic=...)`). Default: none.
     - `half_integers`: "error", the default, or "skip" multiples of 1/2 measured with one phase.
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
@@ -82,7 +77,7 @@ def estimate_htf(
             "pass repeats=2."
         )
     require_x64()
-    sums = spectral_sums(data, harmonics, highest=highest, threshold=threshold, repeats=repeats)
+    sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     unsolved = sums.one_phase()
     if unsolved.any() and half_integers == "error":
         raise DefinitionError(
@@ -119,19 +114,6 @@ def estimate_htf(
         f, lines.H, sums.harmonics, setup.n_sections, setup.inputs, setup.outputs, "estimate",
         variance=total, noise_variance=noise, scatter=scatter,
     )  # fmt: skip
-
-
-@checked
-def missing_frequencies(
-    data: Experiments, threshold: Probability = SILENT_LINE, *, highest: Index | None = None
-) -> Float[np.ndarray, " F"]:
-    """Return the frequencies (cycles per period) that were excited but cannot be estimated.
-
-    Their experiments failed, or not all inputs were applied there, or they lie on a multiple of
-    1/2 and were measured with one phase only. Arguments as of `estimate_htf`.
-    """
-    sums = spectral_sums(data, (), highest=highest, threshold=threshold)
-    return sums.f[~sums.solvable(sums.gram)]
 
 
 class _LineEstimates(NamedTuple):
@@ -198,7 +180,7 @@ def _roundness(
     power = np.einsum("kii->ki", gram).real[None, :, None]
     energy, turned = (x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned))
     square = energy - np.abs(H) ** 2 * power
-    square = np.where(square > _NO_RESIDUAL * energy, square, 0.0)
+    square = np.where(square > ROUNDING * energy, square, 0.0)
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
 
 

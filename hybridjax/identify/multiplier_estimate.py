@@ -11,7 +11,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount, Probability
 from .._core.boundary.values import Complexes
-from .._core.html import card, complex_number, multiplier_table, table, text, unit_circle
+from .._core.html import card, multiplier_table, text, unit_circle
 from ..errors import DefinitionError
 
 
@@ -43,24 +43,15 @@ class MultiplierComparison(eqx.Module):
     def max_error(self) -> float:
         return float(np.max(self.error))
 
-    def _rows(self):
-        names = self.outputs or [""] * len(self.true)
-        return zip(names, self.true, self.estimated, self.error, strict=True)
-
     def __repr__(self) -> str:
         width = max(map(len, self.outputs), default=-2) + 2
         rows = [" " * width + f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
-        for name, true, estimated, error in self._rows():
+        names = self.outputs or [""] * len(self.true)
+        pairs = zip(names, self.true, self.estimated, self.error, strict=True)
+        for name, true, estimated, error in pairs:
             label = f"{name:>{width - 2}}  " if width else ""
             rows.append(f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}")
         return "\n".join(rows)
-
-    def _repr_html_(self) -> str:
-        rows = [
-            (name, complex_number(true, 9), complex_number(estimated, 9), f"{error:.1e}")
-            for name, true, estimated, error in self._rows()
-        ]
-        return card("MultiplierComparison", "", table(("", "true", "estimated", "error"), rows))
 
 
 def _show(value: complex) -> str:
@@ -80,28 +71,6 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
     order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
     return MultiplierComparison(true=truth[columns][order], estimated=values[rows][order])
-
-
-def compare_by_output(
-    estimated: Sequence[Complex[np.ndarray, " _"]],
-    true: Multipliers,
-    outputs: Sequence[str],
-    output: str | int | None = None,
-) -> MultiplierComparison:
-    """Compare fits with separate multipliers for each output.
-
-    **Arguments:** `output`: name or index of the only one to compare. Default: all.
-
-    **Raises:** `DefinitionError` for an output that is not there, or if there is no multiplier.
-    """
-    chosen = range(len(outputs)) if output is None else [channel_index("output", output, outputs)]
-    parts = [compare_multipliers(estimated[k], true) for k in chosen]
-    names = [outputs[k] for k, part in zip(chosen, parts, strict=True) for _ in part.true]
-    return MultiplierComparison(
-        np.concatenate([part.true for part in parts]),
-        np.concatenate([part.estimated for part in parts]),
-        tuple(names),
-    )
 
 
 def channel_index(kind: str, wanted: str | int, names: Sequence[str]) -> int:

@@ -1,20 +1,20 @@
-"""Tests of the residuals of records for whiteness and independence, as sums over records."""
+"""Tests of the residuals of records for whiteness and independence."""
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import optimize, stats
 
 from ..experiments.record import Record
+from .series.output_error import RANK
 
 
 # Samples of a section, below which its correlations are not tested. Fewer: their distribution is
 # not normal; more: short records cannot be validated.
 FEWEST_SAMPLES = 8
-# Singular values of lagged inputs relative to the largest one that are rounding errors.
-_RANK = 1e-9
 # Probability with which a misfit that counts as visible is detected, and the draws over which
 # Gaussian deviates are averaged. Fewer draws: the second digit of `visible` is wrong.
 _POWER, _DRAWS = 0.8, 1000
@@ -22,99 +22,93 @@ _POWER, _DRAWS = 0.8, 1000
 _LARGEST = 1e3
 
 
-class Whiteness:
-    """Correlations of residuals with earlier ones, section by section."""
+class Samples(NamedTuple):
+    """The samples of S records, one after the other."""
 
-    def __init__(self, N: int, lags: int, ny: int):
-        self.products, self.counts = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), int)
+    n_sections: int
+    section: Int[np.ndarray, " n"]
+    before: Int[np.ndarray, " n"]
+    """The number of earlier samples in the same record."""
+    u: Float[np.ndarray, "n nu"]
 
-    def add(self, records: Sequence[Record], residuals: Sequence[np.ndarray]) -> None:
-        section, now = sections_of(records), np.concatenate(residuals)
-        for lag in range(1, self.counts.shape[1] + 1):
-            product = now * np.concatenate([_earlier(x, lag) for x in residuals])
-            for n in range(len(self.counts)):
-                values = product[section == n]
-                self.products[n, lag - 1] += np.nansum(values, axis=0)
-                self.counts[n, lag - 1] += np.isfinite(values).sum(axis=0)
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> "Samples":
+        N, before = records[0].n_sections, [np.arange(len(r.u)) for r in records]
+        section = [(r.first_section + k) % N for r, k in zip(records, before, strict=True)]
+        u = np.concatenate([r.u for r in records])
+        return cls(N, np.concatenate(section), np.concatenate(before), u)
 
-    def result(
-        self, size: Float[np.ndarray, "N ny"]
-    ) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
-        """Return correlations and p-values; `size`: rms of the residuals at each section."""
-        scale = np.where(size > 0, size, 1.0)
-        N, lags = self.counts.shape[:2]
-        before = (np.arange(N)[:, None] - np.arange(1, lags + 1)) % N
-        z = self.products / scale[:, None] / scale[before] / np.sqrt(np.maximum(self.counts, 1))
-        # The mean over the sections of each lag, and the deviations from it: independent.
-        tested = self.counts >= FEWEST_SAMPLES
-        z = z * tested
-        count = tested.sum(axis=0)
-        pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
-        deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
-        degrees = (count > 0).sum(axis=0)
-        p = stats.chi2.sf(pooled.sum(axis=0), degrees)
-        if N > 1:
-            p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
-            p = -np.expm1(2 * np.log1p(-p))
-        return z, p
+    def at(self, lags: int) -> list[Int[np.ndarray, " k"]]:
+        """Return the samples at each section with so many samples before them."""
+        late = self.before >= lags
+        return [np.flatnonzero(late & (self.section == n)) for n in range(self.n_sections)]
+
+    def count(self, present: Bool[np.ndarray, "n ny"], lags: int) -> Int[np.ndarray, "N ny"]:
+        """Return how often each section was sampled with so many samples before it."""
+        return np.stack([present[rows].sum(axis=0) for rows in self.at(lags)])
 
 
-class Independence:
-    """The part of residuals that present and past inputs explain, section by section.
+def whiteness_test(
+    samples: Samples,
+    error: Float[np.ndarray, "n ny"],
+    size: Float[np.ndarray, "N ny"],
+    lags: int,
+) -> tuple[Float[np.ndarray, "N lags ny"], Float[np.ndarray, " ny"]]:
+    """Return correlations of residuals with earlier ones, section by section, and p-values.
 
-    The rows of lagged inputs, with the residuals as one more column, are kept as the triangle of
-    their QR decomposition.
+    **Arguments:** `size`: rms of the residuals at each section.
     """
+    scale, N = np.where(size > 0, size, 1.0), samples.n_sections
+    z, tested = np.zeros((N, lags, size.shape[1])), np.zeros((N, lags, size.shape[1]), bool)
+    for k in range(lags):
+        for n, rows in enumerate(samples.at(k + 1)):
+            product = error[rows] * error[rows - k - 1] / scale[n] / scale[(n - k - 1) % N]
+            count = np.isfinite(product).sum(axis=0)
+            z[n, k] = np.nansum(product, axis=0) / np.sqrt(np.maximum(count, 1))
+            tested[n, k] = count >= FEWEST_SAMPLES
+    # The mean over the sections of each lag, and the deviations from it: independent.
+    z = z * tested
+    count = tested.sum(axis=0)
+    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
+    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
+    degrees = (count > 0).sum(axis=0)
+    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
+    if N > 1:
+        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
+        p = -np.expm1(2 * np.log1p(-p))
+    return z, p
 
-    def __init__(self, N: int, lags: int, ny: int, nu: int):
-        self.shape = N, lags, ny, nu
-        self.triangles = {k: np.zeros((0, lags * nu + 1)) for k in np.ndindex(N, ny)}
-        self.counts = np.zeros((N, ny), int)
 
-    def add(self, records: Sequence[Record], residuals: Sequence[np.ndarray]) -> None:
-        section, now = sections_of(records), np.concatenate(residuals)
-        lags = range(self.shape[1])
-        past = [np.concatenate([_earlier(r.u, lag) for r in records]) for lag in lags]
-        past = np.stack(past, axis=1).reshape(len(now), -1)
-        complete = np.isfinite(past).all(axis=1)
-        for (n, i), triangle in self.triangles.items():
-            rows = (section == n) & complete & np.isfinite(now[:, i])
-            more = np.concatenate([past[rows], now[rows, i, None]], axis=1)
-            self.counts[n, i] += len(more)
-            self.triangles[n, i] = _triangle(np.concatenate([triangle, more]))
+def independence_test(
+    samples: Samples, error: Float[np.ndarray, "n ny"], lags: int, level: float
+) -> tuple[Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]]:
+    """Test the part of residuals that present and past inputs explain, section by section.
 
-    def result(
-        self, level: float
-    ) -> tuple[
-        Float[np.ndarray, "N lags ny nu"], Float[np.ndarray, " ny"], Float[np.ndarray, " ny"]
-    ]:
-        """Return the correlations with the inputs, the p-values, and the smallest visible misfits.
-
-        The latter in standard deviations of the noise, for tests of this level.
-        """
-        N, lags, ny, nu = self.shape
-        z, deviates = np.zeros(self.shape), np.zeros(ny)
-        ratios: list[list[tuple[int, int]]] = [[] for _ in range(ny)]
-        for (n, i), triangle in self.triangles.items():
-            U, r, rows = triangle[:, :-1], triangle[:, -1], int(self.counts[n, i])
-            if rows < FEWEST_SAMPLES or not r.any():
+    **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
+    in standard deviations of the noise, for tests of this level.
+    """
+    N, ny, nu = samples.n_sections, error.shape[1], samples.u.shape[1]
+    z, deviates = np.zeros((N, lags, ny, nu)), np.zeros(ny)
+    ratios: list[list[tuple[int, int]]] = [[] for _ in range(ny)]
+    for n, rows in enumerate(samples.at(lags - 1)):
+        past = samples.u[rows[:, None] - np.arange(lags)].reshape(len(rows), -1)
+        for i in range(ny):
+            present = np.isfinite(error[rows, i])
+            U, r, count = past[present], error[rows, i][present], int(present.sum())
+            if count < FEWEST_SAMPLES or not r.any():
                 continue
-            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / rows)
+            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
             z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
             left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > _RANK * s[0]][:, : rows // 2]
+            left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
-            a, b = left.shape[1], rows - left.shape[1]
+            a, b = left.shape[1], count - left.shape[1]
             inside = ((left.T @ r) ** 2).sum()
             deviates[i] += _deviate((inside / a) / ((r @ r - inside) / b), a, b)
             ratios[i].append((a, b))
-        count = np.array([len(x) for x in ratios])
-        p = stats.norm.sf(deviates / np.sqrt(np.maximum(count, 1)))
-        return z, p, np.array([_smallest_visible(x, level) for x in ratios])
-
-
-def _triangle(rows: np.ndarray) -> np.ndarray:
-    return np.linalg.qr(rows)[1]
+    count = np.array([len(x) for x in ratios])
+    p = stats.norm.sf(deviates / np.sqrt(np.maximum(count, 1)))
+    return z, p, np.array([_smallest_visible(x, level) for x in ratios])
 
 
 def _deviate(ratio, a: int, b: int):
@@ -150,15 +144,3 @@ def _smallest_visible(ratios: Sequence[tuple[int, int]], level: float) -> float:
     if not shortfall(limit) > 0:
         return np.inf
     return float(np.exp(optimize.root_scalar(shortfall, bracket=(-limit, limit), xtol=1e-3).root))
-
-
-def sections_of(records: Sequence[Record]) -> Int[np.ndarray, " n"]:
-    """Return the section of each sample of all records."""
-    return np.concatenate([(r.first_section + np.arange(len(r.u))) % r.n_sections for r in records])
-
-
-def _earlier(x: np.ndarray, lag: int) -> np.ndarray:
-    """Return x, `lag` samples earlier; NaN before its start."""
-    out = np.full_like(x, np.nan)
-    out[lag:] = x[: max(len(x) - lag, 0)]
-    return out

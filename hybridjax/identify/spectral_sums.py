@@ -13,8 +13,9 @@ from jaxtyping import Bool, Complex, Float, Int
 from .._core.boundary.containers import Stream
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.design.partition import check_sharing, meets_itself, regular
+from ..experiments.design.partition import check_sharing, needs_two_phases, regular
 from ..linear.frequency_response import Harmonics, check_harmonics
+from .descent import ROUNDING
 
 
 Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
@@ -24,8 +25,6 @@ Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(Experi
 # Largest change of a line of the input from one window to the next, relative to the largest line.
 # Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
 _REPEATS = 1e-2
-# Part of the largest line of all inputs below which a line is rounding.
-_ROUNDING = 1e-12
 # Part of the largest line of an input below which a line is not excited, where nobody chose it.
 # Smaller: rounding counts as a line; larger: weak lines are missed.
 SILENT_LINE = 1e-6
@@ -100,7 +99,6 @@ def spectral_sums(
     data: Experiments,
     harmonics: Harmonics | None,
     *,
-    highest: int | None = None,
     threshold: float = SILENT_LINE,
     repeats: int = 1,
 ) -> SpectralSums:
@@ -119,9 +117,8 @@ def spectral_sums(
                 f"these experiments do not belong together: some have {total.setup}, others "
                 f"{setup}."
             )
-        chosen = _choose_harmonics(harmonics, highest, part.n_sections)
-        reach = None if highest is None else highest + max(map(abs, chosen), default=0)
-        sums = _sums_of_part(part, setup, chosen, reach, threshold, repeats, count)
+        chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
+        sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:
@@ -131,36 +128,17 @@ def spectral_sums(
     return total
 
 
-def _choose_harmonics(
-    harmonics: Harmonics | None, highest: int | None, n_sections: int
-) -> tuple[int, ...]:
-    if harmonics == ():
-        return ()
-    chosen = check_harmonics(harmonics, n_sections)
-    if highest is None:
-        return chosen
-    if harmonics is None:
-        return tuple(m for m in chosen if abs(m) <= highest)
-    if max(map(abs, chosen)) > highest:
-        raise DefinitionError(
-            f"harmonics beyond highest = {highest} are taken as zero, so {chosen} cannot all be "
-            "estimated."
-        )
-    return chosen
-
-
 def _sums_of_part(
     data: ExperimentData,
     setup: Setup,
     harmonics: tuple[int, ...],
-    highest: int | None,
     threshold: float,
     repeats: int,
     first: int,
 ) -> SpectralSums:
     """Return the sums over one part, whose first experiment has the number `first`."""
     windows = data.windows(repeats)
-    experiment, line, U = _excited(data, windows, threshold, highest, first)
+    experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
     good = data.ok[experiment]
 
@@ -187,7 +165,7 @@ def _sums_of_part(
         setup,
         harmonics,
         lines,
-        meets_itself(lines, setup.periods, setup.n_sections, highest),
+        needs_two_phases(lines, setup.periods, setup.n_sections),
         tried=total(products, np.ones(len(U), bool)),
         gram=total(products, good),
         count=total(np.ones(len(U), int), good),
@@ -213,9 +191,7 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
     return mean, spread / max(len(Y) - 1, 1) / len(Y)
 
 
-def _excited(
-    data: ExperimentData, windows: list[slice], threshold: float, highest: int | None, first: int
-):
+def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
     """Return experiment, line and U of every excited line, checked that they do not meet."""
     u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
     spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
@@ -229,7 +205,7 @@ def _excited(
             f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
             "right number of periods."
         )
-    excited = ((size > threshold * peak) & (size > _ROUNDING * peak.max())).any(axis=2)
+    excited = ((size > threshold * peak) & (size > ROUNDING * peak.max())).any(axis=2)
     experiment, line = np.nonzero(excited)
     number = excited.sum(axis=1)
 
@@ -243,7 +219,7 @@ def _excited(
             "`threshold`?)"
         )
 
-    check_sharing(experiment + first, line, data.periods, hint, data.n_sections, highest)
+    check_sharing(experiment + first, line, data.periods, hint)
     return experiment, line, U[experiment, line]
 
 

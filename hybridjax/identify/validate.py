@@ -1,11 +1,10 @@
 """Is an identified model good enough? Simulation of data that it was not fitted to."""
 
-from collections.abc import Iterator
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
@@ -14,14 +13,12 @@ from .._core.html import COLORS, Curve, card, picture, table, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..experiments.record import HasRecords, Record, RecordedData, each_uninterrupted_record
+from ..experiments.record import RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .joint.fit import LDTPFit
-from .joint.noise import Predictor
 from .record_simulation import can_be_compared, simulate_record
-from .residual_tests import FEWEST_SAMPLES, Independence, Whiteness, sections_of
+from .residual_tests import FEWEST_SAMPLES, Samples, independence_test, whiteness_test
 from .series.fit import SeriesFit
-from .series.records import in_groups
 
 
 # Cycles that a notebook draws. More: they are harder to see.
@@ -134,7 +131,6 @@ def validate(
     model: LDTP | SeriesFit | LDTPFit,
     data: RecordedData,
     *,
-    noise: LDTP | None = None,
     start: Literal["free", "cycle"] = "free",
     lags: Count | None = None,
     level: Probability = 0.01,
@@ -149,9 +145,9 @@ def validate(
     part of the residuals that lagged inputs explain, compared with the rest (an F ratio for each
     section), for any spectrum of the input; its level holds for residuals that are white.
 
-    With `noise`, or a fit of `fit_ldtp` to series, the errors of predictions one step ahead are
-    tested (Ljung 1999): they are white for a true model with any noise that drives the system, if
-    that noise is described. All fields are then those of the predictions.
+    For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
+    1999): they are white for a true model with any noise that drives the system, if that noise is
+    described. All fields are then those of the predictions.
 
     Records with three samples or fewer for each unknown of their initial condition and drift are
     left out: they agree with any model.
@@ -160,9 +156,7 @@ def validate(
 
     - `model`: identified or exact; a `SeriesFit` is simulated as it is.
     - `data`: as for `fit_series`, best those that the model was not fitted to; the data of the fit
-      always fit too well. `StoredExperiments` are read twice, part by part.
-    - `noise`: an `LDTP` that makes the noise of the outputs from white inputs of variance one, as
-      `LDTPFit.noise`; for an LDTP as `model` only. Default: the residuals are tested as they are.
+      always fit too well.
     - `start`: "free", the default, estimates the state at the start of each record from it;
       "cycle" takes it as zero. A drift that the records announce is estimated from them in either
       case.
@@ -170,16 +164,27 @@ def validate(
     - `level`: significance level of the tests. Default: 0.01.
 
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
-    cycles, or all records are too short to be compared or for so many lags; for noise that does not
-    belong to the model, or has an output without noise.
+    cycles, or all records are too short to be compared or for so many lags.
     """
-    free_start, tested = start == "free", _with_noise(model, noise)
-    records = _Comparable(tested, data, free_start, lags)
-    longest, sampled = records.longest, records.with_past(0)
-    N, outputs, ny = longest.n_sections, longest.outputs, len(longest.outputs)
-    fewest, spread = sampled.min(axis=0), records.spread
-    for name, few, size in zip(outputs, fewest, spread, strict=True):
-        if size == 0 or not np.isfinite(size):
+    free_start, tested = start == "free", model
+    if isinstance(model, LDTPFit):
+        tested = model.predictor or model.model
+    records = uninterrupted_records(data)
+    require_same("model and data", model, records[0])
+    compared = [r for r in records if can_be_compared(tested, r, free_start)]
+    N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
+    if not compared:
+        raise DefinitionError(
+            f"the longest of {len(records)} uninterrupted records has "
+            f"{max(len(r.u) for r in records) / N:.3g} cycles: too few to tell the model from an "
+            "unknown start."
+        )
+    y = np.concatenate([r.y for r in compared])
+    samples, present = Samples.of(compared), np.isfinite(y)
+    spread = np.ma.masked_invalid(y).std(axis=0).filled(0.0)
+    sampled = samples.count(present, 0)
+    for name, few, size in zip(outputs, sampled.min(axis=0), spread, strict=True):
+        if not size:
             raise DefinitionError(f"the output {name} is constant or missing at every sample.")
         if few < FEWEST_SAMPLES:
             raise DefinitionError(
@@ -187,29 +192,24 @@ def validate(
                 "cycles."
             )
     if lags is None:
-        most = min(N, int(fewest.min()) // _SAMPLES_PER_LAG)
-        enough = [records.with_past(lag).min() >= FEWEST_SAMPLES for lag in range(1, most + 1)]
+        tried = range(1, min(N, int(sampled.min()) // _SAMPLES_PER_LAG) + 1)
+        enough = [samples.count(present, lag).min() >= FEWEST_SAMPLES for lag in tried]
         lags = max(sum(map(bool, enough)), 1)
-    if (records.with_past(lags).max(axis=0) < FEWEST_SAMPLES).any():
+    if (samples.count(present, lags).max(axis=0) < FEWEST_SAMPLES).any():
         raise DefinitionError(
             f"`lags` is {lags}, and the records are too short for it: no section was sampled "
             f"{FEWEST_SAMPLES} times with so many samples before it in its record."
         )
-    white, independent = Whiteness(N, lags, ny), Independence(N, lags, ny, len(longest.inputs))
-    square, power, samples = np.zeros((N, ny)), np.zeros(ny), 0
-    for group in in_groups(records.all()):
-        simulated = [simulate_record(tested, record, free_start) for record in group]
-        residuals = [r.y - y for r, y in zip(group, simulated, strict=True)]
-        section, error = sections_of(group), np.concatenate(residuals)
-        square += [np.nansum(error[section == n] ** 2, axis=0) for n in range(N)]
-        power += (np.concatenate(simulated) ** 2).sum(axis=0)
-        samples += len(error)
-        white.add(group, residuals)
-        independent.add(group, residuals)
-    rms, size = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0)), np.sqrt(power / samples)
-    auto, whiteness = white.result(np.sqrt(square / sampled))
-    cross, independence, visible = independent.result(level / ny)
-    shown = slice(0, len(longest.u) - longest.lead)  # later inputs are unknown
+    simulated = np.concatenate([simulate_record(tested, r, free_start) for r in compared])
+    error = y - simulated
+    square = np.stack([np.nansum(error[at] ** 2, axis=0) for at in samples.at(0)])
+    rms = np.sqrt(square.sum(axis=0) / sampled.sum(axis=0))
+    size = np.sqrt(np.mean(simulated**2, axis=0))
+    auto, whiteness = whiteness_test(samples, error, np.sqrt(square / sampled), lags)
+    cross, independence, visible = independence_test(samples, error, lags, level / ny)
+    first = int(np.argmax([len(r.u) for r in compared]))
+    longest, begin = compared[first], sum(len(r.u) for r in compared[:first])
+    shown = slice(begin, begin + len(longest.u) - longest.lead)  # later inputs are unknown
     return Validation(
         fit=100 * (1 - rms / spread),
         noise=rms,
@@ -218,95 +218,12 @@ def validate(
         visible=np.where(size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf),
         autocorrelation=auto,
         cross_correlation=cross,
-        measured=longest.y[shown],
-        simulated=simulate_record(tested, longest, free_start)[shown],
+        measured=y[shown],
+        simulated=simulated[shown],
         level=level,
         first_section=longest.first_section,
-        left_out=records.left_out,
+        left_out=len(records) - len(compared),
         n_sections=N,
         inputs=longest.inputs,
         outputs=outputs,
     )
-
-
-def _with_noise(
-    model: LDTP | SeriesFit | LDTPFit, noise: LDTP | None
-) -> LDTP | SeriesFit | Predictor:
-    """Return a predictor where the noise is described, otherwise the model."""
-    if noise is not None and not isinstance(model, LDTP):
-        raise DefinitionError(
-            f"`noise` belongs to an LDTP, but `model` is a {type(model).__name__}: give an LDTP, "
-            "as `LDTPFit.model`, or a result of `hj.identify.realize`."
-        )
-    if isinstance(model, LDTPFit):
-        return model.predictor or model.model
-    if noise is not None and isinstance(model, LDTP):
-        return Predictor.of(model, noise)
-    return model
-
-
-class _Comparable:
-    """Records with enough samples for a comparison, and how many samples they have.
-
-    Data other than sequences are read anew each time.
-
-    **Raises:** `DefinitionError` if there are none, or model and data do not belong together.
-    """
-
-    def __init__(
-        self,
-        model: LDTP | SeriesFit | Predictor,
-        data: RecordedData,
-        free_start: bool,
-        lags: int | None,
-    ):
-        if not isinstance(data, HasRecords) and iter(data) is data:
-            data = list(data)
-        self._data = data
-        self._compared = lambda record: can_be_compared(model, record, free_start)
-        self.left_out, compared, first, most = 0, None, None, 0
-        for record in each_uninterrupted_record(self._data):
-            if first is None:
-                first, (_, ny) = record, record.y.shape
-                require_same("model and data", model, record)
-                self._lags = lags or record.n_sections
-                self._late = np.zeros((self._lags + 1, record.n_sections, ny), int)
-                self._moments = np.zeros((3, ny))
-            most = max(most, len(record.u))
-            if not self._compared(record):
-                self.left_out += 1
-                continue
-            self._count(record)
-            if compared is None or len(record.u) > len(compared.u):
-                compared = record
-        if compared is None:
-            raise DefinitionError(
-                f"the longest of {self.left_out} uninterrupted records has "
-                f"{most / first.n_sections if first else 0:.3g} cycles: too few to tell the model "
-                "from an unknown start."
-            )
-        self.longest: Record = compared
-
-    def _count(self, record: Record) -> None:
-        sampled = np.isfinite(record.y)
-        before = np.minimum(np.arange(len(sampled)), self._lags)
-        np.add.at(self._late, (before, sections_of([record])), sampled)
-        # Means and squares of two sets as one (Chan, Golub and LeVeque 1983).
-        count, (old, mean, square) = sampled.sum(axis=0), self._moments
-        y = np.where(sampled, record.y, 0.0)
-        new = y.sum(axis=0) / np.maximum(count, 1)
-        part = count / np.maximum(old + count, 1)
-        square = square + ((y - new) ** 2 * sampled).sum(axis=0) + (new - mean) ** 2 * old * part
-        self._moments = np.stack([old + count, mean + (new - mean) * part, square])
-
-    def all(self) -> Iterator[Record]:
-        return filter(self._compared, each_uninterrupted_record(self._data))
-
-    def with_past(self, lags: int) -> Int[np.ndarray, "N ny"]:
-        """Return how often each section was sampled with so many samples before it."""
-        return self._late[lags:].sum(axis=0)
-
-    @property
-    def spread(self) -> Float[np.ndarray, " ny"]:
-        """Standard deviation of each output."""
-        return np.sqrt(self._moments[2] / np.maximum(self._moments[0], 1))

@@ -35,8 +35,7 @@ class Scatter(eqx.Module):
       the realizations, relative to its mean for normal errors: 0 where all lie on a line. None,
       and ones, are scatter that says nothing but its size.
 
-    **Raises:** `DefinitionError` for freedom that is not positive, roundness beyond 0 to 3, or two
-    numbers of frequencies.
+    **Raises:** `DefinitionError` for freedom that is not positive, or roundness beyond 0 to 3.
     """
 
     freedom: Float[Array, " F"]
@@ -50,14 +49,11 @@ class Scatter(eqx.Module):
         require_x64()
         self.freedom = jnp.asarray(freedom)
         self.roundness = None if roundness is None else jnp.asarray(roundness)
-        if roundness is None:
-            return
-        if roundness.shape[1] != len(self.freedom):
-            raise DefinitionError(
-                f"`freedom` is of {len(self.freedom)} frequencies, `roundness` of "
-                f"{roundness.shape[1]}."
-            )
-        if not is_traced(roundness) and np.max(roundness, initial=0) > _ROUNDEST:
+        if (
+            roundness is not None
+            and not is_traced(roundness)
+            and np.max(roundness, initial=0) > _ROUNDEST
+        ):
             raise DefinitionError(f"`roundness` must be at most {_ROUNDEST}.")
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
@@ -283,18 +279,13 @@ class HTF(eqx.Module):
         if len(given) < 2:
             raise DefinitionError("Interpolation needs at least two frequencies.")
         step = np.diff(given)
-        ends = (
-            np.flatnonzero(
-                np.diff(knots) > _WIDEST_GAP * step[step > _SAME_FREQUENCY].max() + _SAME_FREQUENCY
-            )
-            + 1
-        )
+        widest = _WIDEST_GAP * step[step > _SAME_FREQUENCY].max() + _SAME_FREQUENCY
+        ends = np.flatnonzero(np.diff(knots) > widest) + 1
         place = np.mod(wanted, self.n_sections)
         H = np.full((values.shape[0], len(wanted), *values.shape[2:]), np.nan, complex)
         for run in np.split(np.arange(len(knots)), ends):
-            inside = (place >= knots[run[0]] - _SAME_FREQUENCY) & (
-                place <= knots[run[-1]] + _SAME_FREQUENCY
-            )
+            first, last = knots[run[[0, -1]]] + [-_SAME_FREQUENCY, _SAME_FREQUENCY]
+            inside = (place >= first) & (place <= last)
             if len(run) > 1 and np.any(inside):
                 H[:, inside] = CubicSpline(knots[run], values[:, run], axis=1)(place[inside])
         missing = np.isnan(H[0, :, 0, 0])
@@ -339,24 +330,23 @@ class HTF(eqx.Module):
             )
         periods = n // self.n_sections
         U = np.fft.fft(values, axis=0)
-        excited = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
-        lines, conjugate, rows = [], [], []
-        for k in excited:
-            for sign in (1, -1):
-                distance = np.abs(self._circle(np.asarray(self.f) - sign * k / periods))
-                if len(distance) and distance.min() < _SAME_FREQUENCY:
-                    lines.append(k)
-                    conjugate.append(sign < 0)
-                    rows.append(int(np.argmin(distance)))
-                    break
-            else:
-                raise DefinitionError(
-                    f"`u` holds the frequency f = {abs(self._circle(k / periods)):g} cycles per "
-                    "period, where the HTFs are not known."
-                )
-        lines, rows = np.array(lines, int), np.array(rows, int)
-        conjugate = np.array(conjugate, bool)[:, None, None]
-        H = jnp.where(conjugate, jnp.conj(self.H[np.array(mirror)][:, rows]), self.H[:, rows])
+        lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
+        # Each line or its mirror image is among the frequencies: axes of signs, lines, frequencies.
+        f = lines[:, None] / periods * np.array([1, -1])[:, None, None]
+        distance = np.abs(self._circle(np.asarray(self.f) - f))
+        measured = distance.min(axis=2, initial=np.inf) < _SAME_FREQUENCY
+        if not measured.any(axis=0).all():
+            lost = lines[~measured.any(axis=0)][0] / periods
+            raise DefinitionError(
+                f"`u` holds the frequency f = {abs(self._circle(lost)):g} cycles per period, where "
+                "the HTFs are not known."
+            )
+        rows = np.where(measured[0], *distance.argmin(axis=2))
+        H = jnp.where(
+            ~measured[0][:, None, None],
+            jnp.conj(self.H[np.array(mirror)][:, rows]),
+            self.H[:, rows],
+        )
         parts = jnp.einsum("mkij,kj->mki", H, U[lines])
         places = (lines + periods * np.array(self.harmonics)[:, None]) % n
         Y = jnp.zeros((n, len(self.outputs)), complex).at[places].add(parts)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._core.arguments import Numbers, names
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count, NewNames, NonNegative, PeriodCount, Vector
+from .._core.boundary.kinds import Count, NewNames, PeriodCount, Vector
 from .._core.boundary.values import Integers, Reals
 from .._core.executor import from_host, is_traced
 from .._core.html import card, facts, multiplier_table, unit_circle
@@ -265,15 +265,11 @@ class LDTP(eqx.Module):
         """
         return product_eigenvalues(self._blocks("multipliers"), _RANK_TOLERANCE)
 
-    def rank(self, section: int = 0, rtol: NonNegative = _RANK_TOLERANCE) -> int:
-        """Rank of the monodromy matrix at a section, from the ranks of the factors (host side).
-
-        **Arguments:** `rtol`: singular values of a factor below `rtol` times its largest one
-        count as zero.
-        """
+    def rank(self, section: int = 0) -> int:
+        """Rank of the monodromy matrix at a section, from the ranks of the factors (host side)."""
         blocks = self._blocks("rank")
         first = section % self.n_sections
-        return product_rank([*blocks[first:], *blocks[:first]], rtol)
+        return product_rank([*blocks[first:], *blocks[:first]], _RANK_TOLERANCE)
 
     def periodic_state(self, u: Signals, periods: PeriodCount) -> Float[Array, " d"]:
         r"""The state at section 0 from which the response to a repeated input is periodic.

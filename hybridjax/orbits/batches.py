@@ -22,19 +22,13 @@ from ..engine.target import toward, until
 from ..systems.system import HybridSystem
 from .coincidence import together
 from .crossing import AtEvent, to_section
-from .newton import excess, newton_steps
+from .newton import FEW_STEPS, USUAL_STEPS, excess, newton_steps
 from .return_map import ReturnMap, Turn
 
 
 # Periods for which a system is simulated before Newton's method tries again. Fewer: slow transients
 # remain. More: each failure takes longer.
 _SETTLE = 40
-# Newton steps before a system is given up, or tried again. Fewer: distant cycles are lost. More:
-# hopeless systems cost more.
-_NEWTON = 6
-# Newton steps before a system waits for those that need more steps than most. More: calls run for
-# few of their systems. Fewer: most systems wait.
-_USUAL = 3
 # Ridge of the least squares, relative to their trace: directions in which neighbors hardly differ
 # get no slope. Smaller: slopes from rounding. Larger: slopes are biased.
 _RIDGE = 1e-12
@@ -188,7 +182,9 @@ class Tiles(NamedTuple):
             if self.known is None:
                 call.done, rows = 0, order[: self.size]
                 with uncollected:  # the programs are compiled during this call
-                    out = self._settled(rows, self._newton(rows, *self._given(len(rows)), _NEWTON))
+                    out = self._settled(
+                        rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS)
+                    )
             else:
                 out = None
             while (done := 0 if out is None else len(out.result)) < S:
@@ -199,19 +195,19 @@ class Tiles(NamedTuple):
                 order[more] = rows
                 anchor, period, jacobian = neighbors(rows, out)
                 begin = self._first_step(rows, anchor, period, jacobian)
-                part = self._newton(rows, *begin, _USUAL)
+                part = self._newton(rows, *begin, USUAL_STEPS)
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None
         late = np.flatnonzero(out.excess > 1)
         if len(late):
             anchor, period = _pick((out.anchor, out.period), late)
-            part = self._newton(order[late], anchor, period, _NEWTON - _USUAL)
+            part = self._newton(order[late], anchor, period, FEW_STEPS - USUAL_STEPS)
             out = _replace(out, late, part._replace(steps=part.steps + out.steps[late]))
         failed = np.flatnonzero(out.result != Result.OK)
         if len(failed) and (self.known is not None or len(failed) < S):
             anchor, period, _ = neighbors(order[failed], out, moved=False)
-            part = self._newton(order[failed], anchor, period, _NEWTON)
+            part = self._newton(order[failed], anchor, period, FEW_STEPS)
             better = part.result == Result.OK
             part = part._replace(steps=part.steps + out.steps[failed])
             out = _replace(out, failed[better], _pick(part, better))
@@ -232,7 +228,7 @@ class Tiles(NamedTuple):
             return out
         failed, begin = failed[arrived], _pick(begin, arrived)
         anchor, period = begin
-        return _replace(out, failed, self._newton(rows[failed], anchor, period, _NEWTON))
+        return _replace(out, failed, self._newton(rows[failed], anchor, period, FEW_STEPS))
 
     def _by_neighbors(self, parameters, cycles: Known, wanted, moved: bool):
         """The cycle of the nearest system, `moved` as the cycles around it in the same chart

@@ -14,17 +14,12 @@ from ..errors import DefinitionError
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
-from .coincidence import coincident, events_of
+from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle
-from .return_map import LEGS, Turn
-from .scale import fastest, is_implicit, points
+from .return_map import Turn
+from .scale import STIFF, fastest, is_implicit, points
 
 
-# Relative difference up to which a schedule divides the clock's period, a function has the same
-# value at two times, and the gradient of a conserved quantity is a left eigenvector of the
-# monodromy. Smaller: rounding and errors of the flow are taken for differences. Larger: wrong
-# clocks, and quantities that are lost slowly, pass.
-_SAME = 1e-6
 # The part of a function's change over the states' sizes and the period, as its derivatives predict
 # it, that is no difference between two times. Smaller: rounding is. Larger: small errors of a
 # stated period pass.
@@ -32,9 +27,6 @@ _SAME_SLOPE = 1e-9
 # Times at which functions are compared, after that of each point, in parts of the period: fields
 # that jump with a clock do not jump there, and no shift is a multiple of another.
 _BASE, _LATER = 0.0729, np.array([0.1459, 0.3820, 0.6180, 1.4142])
-# A system is stiff if a mode decays to this power of e in one piece of a turn. Smaller: systems are
-# blamed that only move fast. Larger: stiff ones are not.
-_STIFF = 20.0
 
 
 def check_clock(s: Structure) -> None:
@@ -48,7 +40,7 @@ def check_clock(s: Structure) -> None:
             if given is None:
                 raise DefinitionError(_no_period(s, f"'{transition.name}' is scheduled"))
             ratio = period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < _SAME:
+            if not abs(ratio - round(min(ratio, 1e9))) < SAME:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise no turn is like the last one."
@@ -60,7 +52,7 @@ def check_clock(s: Structure) -> None:
             times[x.name] = (offset + every * np.arange(round(period / every))) % period
         for (name, first), (other, second) in itertools.combinations(times.items(), 2):
             apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
-            if np.min(np.abs(apart)) < _SAME * period:
+            if np.min(np.abs(apart)) < SAME * period:
                 raise DefinitionError(
                     f"'{name}' and '{other}' are scheduled for the same time in chart '{chart}': "
                     "write them as one event, or let one lead to a chart that the other leaves."
@@ -91,7 +83,7 @@ def check_times(
             values = function(first, states)
             size = np.concatenate([[time], sizes[a, :n]])[:, None]
             slope = np.sum(np.abs(values[:, 1 : 2 + n]) * size, axis=1)
-            same = _SAME * np.abs(values[:, 0]) + _SAME_SLOPE * slope
+            same = SAME * np.abs(values[:, 0]) + _SAME_SLOPE * slope
             for shift in later:
                 if np.any(np.abs(function(first + shift, states)[:, 0] - values[:, 0]) > same):
                     if period is None:
@@ -155,7 +147,7 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     rows = kernels.outputs(s, a, items, t, cycle.anchor.q[:n], np.zeros((s.nu, 1)))[..., 0]
     values, gradients = rows[:, 0], rows[:, 2 : 2 + n]
     changes = np.abs((gradients @ returned - gradients) * sizes).max(axis=1)
-    kept = changes <= _SAME * np.abs(gradients * sizes).max(axis=1)
+    kept = changes <= SAME * np.abs(gradients * sizes).max(axis=1)
     return {name: float(x) for name, x, same in zip(names, values, kept, strict=True) if same}
 
 
@@ -210,7 +202,7 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
         return ""
     explicit = (x for x in points(s, lanes) if not is_implicit(s, x[0]))
     rate = max((float(fastest(s, *x).max()) for x in explicit), default=0.0)
-    if rate * expected / LEGS < _STIFF:
+    if rate * expected < STIFF:
         return ""
     return (
         f" The system is stiff: a mode decays in a time of {1 / rate:.2g}, in a period of "

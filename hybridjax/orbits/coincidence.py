@@ -7,42 +7,35 @@ piecewise-differentiable flows, SIAM J. Applied Dynamical Systems 15, 2016). If 
 for events that are independent of each other, it is differentiable.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
-from .._core.compilation import at_ease, host_first
+from .._core.compilation import host_first
 from .._core.executor import to_host
-from .._core.results import Result
 from ..engine import kernels
-from ..engine.chain import chain
-from ..engine.lanes import start_lanes
-from ..engine.move import record
-from ..engine.target import toward, until
+from ..engine.target import until
 from ..errors import ComputationError
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .crossing import AtEvent
 from .cycle import LimitCycle
-from .return_map import LEGS, ReturnMap, Turn
+from .return_map import ReturnMap, Turn
 
 
 # Events coincide if no more than this part of the period lies between them; a guard is due, in
 # another order, if it would be at zero within ten times as much. Smaller: rounding separates events
 # that coincide. Larger: events that are merely close are reported.
 TOGETHER = 1e-9
-# Orders commute if states after them, and derivatives, differ by less than this, in sizes of the
-# states. Smaller: errors of the flow count as differences. Larger: small differences pass.
-_COMMUTE = 1e-6
-# A turn is integrated up to this part of the period before the events, and continued by the field
-# there, with an error that is its cube. Larger: that error shows. Smaller: events are reached.
-_SHORT = 1e-5
+# Two results of the flow are the same up to this relative difference: states and derivatives after
+# events in two orders, functions at two times, the period and the durations between sections.
+# Smaller: errors of the flow count as differences. Larger: small differences pass.
+SAME = 1e-6
 
 
 class Coincidence(NamedTuple):
@@ -57,11 +50,6 @@ class Coincidence(NamedTuple):
     cycle that reach the events in this order."""
     commute: bool
     """Whether all orders lead to the same state, with the same derivative."""
-    multipliers: tuple[Complex[np.ndarray, " r"], ...]
-    """For each order, the multipliers that the cycle would have if all its neighbors reached the
-    events in this order, by decreasing modulus; none if the order leads to another state than the
-    cycle's. (Neighbors may change from one order to the other, so that these multipliers need not
-    decide whether a cycle is stable.)"""
 
 
 class _Order(NamedTuple):
@@ -85,7 +73,7 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     times = path.t[at]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
     for first, after in itertools.pairwise([*starts, len(at)]):
-        t, k, end = float(times[first]), at[first], at[after - 1]
+        t, k = float(times[first]), at[first]
         if not TOGETHER * period < t - path.t[0] <= (1 + TOGETHER) * period:
             continue
         group = path.event[at[first:after]].tolist()
@@ -95,11 +83,10 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
             n = s.dims[a]
             before = _Order((), a, path.before[k, :n], np.eye(n))
             orders = list(_orders(s, t, before, len(events), 10 * TOGETHER * period))
-            values = tuple(_multipliers(cycle, t, a, orders, int(path.chart[end]), path.after[end]))
             names = tuple(tuple(s.transitions[g].name for g in x.events) for x in orders)
             commute = _commute(np.asarray(cycle.settings.scale), a, orders)
             derivatives = tuple(x.derivative for x in orders)
-            groups.append(Coincidence(t, names, derivatives, commute, values))
+            groups.append(Coincidence(t, names, derivatives, commute))
     return groups
 
 
@@ -179,38 +166,9 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
             return False
         apart = np.abs(order.state - first.state) / after
         tilted = np.abs(order.derivative - first.derivative) * scale[a, :n] / after[:, None]
-        if not max(apart.max(), tilted.max()) < _COMMUTE:
+        if not max(apart.max(), tilted.max()) < SAME:
             return False
     return True
-
-
-def _multipliers(cycle, t, a, orders, chart: int, state) -> Iterator[np.ndarray]:
-    """The multipliers of each order; the cycle continues from this chart and state."""
-    s, period = cycle.structure, float(cycle.period)
-    n, m, u = s.dims[a], s.dims[chart], np.zeros((s.nu, 1))
-    # (Steps of an explicit method end shortly before the events.)
-    short, last = _SHORT * period, t + (1 - _SHORT) * period
-    lanes = start_lanes(s, np.array([t]), np.array([chart], np.int32), state[:, None])
-    target = toward(np.array([last]), -1, np.array([t + 2 * period]))
-    settings = dataclasses.replace(cycle.settings, max_steps=LEGS * cycle.settings.max_steps)
-    with at_ease():
-        moved, tape = record(s, lanes, u, target, settings, tangents=True)
-        assert tape is not None
-        around, _ = chain(s, lanes, target, tape, of_states=True)
-    before = moved.lanes.q[:n]
-    field = kernels.field(s, a, np.array([last]), before, u)[:, 2 : 2 + n, 0]
-    onward = np.eye(n) + short * field + short**2 / 2 * field @ field
-    size = np.asarray(cycle.settings.scale)[chart, :m]
-    for order in orders:
-        same = order.chart == chart and np.max(np.abs(order.state - state[:m]) / size) < _COMMUTE
-        if not same or moved.result[0] != Result.OK or moved.lanes.chart[0] != a:
-            yield np.zeros(0, complex)
-            continue
-        turn = onward @ around[0, 1 : 1 + n, :m] @ order.derivative
-        values = np.linalg.eigvals(turn).astype(complex)
-        if not cycle.clocked:  # less that of the flow's own direction
-            values = np.delete(values, np.argmin(np.abs(values - 1)))
-        yield values[np.argsort(-np.abs(values), kind="stable")]
 
 
 def _orders(s: Structure, t: float, before: _Order, left: int, due: float) -> Iterator[_Order]:

@@ -22,23 +22,19 @@ from ..errors import DefinitionError
 from .batches import front
 from .branch import KINDS, Branch, BranchEnd, BranchPoint
 from .coincidence import coincident
-from .curve import Curve, Failure, Point
+from .curve import Curve, Point
 from .cycle import LimitCycle
 from .limit_cycles import LimitCycles, without_coincidences
+from .newton import USUAL_STEPS
+from .return_map import SINGULAR
 
 
 # A step is halved if the tangent turns by more than the angle of this cosine. Nearer to 1: more
 # points than a plot needs. Smaller: the branch jumps over turns.
 _STRAIGHT = 0.97
-# The next step is longer if Newton's method needs at most this many. More: steps grow until they
-# fail. Fewer: they stay short.
-_QUICK = 3
 # Parts of a step by which a test function is evaluated beside a point where Newton's method fails,
 # as it does at a crossing of two branches.
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
-# Test functions below this are rounding errors. Smaller: rounding marks points. Larger: points
-# close to a degenerate one are not marked.
-_ROUNDING = 1e-7
 # The first and the shortest step, relative to the longest. A longer first step loses the branch; a
 # longer shortest one ends it far from a grazing, a shorter one takes time.
 _FIRST, _SHORTEST = 0.2, 1e-5
@@ -92,10 +88,10 @@ def continuation(
             f"{values[-1]:.6g}: begin within them."
         )
     first = curve.first(value)
-    if isinstance(first, Failure):
+    if isinstance(first, Result):
         raise DefinitionError(
             f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
-            f"{value:.6g}: {first.result.message}. Find it anew."
+            f"{value:.6g}: {first.message}. Find it anew."
         )
     trace = _Trace(curve, np.sort(values), step, max_points)
     sense = np.sign(values[-1] - values[0])
@@ -162,17 +158,17 @@ class _Trace(NamedTuple):
                 over = True
                 point = self.curve.land(last, point, np.clip(point.value, low, high))
             if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
-                point = Failure(Result.NOT_CONVERGED)
-            if isinstance(point, Failure):
+                point = Result.NOT_CONVERGED
+            if isinstance(point, Result):
                 length /= 2
                 if length >= _SHORTEST * self.step:
                     continue
-                if point.result in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
+                if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
                     moved = self.curve.elsewhere(last)
                     if moved is not None:
                         points[-1], length = moved, _FIRST * self.step
                         continue
-                return points, marks, BranchEnd(last.value, point.result, point.result.message)
+                return points, marks, BranchEnd(last.value, point, point.message)
             for event in self.events(last, point):
                 if event.kind:
                     marks.append((len(points), event.kind))
@@ -180,7 +176,7 @@ class _Trace(NamedTuple):
             points.append(point)
             if over:
                 return points, marks, BranchEnd(point.value, Result.OK, "the values end")
-            length = min(self.step, length * (1.5 if point.steps <= _QUICK else 1.0))
+            length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
         message = f"{self.max_points} cycles; `max_points` raises it"
         return points, marks, BranchEnd(points[-1].value, Result.STEP_LIMIT, message)
 
@@ -189,7 +185,7 @@ class _Trace(NamedTuple):
         marked = []
         for kind in KINDS:
             before, after = a.tests[kind], b.tests[kind]
-            if max(abs(before), abs(after)) < _ROUNDING or before * after >= 0:
+            if max(abs(before), abs(after)) < SINGULAR or before * after >= 0:
                 continue
             if kind == "branch point" and a.tests["fold"] * b.tests["fold"] < 0:
                 continue  # the parameter turns back

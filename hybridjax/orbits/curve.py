@@ -18,33 +18,20 @@ from ..engine.lanes import Lanes
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem
 from .cycle import LimitCycle
-from .newton import newton_steps
+from .newton import FEW_STEPS, newton_steps
 from .return_map import ReturnMap, Turn, turn_product
 
 
-# Newton steps before a point is given up. Fewer: long steps along the branch fail. More: hopeless
-# points last longer.
-_MOST = 8
 # Newton's method ends with a step this small, in sizes of the states; from the second number on,
 # rounding errors may be all that is left. Smaller: it does not end. Larger: points are less
 # accurate.
 _SMALL, _ROUNDING = 1e-11, 1e-8
-# Singular values of Newton's equations below this part of the largest are zero. Larger: points near
-# a crossing of branches fail. Smaller: rounding is divided by.
-_SINGULAR = 1e-14
 # States that hardly move on the cycle count as if they moved by these parts of the largest move and
 # of their own size. Smaller: they shorten the steps. Larger: steps are longer than the orbit.
 _FLOOR, _SHARE = 1e-3, 0.02
 # Nothing moves if the largest move is at most this part of the largest state, all in sizes.
 # Smaller: an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e-6
-
-
-@dataclasses.dataclass
-class Failure:
-    """The reason for a point that was not found."""
-
-    result: Result
 
 
 @dataclasses.dataclass
@@ -134,38 +121,38 @@ class Curve:
     def system_at(self, value: float) -> HybridSystem:
         return _with(self.cycle.system, self.parameter, value)
 
-    def first(self, value: float) -> Point | Failure:
+    def first(self, value: float) -> Point | Result:
         """The cycle itself."""
         z = np.append(np.asarray(self.cycle.anchor.q[:, 0]), value)
         row = np.append(np.zeros(self.structure.d), 1.0)
         size = np.append(np.asarray(self.map.sizes), self.span)
         return self._correct(z, row / size, size, row, self.cycle.anchor)
 
-    def step(self, last: Point, length: float) -> Point | Failure:
+    def step(self, last: Point, length: float) -> Point | Result:
         """The next point, about `length` further along the tangent."""
         ahead = length * last.tangent * last.size
         point = self._correct(
             last.z + ahead, last.tangent / last.size, last.size, last.tangent, last.anchor
         )
-        if isinstance(point, Failure):
+        if isinstance(point, Result):
             return point
         astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
-        return point if astray <= 0.5 * length else Failure(Result.NOT_CONVERGED)
+        return point if astray <= 0.5 * length else Result.NOT_CONVERGED
 
-    def between(self, a: Point, b: Point, where: float) -> Point | Failure:
+    def between(self, a: Point, b: Point, where: float) -> Point | Result:
         """The point over a place on the chord from a to b."""
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
         return self._correct(a.z + where * (b.z - a.z), row, a.size, chord, a.anchor)
 
-    def land(self, a: Point, b: Point, value: float) -> Point | Failure:
+    def land(self, a: Point, b: Point, value: float) -> Point | Result:
         """The point between a and b where the parameter has a value."""
         where = (value - a.value) / (b.value - a.value)
         z = a.z + where * (b.z - a.z)
         z[-1] = value
         row = np.append(np.zeros(len(z) - 1), 1 / a.size[-1])
         point = self._correct(z, row, a.size, (b.z - a.z) / a.size, a.anchor)
-        if not isinstance(point, Failure):
+        if not isinstance(point, Result):
             point.z[-1] = value
         return point
 
@@ -189,20 +176,20 @@ class Curve:
         forward = row * np.sign(point.tangent[-1])
         z = np.append(legs.q[:, k], point.value)
         moved = self._correct(z, row / point.size, point.size, forward, anchor)
-        return None if k == 0 or isinstance(moved, Failure) else moved
+        return None if k == 0 or isinstance(moved, Result) else moved
 
-    def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Failure:
+    def _correct(self, z0, row, size, forward, anchor: Lanes) -> Point | Result:
         """Newton's method for a point with row @ (z - z0) = 0."""
-        z, last = z0.copy(), np.inf
-        for k in range(_MOST):
+        z, last, rounding = z0.copy(), np.inf, len(z0) * np.finfo(float).eps
+        for k in range(FEW_STEPS):
             departure, turn = self._turn(z, anchor)
             if (failure := self._failure(turn)) is not None:
                 return failure
             equations = np.vstack([_scaled(turn, size), row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
-            (change,) = newton_steps(equations[None], residual[None], _SINGULAR)
+            (change,) = newton_steps(equations[None], residual[None], rounding)
             if not np.all(np.isfinite(change)):
-                return Failure(Result.NOT_CONVERGED)
+                return Result.NOT_CONVERGED
             length = np.linalg.norm(change)
             if length <= _SMALL or (length <= _ROUNDING and length >= 0.5 * last):
                 dim = self.structure.dims[int(anchor.chart[0])]
@@ -210,29 +197,29 @@ class Curve:
             if length > 2 * last:
                 break
             z, last = z + change * size, length
-        return Failure(Result.NOT_CONVERGED)
+        return Result.NOT_CONVERGED
 
     def _turn(self, z, anchor: Lanes) -> tuple[Lanes, Turn]:
         map = dataclasses.replace(self.map, anchor=anchor)
         out = _turn_along(map, self.system_at(z[-1]), self.direction, jnp.asarray(z[:-1]))
         return jax.tree_util.tree_map(np.asarray, out)
 
-    def _failure(self, turn: Turn) -> Failure | None:
+    def _failure(self, turn: Turn) -> Result | None:
         if int(turn.result) != Result.OK:
-            return Failure(Result(int(turn.result)))
+            return Result(int(turn.result))
         sequence = _rotated(int(g) for g in np.ravel(turn.codes) if g >= 0)
         if sorted(sequence) != sorted(self.sequence):
-            return Failure(Result.GRAZING)  # events come and go where a guard is touched
+            return Result.GRAZING  # events come and go where a guard is touched
         if sequence != self.sequence or not np.all(np.isfinite(turn.residual)):
-            return Failure(Result.EVENT_ORDER)
+            return Result.EVENT_ORDER
         return None
 
-    def _settled(self, point: Point) -> Point | Failure:
+    def _settled(self, point: Point) -> Point | Result:
         """The point with sizes and a tangent of its own."""
         moves, largest = self._extent(point)
         still = np.max(moves) <= _REST * np.max(largest)
         if still and self.map.base is not None:
-            return Failure(Result.EQUILIBRIUM)
+            return Result.EQUILIBRIUM
         floor = np.maximum(_FLOOR * np.max(moves), _SHARE * largest)
         moves = np.ones_like(moves) if still else np.maximum(moves, floor)
         sizes = self._sizes(point)

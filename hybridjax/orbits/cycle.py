@@ -23,16 +23,10 @@ from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .crossing import AtEvent, Crossing
 from .return_map import ReturnMap
-from .scale import has_implicit, sizes_of, stiff_charts
-from .small_multipliers import fine_factors, log_determinant, weakest
+from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
+from .small_multipliers import WEAKEST, fine_factors, log_determinant, weakest
 
 
-# Singular values of a factor, in sizes of the states, below this part of its largest one count as
-# zero. Smaller: rounding is taken for multipliers. Larger: weak multipliers are taken for zeros.
-_RANK = 1e-9
-# A piece of the turn contracts too much if its weakest direction keeps less than this. Smaller:
-# small multipliers lose digits. Larger: one more turn is computed for cycles that do not need it.
-_CONTRACTS = 1e-6
 # Multipliers below this are lost in the errors of implicit steps. Smaller: errors are taken for
 # multipliers. Larger: multipliers that are accurate are given as 0.
 _LEAST_OF_IMPLICIT = 1e-10
@@ -126,10 +120,10 @@ class LimitCycle(eqx.Module):
         # (The weakest direction of an autonomous flow is its own, which was projected out.)
         weaker = 0 if self.clocked else 1
         strong = np.isfinite(self.residual)
-        strong = strong and min(weakest(block, weaker) for block in blocks) < _CONTRACTS
+        strong = strong and min(weakest(block, weaker) for block in blocks) < WEAKEST
         if strong:
             blocks = fine_factors(self.return_map)
-        values = product_eigenvalues(blocks, rtol=_RANK)
+        values = product_eigenvalues(blocks, rtol=ROUNDING)
         if strong and has_implicit(self.structure):
             lost = np.abs(values) < _LEAST_OF_IMPLICIT
             values = np.where(lost, 0.0, values)

@@ -24,13 +24,10 @@ from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle
 from .guess import return_map_near
 from .newton import Solution, search, solve
-from .return_map import ReturnMap
+from .return_map import PATIENCE, ReturnMap
 from .scale import Sizes, given_sizes, has_implicit, scale_of, sizes_of, sizes_on, stiff_charts
 
 
-# Least bound on the steps of a piece of a turn with an implicit method. Smaller: a fast jump, such
-# as that of van der Pol's oscillator at mu = 1000, reaches it. Larger: vain searches last longer.
-_JUMP = 1024
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
@@ -106,14 +103,10 @@ def find_limit_cycle(
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        options = dict(
-            section=section,
-            multiplicity=multiplicity,
-            conserved=conserved,
-            scale=scale,
-            throw=throw,
-        )
-        return _find_with_auto(system, guess, settle, max_period, settings, options)
+        again = dict(section=section, multiplicity=multiplicity, conserved=conserved, scale=scale)
+        again |= dict(settings=dataclasses.replace(settings, solver=None), throw=throw)
+        first = dict(settle=settle, max_period=max_period)
+        return _find_with_auto(system, guess, first, again)
     system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
@@ -122,7 +115,7 @@ def find_limit_cycle(
     s = Structure(system)
     settings = settings.filled(LIMIT_CYCLE)
     if has_implicit(s):
-        settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, _JUMP))
+        settings = dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
     given = {} if settings.scale is None else sizes_of(s, settings.scale)
     given |= given_sizes(s, scale)
     if section is not None:
@@ -175,30 +168,24 @@ def find_limit_cycle(
     return cycle
 
 
-def _find_with_auto(system, guess, settle, max_period, settings, options) -> LimitCycle:
-    """The cycle with an implicit method in those charts that are stiff on it."""
-    settings = dataclasses.replace(settings, solver=None)
-    cycle = find_limit_cycle(
-        integrated(system, Radau()), guess, settle=settle, max_period=max_period,
-        settings=settings, **options,
-    )  # fmt: skip
+def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
+    """Return the cycle with an implicit method in those charts that are stiff on it. `first` holds
+    the options of the first search only."""
+    cycle = find_limit_cycle(integrated(system, Radau()), guess, **first, **options)
     explicit = dataclasses.replace(cycle, system=integrated(system, None))
     stiff = stiff_charts(explicit.structure, to_host(cycle.legs), float(cycle.period))
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
-    return find_limit_cycle(fitting, cycle, settings=settings, **options)
+    return find_limit_cycle(fitting, cycle, **options)
 
 
 def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
     if not solution.is_fixed_point:
         return map, solution
-    s, period, rough = (
-        map.structure,
-        solution.turn.period,
-        sizes_of(map.structure, map.scale),
-    )
+    s, period = map.structure, solution.turn.period
+    rough = sizes_of(s, map.scale)
     sizes = sizes_on(s, solution.turn.legs, float(period))
     sizes = {k: x if x > _VANISHING * rough[k] else rough[k] for k, x in sizes.items()} | given
     fine = dataclasses.replace(

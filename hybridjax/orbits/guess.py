@@ -1,7 +1,6 @@
 """The beginning of a search for a limit cycle: from a guess to a state on the section."""
 
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -25,7 +24,7 @@ from ..systems.system import Guess
 from .checks import check_times
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap
-from .scale import Sizes, scale_of, sizes_near, slow_time, stiff_mode
+from .scale import Sizes, scale_of, sizes_near, slow_time
 
 
 # A guess lies on the section if it would reach it within this part of the time scale of the states.
@@ -138,20 +137,16 @@ def _on_section(
         advice = f"Choose a section that each turn crosses once, e.g. `section={example}`. "
     map = dataclasses.replace(map, base=section)
 
-    def if_late() -> str:
-        rate = stiff_mode(s, a, float(np.asarray(map.anchor.t)[0]), q)
-        return f"Allow more time than {wait:.3g}, by `max_period`. " + (
-            f"The system is stiff: a mode decays in a time of {1 / rate:.2g}; "
-            '`settings=Settings(solver="auto")` waits for the slow ones. '
-            if rate
-            else ""
-        )
+    late = (
+        f"Allow more time than {wait:.3g}, by `max_period`, or for the slow modes of a stiff "
+        'system, take `settings=Settings(solver="auto")`. '
+    )
 
     def next_crossing(lanes, doing):
         say(doing)
         target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
         target = to_section(target, section, map.event)
-        return _go(map, f"{doing} ({place})", lanes, target, advice, if_late)
+        return _go(map, f"{doing} ({place})", lanes, target, advice, late)
 
     if not on_section:
         lanes = next_crossing(lanes, "looking for the section")
@@ -175,7 +170,7 @@ def _go(
     lanes: Lanes,
     target: Target,
     advice: str = "",
-    if_late: Callable[[], str] = str,
+    if_late: str = "",
 ) -> Lanes:
     """The lane at a target, however many steps it takes.
 
@@ -185,7 +180,7 @@ def _go(
     result = Result(int(np.asarray(moved.result)[0]))
     if result != Result.OK:
         lanes, s = to_host(moved.lanes), map.structure
-        advice += if_late() if result == Result.SECTION_MISSED else ""
+        advice += if_late if result == Result.SECTION_MISSED else ""
         raise ComputationError(
             f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
             f"'{s.names[int(lanes.chart[0])]}': {result.message}. {advice}Check the guess and "

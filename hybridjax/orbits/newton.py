@@ -23,6 +23,13 @@ from .return_map import SINGULAR, ReturnMap, Turn
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
 # Larger: it ends one step too early. Smaller: rounding keeps it from ending.
 _ATOL, _RTOL = 1e-12, 1e-11
+# Steps that a good guess needs: a continuation then takes longer steps, and a system of a sweep
+# that needs more waits for others. More: a continuation steps too far, and calls of a sweep run for
+# few of their systems. Fewer: steps stay short, and most systems wait.
+USUAL_STEPS = 3
+# Steps before a point of a branch, or a system of a sweep, is given up. Fewer: distant cycles are
+# lost. More: hopeless ones cost more.
+FEW_STEPS = 8
 # Steps before a cycle is given up. Fewer: cycles far from the guess are lost. More: hopeless
 # searches last longer.
 MAX_STEPS = 32

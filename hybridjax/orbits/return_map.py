@@ -36,6 +36,10 @@ from .crossing import AtEvent, Crossing, to_section
 # Pieces of one turn. Fewer: strong contraction drowns in the product of the steps of a piece. More:
 # programs run longer.
 LEGS = 16
+# Least bound on the steps of a piece of a turn with an implicit method, and of the flow from one
+# section to the next. Smaller: a fast jump, as of van der Pol's oscillator at mu = 1000, or many
+# events reach it. Larger: vain searches last longer.
+PATIENCE = 1024
 # The part of the last period up to which an autonomous system flows freely, then to the section.
 # Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
 _FREE = 0.75

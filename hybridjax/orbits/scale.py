@@ -35,19 +35,17 @@ _MODES = 20.0
 # Shifts of states and of times by which rounding errors of the field show, in their rounding
 # errors: odd ones and even ones, of several sizes, since equal ones may cancel.
 _SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
-# Rounding errors of time, as in a phase omega * t, that are not errors of the field. Smaller: they
-# are counted twice. Larger: errors of the field are missed.
-_TIME_ROUNDING = 2.0
 # Phases of the clock at which rounding errors of the field are evaluated at a guess: an odd number,
 # since an even one may repeat a symmetry.
 _PHASES = 7
 # A chart is stiff if its fastest mode decays to more than this power of e in one turn. Smaller: an
 # implicit method is used where an explicit one is faster. Larger: explicit methods take thousands
 # of steps.
-_STIFF = 1000.0
-# Modes that are slower than the fastest one by more than this stand still, up to rounding. Larger:
-# slow modes are taken for constants. Smaller: rounding errors are taken for modes.
-_ROUNDING = 1e-9
+STIFF = 1000.0
+# Rates of modes, and singular values of a factor in sizes of the states, below this part of the
+# largest are zero. Larger: slow modes and small multipliers are lost. Smaller: rounding errors are
+# taken for modes and multipliers.
+ROUNDING = 1e-9
 
 
 class GuessSizes(NamedTuple):
@@ -131,7 +129,7 @@ def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
     stiff, step = {}, period / len(np.ravel(legs.t))
     for a, t, q in points(s, legs):
         rates = fastest(s, a, t, q)
-        if step * rates.sum() > _STIFF and not is_implicit(s, a):
+        if step * rates.sum() > STIFF and not is_implicit(s, a):
             stiff[s.names[a]] = float(rates.max())
     return stiff
 
@@ -164,15 +162,9 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     for a, state in enumerate(states):
         q = state[: s.dims[a]]
         if is_implicit(s, a) and np.isfinite(q).all():
-            times.append(1 / _slowest_and_fastest(s, a, t, q)[0])
+            rates = np.abs(_modes(s, a, np.array([t]), q[:, None])[0])
+            times.append(1 / rates[rates > ROUNDING * rates.max()].min(initial=np.inf))
     return max(times)
-
-
-def stiff_mode(s: Structure, a: int, t: float, q: Float[np.ndarray, " n"]) -> float | None:
-    """The rate of the fastest mode of a chart with an explicit method, if the slowest one is slower
-    by far."""
-    slow, fast = _slowest_and_fastest(s, a, t, q)
-    return fast if fast > _STIFF * slow > 0 and not is_implicit(s, a) else None
 
 
 def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
@@ -188,13 +180,6 @@ def _modes(s: Structure, a: int, t, q) -> np.ndarray:
     """Eigenvalues of the field's derivative at points of chart a."""
     derivative = kernels.field(s, a, t, q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q)]
     return np.linalg.eigvals(np.moveaxis(derivative, -1, 0))
-
-
-def _slowest_and_fastest(s: Structure, a: int, t: float, q) -> tuple[float, float]:
-    """Rates of the modes at a state, without those that stand still."""
-    rates = np.abs(_modes(s, a, np.array([t]), q[:, None])[0])
-    moving = rates[rates > _ROUNDING * rates.max()]
-    return float(moving.min(initial=np.inf)), float(moving.max(initial=0.0))
 
 
 class _Fields(NamedTuple):
@@ -235,7 +220,8 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     smooth = np.einsum("ijk,jks->iks", derivative, moved - q[..., None])
     smooth = smooth + by_time * (later - t[:, None])
     off = np.abs(values - f[..., None] - smooth)
-    off[..., len(_SHIFTS) + 1 :] -= _TIME_ROUNDING * eps * np.abs(by_time * t[:, None])
+    # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
+    off[..., len(_SHIFTS) + 1 :] -= 2 * eps * np.abs(by_time * t[:, None])
     return _Fields(f, change, derivative, np.max(off, axis=-1))  # without a shift it is zero
 
 

@@ -15,9 +15,10 @@ from .return_map import ReturnMap
 
 Matrix = Float[np.ndarray, "_ _"]
 
-# Steps of the flow are multiplied as long as their product keeps this part of its weakest
-# direction. Larger: more factors. Smaller: small multipliers lose digits.
-_WEAKEST = 1e-4
+# A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
+# this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
+# more cycles. Smaller: small multipliers lose digits.
+WEAKEST = 1e-5
 
 
 def fine_factors(map: ReturnMap) -> list[Matrix]:
@@ -34,7 +35,7 @@ def fine_factors(map: ReturnMap) -> list[Matrix]:
         out, into = frames[(k + 1) % len(moves)], frames[k]
         factor = out[0] @ move.jacobian @ into[1]
         merged = factor @ factors[-1] if factors else factor
-        if factors and weakest(merged) > _WEAKEST:
+        if factors and weakest(merged) > WEAKEST:
             factors[-1] = merged
         else:
             factors.append(factor)

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from .._core.boundary.checked import checked
@@ -142,7 +140,12 @@ def strides(
             several = [given] if isinstance(given, Study) else list(given)
             color = CYCLE[k % len(CYCLE)]
             for number, one in enumerate(several):
-                reached += _steps(panel, one, label if number == 0 else None, color)
+                if not one.blocks:
+                    raise DefinitionError("a study without a block has no errors: `add` data.")
+                error = np.linalg.norm(one.standard_errors, axis=1)
+                style = dict(label=label if number == 0 else None, color=color, zorder=2)
+                panel.plot(one.strides, error, marker="o", ms=3, lw=0.6, **style)
+                reached += one.strides.tolist()
         around = 1.5 if studies else 10.0
         low, high = min(reached) / around, max(reached) * around
         for errors, cycles, color, label in (
@@ -160,12 +163,3 @@ def strides(
             axis.set_minor_formatter(NullFormatter())
         panel.legend()
     return Plot(axes)
-
-
-def _steps(panel: Axes, study: Study, label: str | None, color: str) -> list[float]:
-    """A study, block by block, and where its strides are."""
-    if not study.blocks:
-        raise DefinitionError("a study without a block has nothing to show: `add` data first.")
-    size: Float[np.ndarray, " B"] = np.linalg.norm(study.standard_errors, axis=1)
-    panel.plot(study.strides, size, marker="o", ms=3, lw=0.6, color=color, label=label, zorder=2)
-    return study.strides.tolist()

@@ -131,8 +131,7 @@ def bode(
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         _bode(axes[:, 0], htfs, fits, harmonic, outputs, input, labels)
-        if ax is None:
-            axes[0, 0].set_xlabel("")
+        axes[0, 0].set_xlabel("")
     return Plot(axes)
 
 

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index
 from ..engine import kernels
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
@@ -18,8 +17,8 @@ from .look import COLORS, AxesLike, Plot, axis_of, panels
 
 
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
-# Half of a section's bar, and from its end to its number, as parts of the width of the picture.
-_BAR, _ROOM = 0.035, 0.03
+# Half of a section's bar, and the distance from its end to its number, in widths of the picture.
+_BAR = 0.035
 _NUMBER = {
     "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
     "path_effects": [withStroke(linewidth=2, foreground="white")],
@@ -36,7 +35,6 @@ def cycle(
     sections: PlacedSections | None = None,
     perturbed: Trajectory | None = None,
     labels: Mapping[str, str] | None = None,
-    numbers: Index | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The limit cycle in the plane of two states or outputs, colored by chart.
@@ -48,9 +46,7 @@ def cycle(
     **Arguments:**
 
     - `x`, `y`: names of states or outputs; by default the first two states that every chart has.
-    - `sections`: from `place_sections`, drawn as bars and numbered.
-    - `numbers`: number every so manyth section (0: none); by default about 8 of them, where there
-      is room beside the orbit.
+    - `sections`: from `place_sections`, drawn as bars; about 8 are numbered, where there is room.
     - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
     - `labels`: texts for the axes by name, e.g. `{"yM": "$y_M$"}`; units are added.
     - `ax`: where to draw; a new figure of one column's width by default.
@@ -84,8 +80,7 @@ def cycle(
         panel.margins(0.08)
         panel.locator_params(axis="x", nbins=6)
         if sections is not None:
-            step = max(1, round(sections.n_sections / 8)) if numbers is None else numbers
-            _sections(panel, s, sections, (x, y), np.stack([px, py], axis=1), step)
+            _sections(panel, s, sections, (x, y), np.stack([px, py], axis=1))
         if perturbed is not None:
             panel.plot([], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed")
         panel.set_xlabel(axis_of(x, labels))
@@ -172,17 +167,17 @@ def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
     )  # fmt: skip
 
 
-def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit, step: int) -> None:
+def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> None:
     width, height = ax.get_position().size * ax.get_figure(root=True).get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
-    bars = []
+    bars, step = [], max(1, round(placed.n_sections / 8))
     for i, (here, along) in enumerate(_meetings(s, placed, names, unit)):
         bars.append(np.stack([here - _BAR * along, here + _BAR * along]))
-        if step and i % step == 0:
-            beside = np.stack([here + side * (_BAR + _ROOM) * along for side in (-1, 1)]) / unit
+        if i % step == 0:
+            beside = np.stack([here + 2 * side * _BAR * along for side in (-1, 1)]) / unit
             room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
-            if room.max() > _ROOM:
+            if room.max() > _BAR:
                 at = beside[np.argmax(room)]
                 ax.text(*(unit * at), str(i), **_NUMBER)
                 taken = np.concatenate([taken, at[None]])

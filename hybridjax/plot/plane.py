@@ -27,7 +27,6 @@ from .look import (
 
 
 _MARKERS = "osD^vP*X"
-_RATIO = 2.4  # width of a panel of poles_zeros, in heights
 
 
 @checked
@@ -81,7 +80,7 @@ def multipliers(
                 box.plot(
                     z.real, z.imag, _MARKERS[k % len(_MARKERS)], mfc="none", ms=5, mew=1.0, ls="",
                     color=CYCLE[k % len(CYCLE)],
-                    label=rf"{label}: $|\Delta\lambda|$ = {_power(error)}",
+                    label=rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
                 )  # fmt: skip
                 for border in borders.get(label, ()):
                     box.plot(border.real, border.imag, lw=0.7, color=CYCLE[k % len(CYCLE)])
@@ -129,9 +128,7 @@ def poles_zeros(
             poles = np.concatenate([fit.poles[i] for fit in fits.values()])
             zeros = np.concatenate([fit.zeros[i] for fit in fits.values()])
             _limits(lower, *_near(poles, zeros[np.isfinite(zeros)]))
-            everything = np.concatenate([poles, zeros[np.isfinite(zeros)], [1, -1, 1j, -1j]])
-            _equal_limits(upper, everything, _RATIO)
-            lower.set_box_aspect(1 / _RATIO)
+            upper.set_aspect("equal", adjustable="datalim")
             (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
             upper.set_title(label_of(output, labels))
@@ -147,13 +144,11 @@ def poles_zeros(
 
 
 def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Real and imaginary parts of the poles, the zeros close to them, and the unit circle there."""
+    """Return the real and imaginary parts of the poles and of the zeros close to them."""
     center = poles.real.mean()
     reach = np.abs(poles - center).max()
     points = np.concatenate([poles, poles.conj(), zeros[np.abs(zeros - center) <= 2 * reach]])
-    edge = poles.real[np.argmax(np.abs(poles))]
-    circle = [np.sign(edge)] if abs(abs(edge) - 1) <= reach else []
-    return np.concatenate([points.real, circle]), points.imag
+    return points.real, points.imag
 
 
 def _values(source: Any) -> np.ndarray:
@@ -226,19 +221,3 @@ def _limits(ax: Axes, x: np.ndarray, y: np.ndarray) -> None:
     for setter, values in ((ax.set_xlim, x), (ax.set_ylim, y)):
         margin = 0.15 * (np.ptp(values) or 1.0)
         setter(values.min() - margin, values.max() + margin)
-
-
-def _equal_limits(ax: Axes, z: np.ndarray, ratio: float) -> None:
-    """Limits around z, with one scale on both axes, `ratio` times as wide as high."""
-    width = 1.2 * max(np.ptp(z.real), ratio * np.ptp(z.imag))
-    for setter, values, part in ((ax.set_xlim, z.real, 1), (ax.set_ylim, z.imag, 1 / ratio)):
-        middle, half = (values.min() + values.max()) / 2, width * part / 2
-        setter(middle - half, middle + half)
-    ax.set_aspect("equal")
-
-
-def _power(error: float) -> str:
-    if error == 0:
-        return "0"
-    exponent = int(np.floor(np.log10(error)))
-    return rf"${error / 10.0**exponent:.1f} \cdot 10^{{{exponent}}}$"

@@ -9,7 +9,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, ExperimentCount, Path, Seed
 from .._core.pieces.description import function_digest, versions
-from .._core.pieces.run import DaskClient, Workers, call, fill
+from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable
 from .._core.progress import working
 from ..errors import ComputationError, DefinitionError
@@ -18,9 +18,6 @@ from ..errors import ComputationError, DefinitionError
 # Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
 # files.
 _PIECES = 256
-# Draws that may fail before the first success. Fewer: computations that fail often are refused.
-# More: it takes longer to report that none succeeds.
-_ATTEMPTS = 20
 
 
 @checked
@@ -32,7 +29,7 @@ def monte_carlo(
     *,
     chunk: Count | None = None,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
 ) -> Any:
     """Draw a random computation many times.
 
@@ -62,8 +59,8 @@ def monte_carlo(
     `value`; and `failed`, 1 for draws that raised `ComputationError`.
 
     **Raises:** `DefinitionError` for results that are no numbers, or that change their names, their
-    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if the first draws
-    fail, so that the form of results is unknown; any other error that `function` raises.
+    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if all draws
+    fail; any other error that `function` raises.
     """
     blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
     return fill(Draws(function, seed, blocks), store, client).dataset()
@@ -91,9 +88,9 @@ class Draws:
             "piece": list(self.blocks.block),
         }
 
-    def begin(self, client: DaskClient | None) -> tuple["Draws", Layout]:
+    def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
-        variables = call(self, "first", client)
+        variables = self.first()
         number = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout
@@ -109,7 +106,7 @@ class Draws:
     def first(self) -> dict[str, Variable]:
         """Return the form of results, from the first draw that succeeds."""
         failure = None
-        for i in range(min(_ATTEMPTS, *self.blocks.shape)):
+        for i in range(*self.blocks.shape):
             try:
                 values = self._draw(i)
             except ComputationError as error:
@@ -120,7 +117,7 @@ class Draws:
                 for name, x in values.items()
             }
             return variables | {"failed": Variable("<i8")}
-        raise ComputationError(f"the first draws all failed, the last because {failure}")
+        raise ComputationError(f"all draws failed, the last because {failure}")
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the draws of piece k."""

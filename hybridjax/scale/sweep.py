@@ -14,7 +14,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Path
 from .._core.execution import Execution
 from .._core.pieces.description import array_digest, function_digest, versions
-from .._core.pieces.run import DaskClient, Workers, call, fill
+from .._core.pieces.run import DaskClient, fill
 from .._core.pieces.store import Blocks, Layout, Variable, near_cube
 from .._core.precision import require_x64
 from .._core.progress import say, working
@@ -53,7 +53,7 @@ def sweep(
     guess: LimitCycle | None = None,
     chunk: Count | None = None,
     store: Path | None = None,
-    client: Workers | None = None,
+    client: DaskClient | None = None,
     force: bool = False,
 ) -> Any:
     """Find limit cycles over a space of parameters, as a labelled array.
@@ -86,9 +86,7 @@ def sweep(
     - `chunk`: largest number of points in a piece. Default: up to 4000, with functions 250.
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
         are not computed again: after an interruption, repeat the call.
-    - `client`: a `distributed.Client`, whose workers compute the pieces. Or `(rank, size)` if
-        several processes fill one store without Dask: this process computes the pieces rank,
-        rank + size, ...; processes of rank 1 and more wait until the first has begun the store.
+    - `client`: a `distributed.Client`, whose workers compute the pieces.
     - `force`: whether to compute more than 50 million points. Default: False.
 
     **Returns:** an `xarray.Dataset`, whose coordinates are the parameters with their units. With a
@@ -169,12 +167,11 @@ class SweepJob:
     begun: Begun | None = None
     variables: Mapping[str, Variable] = dataclasses.field(default_factory=dict)
 
-    def begin(self, client: DaskClient | None) -> tuple["SweepJob", Layout]:
+    def begin(self) -> tuple["SweepJob", Layout]:
         """Return the job after the coarse pass, and the form of its results."""
         begun = self._blank()
         say("a coarse pass")
-        coarse = dataclasses.replace(self, begun=begun, guess=None)
-        solved, cycles = call(coarse, "coarse", client)
+        solved, cycles = dataclasses.replace(self, begun=begun).coarse()
         variables = self.wanted.variables(cycles)
         units = self.family.units(self.system)
         points, states = self.space.constants(units), self.wanted.constants()

@@ -35,7 +35,7 @@ class _Anchored(AbstractSections):
         return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
 
     def describe(self, i: int) -> str:
-        return f"section {i} ({self.label} {i}/{self.n_sections} after section 0)"
+        return f"section {i} ({self.label} phase {i}/{self.n_sections} after section 0)"
 
 
 def _as_anchor(x: Crossing | Scalar) -> Crossing | Array:
@@ -185,9 +185,6 @@ class KinematicPhase(_Anchored):
         angles = self._first(phase) + sense * steps
         across = sense * jnp.stack([jnp.sin(angles), -jnp.cos(angles)])
         return BoundSections.at_levels(_AngleLevels(self, across), self.n_sections)
-
-    def describe(self, i: int) -> str:
-        return f"section {i} (kinematic phase {i}/{self.n_sections} after section 0)"
 
 
 def _along(s: Structure, function: Callable, t, chart, q, velocity) -> tuple[Array, Array]:

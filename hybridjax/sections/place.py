@@ -24,8 +24,10 @@ from ..engine.tape import IDLE, Tape
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
+from ..orbits.coincidence import SAME, TOGETHER
 from ..orbits.crossing import Crossing, to_section
 from ..orbits.cycle import LimitCycle
+from ..orbits.return_map import PATIENCE
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
 from .abstract import AbstractSections, BoundSections, Orbit
@@ -33,12 +35,6 @@ from .families import FamilyLike, as_family
 from .placed import GRACE, PlacedSections, SectionsLike
 
 
-# Least bound on the steps of the flow from one section to the next. Smaller: cycles with many
-# events between two sections fail. Larger: failures last longer.
-PATIENCE = 1024
-# Rounding errors of the clock's phase, and the least distance of two sections, in periods. Smaller:
-# rounding moves a section into the next period. Larger: sections that are distinct are rejected.
-_SAME = 1e-9
 # Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
 # crossings that are close are missed. More: the check takes longer.
 _PARTS_OF_A_STEP = 16
@@ -46,9 +42,6 @@ _PARTS_OF_A_STEP = 16
 # fastest rate on the cycle. Smaller: crossings that are lost by a perturbation are accepted.
 # Larger: sections at a small angle are rejected.
 _LEAST_STEEPNESS = 1e-4
-# Part of the period by which the durations between sections may miss one period. Smaller: errors
-# of the flow do. Larger than the shortest duration: a section that is crossed twice is missed.
-_ROUND = 1e-6
 
 # The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
 _recent: collections.deque[PlacedSections] = collections.deque(maxlen=4)
@@ -115,7 +108,7 @@ class _Arrivals(NamedTuple):
 def _place(cycle: LimitCycle, family: AbstractSections) -> tuple[PlacedSections, Int[Array, ""]]:
     """The sections on the cycle, and the `Result` of the flow to section 0, which lies at the
     anchor if that is a crossing."""
-    s, xp = Structure(cycle.system), namespace(cycle.period)
+    s, xp = cycle.structure, namespace(cycle.period)
     N, period = family.n_sections, cycle.period
     settings = dataclasses.replace(
         cycle.settings, max_steps=max(cycle.settings.max_steps, PATIENCE)
@@ -196,7 +189,7 @@ def _bind(
         bound = to_host(_bind_program(cycle.system, family, orbit))
     else:
         bound = family.bind(s, orbit)
-    late = xp.ceil((t - bound.time[0]) / period - _SAME)
+    late = xp.ceil((t - bound.time[0]) / period - TOGETHER)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
 
@@ -267,16 +260,16 @@ def _check(placed: PlacedSections, first: int) -> None:
         )
     period, duration = float(placed.cycle.period), np.asarray(placed.duration)
     rounds = float(duration.sum()) / period
-    if rounds < 1 - _ROUND:
+    if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} is crossed more than once in one period; {again}")
-    if rounds > 1 + _ROUND:
+    if rounds > 1 + SAME:
         late = int(np.argmax(duration))
         raise ComputationError(
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
             f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
         )
     short = int(np.argmin(duration))
-    if duration[short] <= _SAME * period:
+    if duration[short] <= TOGETHER * period:
         raise ComputationError(
             f"{name((short + 1) % N)} coincides with section {short} on the cycle; sections "
             "must be distinct."

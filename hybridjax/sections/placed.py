@@ -101,7 +101,7 @@ class PlacedSections(eqx.Module):
 
     def structure(self) -> Structure:
         """The system by the indices of its charts and transitions, made anew."""
-        return Structure(self.cycle.system)
+        return self.cycle.structure
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
         """Outputs of the cycle at the sections, without input; NaN where a chart does not define

@@ -1,6 +1,6 @@
 """Data whose truth is known: simulated recordings, their dirt, a made-up periodic system."""
 
-import lazy_loader
+from .._core.moved import attach
 
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

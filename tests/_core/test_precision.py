@@ -73,7 +73,6 @@ def late(hopper_cycle, placed_isochrons, isochron_ldtp):
         "observe": lambda: placed.observe(OUTPUTS),
         "run_experiments": lambda: hj.run_experiments(cycle, placed, design, OUTPUTS),
         "response": lambda: response(u),
-        "steady_start": lambda: response.steady_start(u),
         "LDTP": lambda: hj.LDTP(ldtp.A, ldtp.B, ldtp.C),
         "LDTP.simulate": lambda: ldtp.simulate(u[0]),
         "LDTP.htf": lambda: ldtp.htf([0.1]),

@@ -17,8 +17,7 @@ def lines(text):
 
 @pytest.fixture
 def shown(monkeypatch):
-    monkeypatch.setattr(progress, "_DELAY", 0.0)
-    monkeypatch.setattr(progress, "_PERIOD", 0.01)
+    monkeypatch.setattr(progress, "_DELAY", 0.01)
     monkeypatch.setattr(progress, "_enabled", True)
 
 
@@ -34,7 +33,7 @@ def wait_for(capsys, text):
 
 
 def test_nothing_is_said_where_nobody_watches(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "_DELAY", 0.0)
+    monkeypatch.setattr(progress, "_DELAY", 0.01)
     with progress.working("call"):
         time.sleep(0.05)
     assert capsys.readouterr().err == ""
@@ -47,8 +46,7 @@ class Terminal(io.StringIO):
 
 def test_a_terminal_is_watched_and_a_log_is_not(monkeypatch):
     """Without a word from the user, and the line is wiped in the end."""
-    monkeypatch.setattr(progress, "_DELAY", 0.0)
-    monkeypatch.setattr(progress, "_PERIOD", 0.01)
+    monkeypatch.setattr(progress, "_DELAY", 0.01)
     terminal, log = Terminal(), io.StringIO()
     for file in (terminal, log):
         monkeypatch.setattr(sys, "stderr", file)

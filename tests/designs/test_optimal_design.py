@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.designs.optimal_design import random_sequence
 
-from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
+from .conftest import expected_htf, random_designs, total_variance
 
 
 NOISE = {"yM": 1e-4, "vM": 3e-4}
@@ -163,69 +162,3 @@ def test_units_and_estimates(isochron_ldtp, usual):
 def test_bad_input(isochron_ldtp, usual, change, message):
     with pytest.raises(hj.DefinitionError, match=message):
         hj.optimal_design(isochron_ldtp, **({"design": usual} | change))
-
-
-@pytest.fixture(scope="module")
-def two_plan(optimal_two):
-    goal = hj.designs.Multipliers(harmonics=HARMONICS)
-    return optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
-
-
-@pytest.mark.parametrize("kind", ["gaussian", "binary"])
-def test_sequences_have_the_spectrum_that_they_report(two_plan, kind):
-    """Over 40 sequences of 320 cycles, within five standard errors of chi square: each line has 10
-    frequencies."""
-    sequences = [two_plan.sequence(320, kind, seed) for seed in range(40)]
-    for channel in (0, 1):
-        members, squares = two_plan.channels == channel, []
-        for sequence in sequences:
-            u = sequence.u[:, channel]
-            power = 2 * np.abs(np.fft.rfft(u) / len(u)) ** 2
-            line = np.rint(np.arange(len(power)) / 10).astype(int)
-            squares.append(np.bincount(line, power)[np.rint(two_plan.frequencies * 32).astype(int)])
-        said = sequences[0].power[members]
-        error = 5 * said / np.sqrt(40 * 10) + 1e-3 * said.max()
-        assert (np.abs(np.mean(squares, axis=0)[members] - said) < error).all()
-    assert sequences[0].power.sum() == pytest.approx(two_plan.power.sum(), rel=0.1)
-    assert (sequences[0].u != sequences[1].u).any()
-    if kind == "binary":
-        np.testing.assert_allclose(np.abs(sequences[0].u), 0.1, rtol=1e-3)
-
-
-def test_the_arcsine_law():
-    """A binary sequence has a smooth spectrum as wanted; 0.2 would be missed without the law."""
-    f, nearest = np.arange(96) / 32, np.rint(np.arange(961) / 10).astype(int)
-    power = np.append((f > 0) / (1 + f**2), 0.0)
-    _, spectrum = random_sequence(power, nearest, "binary", np.random.default_rng(0))
-    assert np.abs(np.bincount(nearest, spectrum) - power).sum() < 0.05 * power.sum()
-
-
-def test_bad_sequences(two_plan):
-    with pytest.raises(hj.DefinitionError, match="31 cycles do not resolve lines"):
-        two_plan.sequence(31)
-    model = hj.LDTP(np.full((3, 1, 1), 0.8), np.ones((3, 1, 1)), np.ones((3, 1, 1)))
-    goal = hj.designs.Multipliers(harmonics=0)
-    plan = hj.optimal_design(model, hj.multisine(3, 32, band=(0, 1.5)), goal=goal)
-    with pytest.raises(hj.DefinitionError, match="odd number of samples"):
-        plan.sequence(33)
-
-
-@pytest.mark.slow
-def test_fits_of_series_gain_what_is_promised(two, two_plan):
-    """Errors of `fit_series` with the optimal spectrum against white noise of the same rms: the
-    ratio of the variances is that of the designs, within four standard errors."""
-    rng, draws, square = np.random.default_rng(0), 60, []
-    for white in (True, False):
-        errors = []
-        for seed in range(draws):
-            u = two_plan.sequence(320, seed=seed).u
-            if white:
-                u = 0.1 * rng.normal(size=u.shape)
-            y = np.asarray(two.simulate(u))
-            y = y + rng.normal(size=y.shape) * list(TWO_NOISE.values())
-            fit = hj.fit_series(hj.Record(u, y, n_sections=6), 2, check=False)
-            errors.append(np.abs(fit.multipliers - two.multipliers)[0])
-        square.append(np.mean(np.square(errors)))
-    spread = 4 * np.sqrt(2 * 2 / draws)
-    assert square[0] / square[1] == pytest.approx(two_plan.saved, rel=spread)
-    assert square[0] > square[1]

@@ -9,8 +9,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import glide, move
-from hybridjax.engine.search.first_step import stride
+from hybridjax.engine.move import move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -114,31 +113,6 @@ def test_new_numbers_compile_nothing():
     hj.simulate(hj.models.BouncingBall(g=9.0), "fall", (1.0, 0.0), 1.0)
     with no_compilation():
         hj.simulate(hj.models.BouncingBall(g=8.0), "fall", (1.1, 0.1), 1.3, time=0.2)
-
-
-# --- Sections of a batch: one step of all lanes, a log of events ----------------------------------
-
-
-@jax.jit
-def logged(q):
-    """Balls that bounce for 5 s with half of their speed, and a log of 4 events of each."""
-    s, L = Structure(hj.models.BouncingBall(restitution=0.5)), q.shape[1]
-    lanes = start_lanes(s, jnp.zeros(L), jnp.zeros(L, jnp.int32), q)
-    h, ok = stride(jnp.full(L, 0.01)), jnp.zeros(L, jnp.int32)
-    end = until(jnp.full(L, 5.0))
-    return glide(s, lanes, jnp.zeros((1, L)), end, Settings(1e-10, 1e-10), h, ok, event_log=4)
-
-
-def test_a_log_of_events():
-    """A ball that comes to rest in finite time, and one that is not a number, beside a good one:
-    the log keeps the first events, and counts all."""
-    moved = logged(jnp.array([[1.0, jnp.nan, 100.0], [0.0, 0.0, 0.0]]))
-    assert moved.result.tolist() == [hj.Result.ZENO, hj.Result.BAD_INPUT, hj.Result.OK]
-    fall = np.sqrt(2 / 9.81)
-    np.testing.assert_allclose(moved.log.time[:, 0], fall * (3 - 2 * 0.5 ** np.arange(4)))
-    assert moved.log.count[0] > 4 and moved.log.count[1:].tolist() == [0, 1]
-    np.testing.assert_array_equal(moved.log.count, moved.lanes.events)
-    assert np.isnan(moved.log.time[1:, 2]).all() and (moved.log.event[1:, 2] == -1).all()
 
 
 class Roots(hj.HybridSystem):

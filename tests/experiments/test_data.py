@@ -71,7 +71,7 @@ HOLE = np.where(np.arange(12) == 7, np.nan, np.ones((3, 12)))[..., None]
         "`y` must be real, not an array of complex128": dict(y=1j * np.ones((3, 12, 2))),
         "`u` must be a rectangular array": dict(u=[[[1.0]], [[1.0, 2.0]]]),
         "experiment 0: u is NaN or infinite at sample 7": dict(u=HOLE),
-        "result, failed_at, error and events": dict(result=[0, 0]),
+        "result, failed_at and error": dict(result=[0, 0]),
         "cycle_outputs must have the shape": dict(cycle_outputs=np.ones((4, 1))),
         "`outputs` is": dict(outputs=("yM",)),
         "`n_sections` must be an integer from 1": dict(n_sections=0),

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
-from hybridjax.identify.htf_estimate import missing_frequencies
 
 from ..linear.conftest import blocks_at_random, hopper as hopper
 
@@ -33,50 +31,6 @@ def test_even_products_miss_the_lines(choice, periods, count, frequencies):
     for s in range(count):
         j = own(design, s)
         assert products(j, periods).isdisjoint(np.minimum(j % periods, -j % periods).tolist())
-
-
-@settings(max_examples=40)
-@given(
-    st.integers(3, 24),
-    st.integers(2, 16),
-    st.integers(0, 12),
-    st.floats(0.3, 1.0),
-    st.integers(0, 9),
-)
-def test_lines_of_few_experiments_are_far_apart(N, P, M, part, seed):
-    try:
-        design = hj.multisine(N, P, (0, part * N / 2), highest_harmonic=M, seed=seed)
-    except hj.DefinitionError as error:
-        assert "wider band" in str(error)
-        return
-    full = hj.multisine(N, P, (0, part * N / 2))
-    np.testing.assert_array_equal(design.frequencies, full.frequencies)
-    assert design.experiments <= max(full.experiments, 1)
-    for s in range(design.experiments):
-        f = np.concatenate([own(design, s), -own(design, s)]) / P
-        for a in range(len(f) // 2):
-            distance = np.abs((np.delete(f, a) - f[a] + N / 2) % N - N / 2)
-            met = np.abs(distance - np.round(distance)) < 1e-9
-            assert not np.any(met & (distance < 2 * M + 0.5) & (distance > 0.5))
-
-
-def test_few_experiments_on_the_hopper(hopper):
-    """2 M + 1 experiments; where lines would meet around the circle of 32, more."""
-    counts = {M: hj.multisine(highest_harmonic=M).experiments for M in range(11)}
-    assert [counts[M] for M in (0, 1, 2, 6, 7)] == [1, 3, 5, 13, 15]
-    assert counts[8] == counts[9] == counts[10] == 20
-    design = hj.multisine(highest_harmonic=2)
-    assert "assumes      H_m = 0 for |m| > 2" in repr(design)
-    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
-    with pytest.raises(hj.DefinitionError, match="experiment 0: .* so their responses fall on"):
-        hj.estimate_htf(data)
-    with pytest.raises(hj.DefinitionError, match="beyond highest = 2 are taken as zero"):
-        hj.estimate_htf(data, 3, highest=2)
-    estimate = hj.estimate_htf(data, highest=2)
-    assert estimate.harmonics == (-2, -1, 0, 1, 2)
-    leakage = estimate.harmonic_errors(hopper.htf(estimate.f, estimate.harmonics))[2]
-    assert np.all((leakage > 1e-5) & (leakage < 5e-3))
-    assert len(missing_frequencies(data, highest=2)) == 0
 
 
 @pytest.mark.parametrize("division, lines", [("random", 12), ("disjoint", 12), ("orthogonal", 12)])
@@ -156,12 +110,8 @@ def test_expected_variance_is_that_of_the_estimate():
     {
         "`lines` must be 'all', 'odd' or 'two-phase', not 'even'": dict(lines="even"),
         "`division` must be 'random', 'sum-free', .*, not 'fair'": dict(division="fair"),
-        "exclude each other": dict(division="orthogonal", highest_harmonic=2),
-        "not with highest_harmonic": dict(highest_harmonic=2, lines="two-phase"),
         "goes with division='random' or": dict(division="disjoint", lines="two-phase"),
         "an even number of periods, not 63": dict(lines="odd", periods=63),
-        "`highest_harmonic` must be an integer from 0": dict(highest_harmonic=-1),
-        "4 experiments are too few for harmonics up to 2": dict(highest_harmonic=2, experiments=4),
     }.items(),
 )
 def test_bad_choices(message, arguments):

@@ -12,7 +12,6 @@ from hybridjax.experiments import StoredExperiments
 from hybridjax.experiments.campaign import Options
 from hybridjax.experiments.design.multisine import single_cosine
 from hybridjax.experiments.stored import prepare_pieces
-from hybridjax.identify.htf_estimate import missing_frequencies
 
 from ..conftest import OUTPUTS
 
@@ -69,7 +68,6 @@ def test_estimates_take_it_chunk_by_chunk(made, whole):
     estimate, expected = hj.estimate_htf(made), hj.estimate_htf(whole)
     error = np.abs(estimate.H - expected.H).max() / np.abs(expected.H).max()
     assert error < 1e-12
-    assert len(missing_frequencies(made)) == 0
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -87,14 +85,6 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=40)
     np.testing.assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
-
-
-def test_processes_share_the_chunks(arguments, whole, tmp_path):
-    for rank in (0, 1):
-        options, store = Options(**BATCH), tmp_path / "records.zarr"
-        stored = stream(*arguments, options, store=store, chunk=40, client=(rank, 2))
-        assert stored.missing() == ([] if rank else [1])
-    np.testing.assert_array_equal(records(stored), whole.y)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +125,7 @@ def test_another_process_can_run_a_piece(hopper_cycle, placed_isochrons, start):
     design = single_cosine([0.25, 0.75], 32, 4)
     options = Options(start=start)
     job = prepare_pieces(hopper_cycle, placed_isochrons, design, OUTPUTS, options, 2)
-    _, layout = job.begin(None)
+    _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     here, there = job.run(0, None), sent.run(0, 1)
     assert here.keys() == there.keys()
@@ -149,7 +139,3 @@ def test_what_is_no_store(tmp_path, arguments):
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.DefinitionError, match="file"):
         stream(*arguments, store=tmp_path / "file")
-    with pytest.raises(hj.DefinitionError, match="0 <= rank < size"):
-        stream(*arguments, store=tmp_path / "s", client=(2, 2))
-    with pytest.raises(hj.DefinitionError, match="a `client` needs a `store`"):
-        stream(*arguments, client=(0, 2))

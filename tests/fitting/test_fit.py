@@ -64,29 +64,10 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     assert len(one.guesses) == 1
 
 
-def test_guesses_may_be_pieces_of_work(oscillation, tmp_path):
-    pytest.importorskip("zarr")
-    wrong, free = Oscillator(p=0.52, w=1.05), ("p", "q", "w")
-    call = {"guess": oscillation, "guesses": 2, "store": tmp_path / "guesses.zarr"}
-    fit = hj.fit_model(wrong, observed(oscillation), free, **call)
-    assert len(fit.guesses) == 2 and fit.guesses.ok.all()
-    np.testing.assert_allclose([fit.values[0] * fit.values[1], fit.values[2]], 1.0, rtol=1e-6)
-    alone = hj.fit_model(wrong, observed(oscillation), free, guess=oscillation)
-    np.testing.assert_allclose(fit.guesses.fitted[0], alone.values, rtol=1e-12)
-    (tmp_path / "guesses.zarr/cost/c/1").unlink()
-    before = (tmp_path / "guesses.zarr/cost/c/0").stat().st_mtime_ns
-    again = hj.fit_model(wrong, observed(oscillation), free, **call)
-    np.testing.assert_array_equal(again.values, fit.values)
-    assert (tmp_path / "guesses.zarr/cost/c/0").stat().st_mtime_ns == before
-    with pytest.raises(hj.DefinitionError, match="holds other results: .*`data`"):
-        hj.fit_model(wrong, observed(oscillation, noise=1e-3), free, **call)
-
-
 @pytest.mark.parametrize(
     "options, message",
     [
         ({"free": "mass"}, "no parameter of Oscillator"),
-        ({"guesses": 0}, "`guesses` must be an integer from 1"),
         ({"data": ()}, "one or more"),
     ],
 )

@@ -7,7 +7,6 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax.experiments.design.multisine import single_cosine
-from hybridjax.identify.htf_estimate import missing_frequencies
 from hybridjax.identify.joint.noise import noise_spectrum
 from hybridjax.recordings.sampling import without_drift
 
@@ -159,7 +158,6 @@ def experiments(t):
     yield hj.response_function, {name: to_run[name] for name in ("cycle", "sections", "outputs")}
     u = np.zeros((1, 8, 1))
     yield t.response, dict(u=u)
-    yield t.response.steady_start, dict(u=u)
     yield hj.experiments.simulate_experiments, dict(ldtp=t.model, design=t.design)
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
@@ -174,7 +172,6 @@ def experiments(t):
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield missing_frequencies, dict(data=t.repeated)
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2, skip=1)
     yield hj.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
@@ -241,7 +238,6 @@ def designs_data(t):
         dict(model=t.decaying, design=t.one_input, noise={"y": 1.0}, goal=t.study.goal),
     )
     yield hj.designs.draws, dict(fit=t.joint, count=1)
-    yield t.plan.sequence, dict(cycles=2)
     yield t.plan.strides_for, dict(standard_error=1.0)
 
 

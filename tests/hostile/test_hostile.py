@@ -17,10 +17,10 @@ CALLED_BY_THE_ENGINE = {
     "BoundSections",
     "BuckConverter", "Chart", "ClockPhase", "CompliantHopper", "Crossing", "KinematicPhase",
     "Lanes", "Mechanism", "ObservedSeries", "PaddleJuggler", "PlacedSections", "Plan", "Points",
-    "ProcessNoise", "ReturnMap", "SLIPRunner", "Scheduled", "SectionList", "Settings", "Structure",
-    "TwoLeggedBar", "VerticalHopper", "Winding",
+    "ProcessNoise", "SLIPRunner", "Scheduled", "SectionList", "Settings", "TwoLeggedBar",
+    "VerticalHopper",
 }  # fmt: skip
-SLOW_TO_MAKE = {"EventTimes", "ModelFit", "StoredExperiments"}
+SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
 
 
 def printed(*command):

@@ -7,7 +7,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.identify.joint.model import PeriodicModel, local_coordinates
-from hybridjax.identify.joint.noise import Predictor, noise_spectrum
+from hybridjax.identify.joint.noise import noise_spectrum
 from hybridjax.identify.joint.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.series.records import CycleGrid
 
@@ -97,18 +97,6 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     assert (ahead - back) / 2e-6 == pytest.approx(-2 * gradient @ step, rel=1e-5)
 
 
-def test_a_change_of_states_changes_no_prediction(small, gappy):
-    part = SeriesPart.of(CycleGrid.from_records(gappy), ONE)
-    model = in_innovation_form(small)
-    problem = SeriesProblem([part], COVARIANCES, True, True, 0)
-    normal = local_coordinates(model, True)
-    assert problem.cost(normal.model) == pytest.approx(problem.cost(model), rel=1e-9)
-    dims = np.asarray(small.dims)
-    after = np.roll(dims, -1)
-    entries = (after * dims + after * (1 + 2) + 2 * dims + 2).sum()
-    assert normal.size == entries - (dims**2).sum()
-
-
 @pytest.mark.parametrize("start", ("free", "cycle"))
 def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None
@@ -178,35 +166,6 @@ def test_errors_are_as_large_as_said(small):
     assert covered(hits, runs)
 
 
-def test_the_true_model_and_its_noise_leave_white_errors(small):
-    """Both p-values are uniform, where simulations are refused every time."""
-    noise, p = driven(small, 0.3), []
-    for seed in range(20):
-        data = noisy(small, noise, 100, seed)
-        found = hj.validate(small, data, noise=noise)
-        p.append([found.whiteness, found.independence])
-        assert not hj.validate(small, data).white
-    for test in np.reshape(p, (20, 2, 2)).transpose(1, 2, 0).reshape(4, 20):
-        assert stats.kstest(test, "uniform").pvalue > 1e-3
-
-
-@pytest.mark.parametrize("unit", (1.0, 1e6, 1e-6))
-def test_the_filter_is_that_of_riccati(unit):
-    """One section: scipy's solution of the algebraic equation, in any unit of the outputs."""
-    from scipy.linalg import solve_discrete_are
-
-    A, C = np.array([[0.8, 0.3], [-0.2, 0.6]]), unit * np.array([[1.0, 0.5], [0.0, 1.0]])
-    G, R = np.array([[1.0], [0.4]]), 0.3 * unit
-    noise = hj.LDTP([A], [np.hstack([G, np.zeros((2, 2))])], [C], [np.hstack([np.zeros((2, 1)),
-                    R * np.eye(2)])])  # fmt: skip
-    plant = hj.LDTP([A], [G], [C])
-    found = Predictor.of(plant, noise)
-    P = solve_discrete_are(A.T, C.T / unit, G @ G.T, R**2 / unit**2 * np.eye(2))
-    S = C @ P @ C.T + R**2 * np.eye(2)
-    np.testing.assert_allclose(found.S[0], S, rtol=1e-9)
-    np.testing.assert_allclose(found.model.K[0][2:], A @ P @ C.T @ np.linalg.inv(S), rtol=1e-8)
-
-
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
     assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
@@ -237,7 +196,5 @@ def test_bad_input_is_refused_in_a_sentence(small):
         hj.fit_ldtp(small.htf(np.array([0.1, 0.2])), small, start="cycle")
     with pytest.raises(hj.DefinitionError, match="no noise was fitted"):
         hj.fit_ldtp(small.htf(np.linspace(0.01, 1.9, 30)), small).noise_spectrum(0.1)
-    with pytest.raises(hj.DefinitionError, match="have no noise of their own"):
-        hj.validate(small, data, noise=driven(small, 0.3, sensor=0.0))
     with pytest.raises(hj.DefinitionError, match="a multiplier of modulus"):
         noise_spectrum(eqx.tree_at(lambda m: m.A, small, 2 * small.A), 0.1)

@@ -32,30 +32,6 @@ PUBLISHED = {
         0.235944251031154 - 0.0967340260593198j,
         0.0585691535423064 - 0.530709131326115j,
     ],
-    (0.375, 1): [
-        -0.197463738897656 - 0.135644964777583j,
-        0.0618068237928809 + 0.0962861563864056j,
-        -0.0812503237919122 - 0.0468651742365950j,
-        -0.0201885781660477 - 0.349237894484668j,
-    ],
-    (0.375, -3): [
-        0.129440211654674 - 0.309710364604919j,
-        0.108293999329773 + 0.142151815209447j,
-        0.230149561273491 - 0.0164694307438428j,
-        0.00395711407298096 + 0.118194359053034j,
-    ],
-    (1.625, -2): [
-        0.475877515178889 + 0.256577098584805j,
-        -0.339553047966473 - 0.183100528413716j,
-        0.187680805609276 + 0.0872384969698475j,
-        -0.178822341466915 + 0.126416075679082j,
-    ],
-    (1.625, 0): [
-        0.140386880184425 - 0.300228235870690j,
-        0.0150139226075515 - 0.476099969045470j,
-        -0.500707893221423 - 0.0742555981401889j,
-        -0.0857139174906250 - 0.217184053891879j,
-    ],
     (1.625, 2): [
         -0.0494116126341986 + 0.329373837208814j,
         -0.0776748978722265 + 0.261505315857721j,
@@ -156,19 +132,6 @@ def test_derivatives(synthetic):
     np.testing.assert_allclose((up - down) / 2e-6, gradient[2, 0, 1, 0].real, rtol=1e-6)
 
 
-def test_jit_and_vmap(synthetic):
-    f = np.array([0.3, 0.7])
-    plain = synthetic.htf(f, harmonics=(0, 1))
-    jitted = eqx.filter_jit(lambda ldtp, f: ldtp.htf(f, (0, 1)))(synthetic, f)
-    np.testing.assert_allclose(jitted.H, plain.H, rtol=0, atol=1e-14)
-    assert jitted.harmonics == (0, 1)
-    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
-    batch = eqx.tree_at(lambda ldtp: ldtp.B, batch, batch.B.at[1].multiply(2.0))
-    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].multiply(2.0))
-    many = eqx.filter_vmap(lambda ldtp: ldtp.htf(f, (0, 1)))(batch)
-    np.testing.assert_allclose(many.H, np.stack([plain.H, 2 * plain.H]), rtol=0, atol=1e-14)
-
-
 def test_interpolation_fills_the_gaps(hopper):
     step = 1 / 128
     f = np.arange(1, 16 / step) * step
@@ -195,10 +158,6 @@ def test_bad_requests(synthetic):
         (dict(f=[0.1], harmonics=(0, 3)), "Harmonic 3 does not exist.*6 sections.*-3 to 2"),
         (dict(f=[0.1], harmonics=(0, 0)), "distinct"),
         (dict(f=[0.1], harmonics=()), "at least one"),
-        (dict(f=[0.1], harmonics=(0.5,)), r"`harmonics\[0\]` must be an integer, not 0.5"),
-        (dict(f=[np.nan]), "`f` must be finite, but is nan at index 0"),
-        (dict(f=[[0.1]]), "`f` must be of shape"),
-        (dict(f=[0.1j]), "`f` must be real"),
     ]
     for arguments, message in cases:
         with pytest.raises(hj.DefinitionError, match=message):
@@ -223,8 +182,6 @@ def test_bad_containers():
     hj.HTF(**good)
     cases = [
         ({"f": [0.1, 0.2]}, "2 frequencies"),
-        ({"H": H[0]}, r"`H` must be of shape \(M, F, ny, nu\)"),
-        ({"H": H > 0}, "`H` must hold numbers, not bool"),
         ({"harmonics": (0, 2)}, "-2 to 1"),
         ({"harmonics": (1, 0)}, "ascending"),
         ({"harmonics": (-1, 0, 1)}, "3 harmonics"),
@@ -240,17 +197,13 @@ def test_bad_use(synthetic, hopper):
     u = np.cos(2 * np.pi * 0.25 * np.arange(24) / 6)[:, None] * np.ones(2)
     cases = [
         (lambda: htf[2], "Harmonic 2 is not stored"),
-        (lambda: htf.select((0, 2)), "Harmonic 2 is not stored"),
         (lambda: htf.predict(u[:23]), "multiple of 6 samples"),
-        (lambda: htf.predict(u[:, :1]), "2 columns"),
         (lambda: htf.predict(u**2), "f = 0 cycles per period, where"),
         (lambda: htf.select((0, 1)).predict(u), "symmetric about 0"),
         (lambda: htf.interpolate([2.0]), "f = 2 cycles per period is too far"),
         (lambda: synthetic.htf(0.25).interpolate([0.3]), "at least two"),
         (lambda: htf.error(htf.select((0, 1))), "different harmonics"),
-        (lambda: htf.error(synthetic.htf([0.25, 0.7], (-1, 0, 1))), "different frequencies"),
         (lambda: htf.error(hopper.htf([0.25, 0.75], (-1, 0, 1))), "different n_sections"),
-        (lambda: htf.select(1).error(htf.select(1)), "Harmonic 0 is not stored"),
         (lambda: jax.jit(lambda u: htf.predict(u))(u), "outside of jit"),
     ]
     for call, message in cases:

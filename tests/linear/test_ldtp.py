@@ -89,16 +89,6 @@ def test_jit_vmap_and_gradients(synthetic):
     jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("fwd", "rev"), eps=1e-6)
 
 
-def test_blocks_may_be_traced(synthetic):
-    @jax.jit
-    def last(a):
-        ldtp = hj.LDTP.from_blocks([a, a[:, :1]], [a[:, 1:], a[:, 1:]], [a[:1], a[:1, :1]])
-        return ldtp.simulate(jnp.ones((4, 1)))[-1, 0]
-
-    with pytest.raises(hj.DefinitionError, match=r"`A\[0\]` has shape \(2, 2\)"):
-        last(jnp.eye(2))  # A[0] must be (1, 2)
-
-
 def test_systems_known_outside_of_jit_work_inside(synthetic):
     @jax.jit
     def inside(u):
@@ -131,17 +121,12 @@ GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1,
     ("change", "message"),
     [
         ({"A": np.zeros((2, 3, 2))}, r"`A` must be of shape \(N, d, d\), not"),
-        ({"A": np.zeros((2, 3))}, r"`A` must be of shape \(N, d, d\), not of shape \(2, 3\)"),
         ({"A": np.full((2, 3, 3), np.nan)}, r"`A` must be finite, but is nan at index \(0, 0, 0\)"),
-        ({"A": np.zeros((2, 3, 3), complex)}, "`A` must be real"),
-        ({"A": [[[1.0, 2.0]], [[1.0]]]}, "`A` must be a rectangular array"),
-        ({"A": "three"}, "`A` must be an array of real numbers"),
         ({"B": np.zeros((3, 3, 1))}, "`B` has shape"),
         ({"C": np.zeros((2, 1, 2))}, "`C` has shape"),
         ({"C": np.zeros((2, 0, 3))}, "without empty axes"),
         ({"D": np.zeros((2, 1, 2))}, "`D` has shape"),
         ({"dims": [3, 3, 3]}, "`dims` must hold 2 integers"),
-        ({"dims": [3.0, 3.0]}, "`dims` must hold integers, not float64"),
         ({"dims": [3, 4]}, "`dims` must lie between 1 and 3"),
         ({"dims": [3, 2], "A": np.ones((2, 3, 3))}, r"`A\[0\]` has entries outside"),
         ({"dims": [3, 2], "B": np.ones((2, 3, 1))}, r"`B\[0\]` has entries outside"),
@@ -184,8 +169,6 @@ def test_bad_calls(synthetic):
         varying.states(u, np.zeros(3), first_section=1)
     with pytest.raises(hj.DefinitionError, match="`u` has 6 samples, but 2 periods of 6"):
         synthetic.periodic_state(u, 2)
-    with pytest.raises(hj.DefinitionError, match="`n_lags` must be an integer from 1"):
-        synthetic.impulse_response(0)
     rotation = hj.LDTP([[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2)))
     rotation.periodic_state(np.ones((3, 1)), 3)
     with pytest.raises(hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"):

@@ -58,30 +58,6 @@ def test_guards(system, message):
         hj.find_limit_cycle(system, hj.Guess("air", (0.1, 4.7), 0.1))
 
 
-def test_resets():
-    class Flickering(Paddle):
-        """Its paddle stands still, and throws as hard as the time of day wants."""
-
-        def transitions(self):
-            reset = lambda t, q, u: (q[0], -q[1] + jnp.sin(t))  # noqa: E731
-            return (hj.Transition("impact", "air", "air", lambda t, q, u: q[0], reset=reset),)
-
-        def period(self):
-            return None
-
-    with pytest.raises(hj.DefinitionError, match="reset of 'impact' depends on t"):
-        hj.find_limit_cycle(Flickering(), hj.Guess("air", (0.1, 4.7)))
-
-
-def test_schedules():
-    class Ticking(Oscillator):
-        def transitions(self):
-            return (hj.Transition("tick", "a", "a", hj.Scheduled(1.0)),)
-
-    with pytest.raises(hj.DefinitionError, match="'tick' is scheduled, but Ticking states no per"):
-        find(Ticking(lambda t, x: 0.0))
-
-
 def test_time_that_makes_no_difference():
     """Its period is that of the oscillator alone, from an integration in 34 digits."""
     cycle = find(Oscillator(lambda t, x: 0.0 * t + jnp.sin(t) ** 2 + jnp.cos(t) ** 2 - 1))
@@ -106,25 +82,3 @@ def test_a_force_that_jumps_with_the_clock():
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
     x = 1 + (x - 1) * np.exp(-0.25)
     np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-6)
-
-
-class Told(Oscillator):
-    """An oscillator that is told of what depends on time, and obeys nothing of it."""
-
-    def transitions(self):
-        late = lambda t, q, u: jnp.sin(t) > 0.0  # noqa: E731
-        return [hj.Transition("never", "a", "a", lambda t, q, u: q[0] + 9.0, enabled=late)]
-
-
-class Seen(Oscillator):
-    def outputs(self):
-        return [hj.Output("turned", lambda t, q, u: q[0] * jnp.cos(t))]
-
-
-@pytest.mark.parametrize(
-    "kind, message",
-    [(Told, "predicate of 'never' depends on t"), (Seen, "output 'turned' depends on t")],
-)
-def test_predicates_and_outputs(kind, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        find(kind(lambda t, x: 0.0))

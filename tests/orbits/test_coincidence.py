@@ -91,12 +91,8 @@ def test_derivatives_of_both_orders():
         ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
     }
     assert set(found.orders) == set(exact)
-    for order, derivative, values in zip(
-        found.orders, found.derivatives, found.multipliers, strict=True
-    ):
+    for order, derivative in zip(found.orders, found.derivatives, strict=True):
         np.testing.assert_allclose(derivative, exact[order], atol=1e-12)
-        expected = 0.1 * np.linalg.eigvals(exact[order])
-        np.testing.assert_allclose(np.sort(values), np.sort(expected), atol=1e-9)
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
@@ -116,6 +112,7 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     assert branch.cycles.result[0] == ok and (branch.cycles.result[1:] == not_ok).all()
 
 
+@pytest.mark.slow
 def test_an_event_that_coincides_with_a_schedule():
     """Without the clock, it would be full at the time 1: which of the two sets it back?"""
     height = 10 - 9.8 * np.exp(-0.1)

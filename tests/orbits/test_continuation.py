@@ -51,6 +51,14 @@ def test_fold_and_flip_of_the_juggler(juggling):
         again = hj.find_limit_cycle(cycle.system, cycle)
         np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
+    ax = hj.plot.branch(branch, output="v", labels={"A": "amplitude"}).ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("amplitude (m)", "largest v (m/s)")
+    lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
+    assert [x.get_linestyle() for x in lines] == ["--", "-", "--"]
+    rows = (0, *(x.index for x in branch.points), len(branch) - 1)
+    for line, first, last in zip(lines, rows, rows[1:], strict=False):
+        np.testing.assert_array_equal(line.get_xdata(), branch.values[first : last + 1])
+
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
     dataset, frame = hj.convert.to_xarray(branch), hj.convert.to_pandas(branch)
@@ -245,32 +253,6 @@ def test_period_2_of_the_buck_converter():
     assert branch.values[0] == branch.values[-1] == 25.5
     at = np.abs([branch.values[1 : point.index].min(), branch.values[point.index + 1 :].min()])
     assert np.all(at > 24.5165)
-
-
-@pytest.mark.slow
-def test_period_doubling_of_the_long_gait():
-    walker = m.SimplestWalker()
-    cycle = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
-    branch = hj.continuation(cycle, "slope", (0.005, 0.016))
-    (flip,) = branch.points
-    assert flip.kind == "flip"
-    np.testing.assert_allclose(flip.value, 0.0150884379411195, rtol=1e-11)
-    np.testing.assert_allclose(flip.multipliers, [-1, -0.297621361684963], rtol=1e-9)
-    doubled = branch[flip.index]
-    np.testing.assert_allclose(doubled.period, 3.91240921248050, rtol=1e-11)
-    np.testing.assert_allclose(
-        [doubled.state["th"], doubled.state["w"]], [0.237165863591579, -0.231927076424014],
-        rtol=1e-10,
-    )  # fmt: skip
-    # Two steps make one round of the gait beyond it.
-    beyond = branch[-1]
-    th, phi, w, p = np.asarray(beyond.anchor.q[:, 0])
-    guess = hj.Guess("step", (1.02 * th, 2 * 1.02 * th, 1.02 * w, 1.02 * p))
-    limping = hj.find_limit_cycle(
-        beyond.system, guess, section=hj.AtEvent("heelstrike"), multiplicity=2, settle=400.0
-    )
-    assert len(limping.event_sequence) == 2 and limping.stable
-    assert abs(float(limping.period) - 2 * float(beyond.period)) > 1e-6
 
 
 @pytest.mark.slow

@@ -53,22 +53,6 @@ def test_the_hopper_from_a_rough_guess(reference, guess=(5.0, -3.0)):
     check_hopper(cycle, reference("limit_cycle"))
 
 
-def test_the_hopper_after_settling(reference):
-    cycle = hj.find_limit_cycle(hj.models.VerticalHopper(), settle=60.0)
-    check_hopper(cycle, reference("limit_cycle"))
-    assert cycle.iterations <= 2
-
-
-def test_settings_that_say_nothing_of_accuracy(hopper_cycle):
-    """They leave each call its own."""
-    more_steps = hj.Settings(max_steps=512)
-    assert repr(more_steps) == "Settings(max_steps=512)"
-    cycle = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, settings=more_steps)
-    assert cycle.settings.rtol == cycle.settings.atol == 1e-12 and cycle.settings.max_steps == 512
-    loose = hj.find_limit_cycle(hopper_cycle.system, hopper_cycle, settings=hj.Settings(rtol=1e-8))
-    assert loose.settings.rtol == 1e-8 and loose.settings.atol == 1e-12
-
-
 def test_the_lossy_hopper(lossy_cycle):
     state = [1.87978886663710, 1.75832736962547]
     np.testing.assert_allclose(lossy_cycle.anchor.q[:2, 0], state, atol=1e-10)
@@ -95,7 +79,7 @@ def test_the_two_legged_bar(bar_cycle):
     np.testing.assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
 
 
-@pytest.mark.parametrize("mu", [1.0, 3.0])
+@pytest.mark.parametrize("mu", [3.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_van_der_pol(mu):
     amplitude, period, multiplier = VANDERPOL[mu]
     cycle = vanderpol(mu)
@@ -103,13 +87,6 @@ def test_van_der_pol(mu):
     np.testing.assert_allclose(cycle.period, period, atol=1e-9)
     np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-7, atol=0)
     assert not cycle.clocked and cycle.event_sequence == ()
-
-
-def test_van_der_pol_on_the_plane_through_a_guess_off_the_cycle():
-    _, period, multiplier = VANDERPOL[1.0]
-    cycle = vanderpol(1.0, (0.3, 2.0), section=None)
-    np.testing.assert_allclose(cycle.period, period, atol=1e-9)
-    np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-7, atol=0)
 
 
 def test_unstable_cycles(mu=1.0, guess=2.0):
@@ -120,11 +97,6 @@ def test_unstable_cycles(mu=1.0, guess=2.0):
     np.testing.assert_allclose(cycle.period, period, atol=1e-9)
     np.testing.assert_allclose(cycle.multipliers * multiplier, [1.0], rtol=1e-8)
     assert not cycle.stable
-
-
-def test_settling_on_an_unstable_cycle_fails():
-    with pytest.raises(hj.ComputationError, match="settling failed at t = .* left all bounds"):
-        vanderpol(-1.0, (2.1, 0.0), settle=60.0)
 
 
 def test_a_conservative_system_has_a_family_of_cycles(amplitude=7.3):
@@ -194,13 +166,9 @@ def test_derivatives_of_scheduled_events():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"guess": hj.Guess("orbit", (2.0, 0.0))}, "there is no chart 'orbit'"),
         ({"guess": hj.Guess("oscillation", (2.0,))}, "values for the 2 states x, v"),
-        ({"settle": -1.0}, "`settle` must be a number that is not"),
-        ({"max_period": np.nan}, "`max_period` must be a positive number"),
         ({"section": hj.AtEvent("bounce")}, "there is no event 'bounce'; events are none"),
         ({"section": hj.Crossing("y", "falling")}, "there is no output 'y'"),
-        ({"section": hj.Crossing("v", "falling", charts=("c",))}, "there is no chart 'c'"),
     ],
 )
 def test_bad_arguments(arguments, message):

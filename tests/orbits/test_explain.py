@@ -108,28 +108,12 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     y, v = way.before[k, :2]
     start = np.array([y - v * 0.05 - 9.81 * 0.05**2 / 2, v + 9.81 * 0.05] * 2)
     ends = lambda q: hj.simulate(system, "air", q, dt, time=t0).after[-1]  # noqa: E731
-    turn = np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]])  # free flight
-    for found, derivative in zip(both.multipliers, both.derivatives, strict=True):
-        expected = np.linalg.eigvals(turn @ derivative)
-        assert np.abs(found[:, None] - expected).min(axis=0).max() < 1e-7
     for order, derivative in zip(both.orders, both.derivatives, strict=True):
         early = int(order[0][-1])
         step = np.zeros(4)
         step[2 * early] = -1e-6  # this ball is lower, and lands first
         change = (ends(start + step) - ends(start)) / 1e-6
         np.testing.assert_allclose(change, fall @ derivative @ fall @ step / 1e-6, atol=1e-4)
-
-
-def test_events_that_nearly_coincide():
-    """The multipliers of the second ball, in closed form (Holmes 1982), with e = 0.701."""
-    cycle = hj.find_limit_cycle(Balls(0.701), BALLS)
-    e, g, A, w = 0.701, 9.81, 0.15, 2 * np.pi
-    # It lands where the table's speed is (1 - e) / (1 + e) g / 2.
-    phase = np.arccos((1 - e) / (1 + e) * g / 2 / (A * w))
-    trace = 1 + e**2 - (1 + e) ** 2 * A * w**2 * np.sin(phase) / g
-    pair = np.roots([1, -trace, e**2])
-    distance = np.abs(cycle.multipliers[:, None] - pair).min(axis=0)
-    assert distance.max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -151,13 +135,6 @@ def test_causes(system, guess, message):
         hj.find_limit_cycle(system, hj.Guess(chart, guess))
 
 
-def test_a_section_that_is_not_met_again_in_time():
-    with pytest.raises(hj.ComputationError, match="Allow more time than 1, by `max_period`"):
-        hj.find_limit_cycle(
-            hj.models.VanDerPol(), section=hj.Crossing("v", "falling"), max_period=1.0
-        )
-
-
 def test_a_time_that_is_too_short_for_a_stiff_system():
-    with pytest.raises(hj.ComputationError, match='`max_period`. The system is stiff.*"auto"'):
+    with pytest.raises(hj.ComputationError, match='`max_period`, or for the slow .*"auto"'):
         hj.find_limit_cycle(hj.models.VanDerPol(1000.0), section=hj.Crossing("v", "falling"))

@@ -16,7 +16,8 @@ from ..conftest import APEX
 QUICK = compiler_options()
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_the_period_of_van_der_pol_by_its_parameter(vanderpol_cycle, order):
     def period(mu):
         system = hj.models.VanDerPol(mu=mu)

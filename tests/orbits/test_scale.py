@@ -9,7 +9,9 @@ import hybridjax as hj
 from hybridjax.orbits import find, newton
 
 
-@pytest.mark.parametrize("factor, solved", [(2.0, 1), (100.0, 2)])
+@pytest.mark.parametrize(
+    "factor, solved", [(100.0, 2), pytest.param(2.0, 1, marks=pytest.mark.slow)]
+)
 def test_a_cycle_is_solved_again_only_if_its_sizes_were_too_large(monkeypatch, factor, solved):
     """With sizes that are too small it was found more accurately than asked."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())

@@ -45,17 +45,6 @@ def test_failures_are_reported_by_index(found):
     assert found.summary().startswith("4/5 found; #4: ")
 
 
-def test_other_libraries_get_them_all(found):
-    pytest.importorskip("xarray")
-    pytest.importorskip("pandas")
-    dataset, frame = hj.convert.to_xarray(found), hj.convert.to_pandas(found)
-    np.testing.assert_array_equal(dataset["k"], found.systems.k)
-    assert dataset["k"].dims == ("system",)
-    np.testing.assert_array_equal(dataset["multipliers"], found.multipliers)
-    np.testing.assert_array_equal(frame["multipliers.1"], found.multipliers[:, 1])
-    np.testing.assert_array_equal(frame["b"], found.systems.b)
-
-
 @pytest.fixture(scope="module")
 def wheel():
     return hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.08), section=hj.AtEvent("impact"))
@@ -71,31 +60,6 @@ def test_without_a_clock_and_in_waves(wheel):
     assert found.period[-1] < 0.7 * wheel.period
     np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
     assert {found[i].event_sequence for i in range(11)} == {(0,)}
-
-
-def test_a_step_with_a_guessed_jacobian_leads_nearer(wheel, monkeypatch):
-    """And one that is not small, or guessed from nothing, is not taken."""
-    steps = []
-    first_step = batches.Tiles._first_step
-
-    def watched(self, rows, anchor, period, jacobian):
-        end, after = first_step(self, rows, anchor, period, jacobian)
-        steps.append((rows, anchor.q[..., 0], end.q[..., 0]))
-        for guess in (1e-6 * jacobian, np.full_like(jacobian, np.nan)):
-            np.testing.assert_array_equal(
-                first_step(self, rows, anchor, period, guess)[0].q, anchor.q
-            )
-        return end, after
-
-    monkeypatch.setattr(batches.Tiles, "_first_step", watched)
-    slopes = np.linspace(0.08, 0.1, 11)
-    found = hj.find_limit_cycles(
-        [hj.models.RimlessWheel(slope=x) for x in slopes], wheel, execution=FOUR
-    )
-    rows, before, after = map(np.concatenate, zip(*steps, strict=True))
-    error = [np.abs(q - found.anchor.q[rows, :, 0]).max(axis=1) for q in (before, after)]
-    assert len(rows) == 7 and np.all(error[1] < 0.3 * error[0])
-    assert found.ok.all() and found.iterations[rows].max() <= 3
 
 
 def test_systems_that_are_alike_or_undefined(wheel):

@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import hybridjax as hj
-from hybridjax.experiments.data import Simulated
 
 
 def labeled(ax):
@@ -40,11 +39,6 @@ def test_exact_lies_under_the_estimate_in_any_order(estimate, exact):
         wide, thin = (x for x in ax.get_lines() if len(x.get_xdata()))
         assert wide.get_zorder() < thin.get_zorder() and wide.get_linewidth() > 2
         np.testing.assert_array_equal(thin.get_ydata(), np.abs(estimate[0][:, 0, 0]))
-
-
-def test_only_exact(exact):
-    assert "exact" in labeled(hj.plot.magnitude(exact).ax)
-    hj.plot.bode(exact)
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
@@ -89,29 +83,13 @@ def test_bodes(estimate, exact, rational):
         hj.plot.bodes(families, fits={"c": rational})
 
 
-def test_on_given_axes_nothing_else_is_made(estimate):
-    with hj.plot.style():
-        figure = Figure()
-        axes = figure.subplots(2, 2)
-    assert hj.plot.magnitude(estimate, ax=axes[0, 0]).ax is axes[0, 0]
-    assert hj.plot.bode(estimate, ax=axes[:, 1]).figure is figure
-    assert hj.plot.multipliers([0.5], ax=axes[1, 0]).ax is axes[1, 0]
-    assert matplotlib.pyplot.get_fignums() == []
-
-
 def test_bad_input_of_transfer_functions(estimate, hopper):
     with pytest.raises(hj.DefinitionError, match="no HTF to draw"):
         hj.plot.magnitude()
-    with pytest.raises(hj.DefinitionError, match="no HTF to draw"):
-        hj.plot.bode()
-    with pytest.raises(hj.DefinitionError, match="no 'ym' among yM, vM"):
-        hj.plot.magnitude(estimate, output="ym")
     with pytest.raises(hj.DefinitionError, match="no 2 among yM, vM"):
         hj.plot.magnitude(estimate, output=2)
     with pytest.raises(hj.DefinitionError, match="no 'force' among u"):
         hj.plot.bode(estimate, input="force")
-    with pytest.raises(hj.DefinitionError, match="Harmonic 3 is not stored"):
-        hj.plot.magnitude(estimate, harmonics=(0, 3))
     with pytest.raises(hj.DefinitionError, match="at least one HTF"):
         hj.plot.harmonics({})
     other = hj.HTF(estimate.f, estimate.H[:, :, :1], estimate.harmonics, 32)
@@ -145,12 +123,6 @@ def test_multipliers_outside_the_disc_and_without_estimates():
     assert "= 0" in list(labeled(ax))[1]
 
 
-@pytest.mark.parametrize("bad", [[], np.array(["a"])])
-def test_multipliers_of_nothing(bad):
-    with pytest.raises(hj.DefinitionError, match="`true`"):
-        hj.plot.multipliers(bad)
-
-
 def test_poles_and_zeros(rational):
     moved = eqx.tree_at(lambda fit: fit.zeros, rational, np.array([[np.nan + 0j], [0.9 + 0j]]))
     figure = hj.plot.poles_zeros({"isochron": rational, "kinematic": moved}).figure
@@ -181,22 +153,6 @@ def test_experiment(hopper):
         hj.plot.experiment(data, 99)
 
 
-def test_failed_experiment():
-    y = np.ones((1, 8, 1))
-    y[0, 5:] = np.nan
-    data = hj.ExperimentData(
-        np.zeros((1, 8, 1)),
-        y,
-        n_sections=2,
-        periods=2,
-        result=[hj.Result.GRAZING],
-        simulated=Simulated(np.array([5])),
-    )
-    figure = hj.plot.experiment(data).figure
-    assert "grazing" in figure.axes[0].get_title()
-    assert figure.axes[0].get_lines()[1].get_xdata()[0] == 2.5
-
-
 # The look
 
 
@@ -212,22 +168,6 @@ def test_saved_in_several_formats(tmp_path):
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.DefinitionError, match="cannot write"):
         hj.plot.save(tmp_path / "absent" / "x", plot.ax)
-
-
-def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
-    plot, count = hj.plot.multipliers([0.5]), 0
-    execute = ConstrainedLayoutEngine.execute
-
-    def counted(self, figure):
-        nonlocal count
-        count += 1
-        execute(self, figure)
-
-    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", counted)
-    (alone,) = hj.plot.save(tmp_path / "alone", plot)
-    assert count == 1
-    *_, last = hj.plot.save(tmp_path / "x", hj.plot.multipliers([0.5]), ("pdf", "png"))
-    assert count == 2 and last.read_bytes() == alone.read_bytes()
 
 
 def test_global_settings_stay(estimate):

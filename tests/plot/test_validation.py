@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.identify.amplitude import AmplitudeSweep
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
-from hybridjax.plot.fit_quality import amplitude
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +25,6 @@ def test_validation_draws_signals_and_correlations(found):
     for k, values in ((1, found.autocorrelation[:, :, 0]), (2, found.cross_correlation[:, :, 0])):
         heights = [path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()]
         np.testing.assert_allclose(heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12)
-
-
-def test_amplitude_marks_the_limit():
-    sweep = AmplitudeSweep(
-        np.array([0.1, 1.0]), np.ones((2, 1)), np.array([[1e-3], [1e-1]]), np.array([0.0, 2.0]),
-        ("u",), ("y",),
-    )  # fmt: skip
-    ax = amplitude(sweep, misfit=1e-2).ax
-    assert [line.get_label() for line in ax.get_lines()][0] == "y"
-    assert ax.get_lines()[-1].get_xdata()[0] == pytest.approx(10**-0.5)
-    assert ax.get_lines()[1].get_xdata()[0] == 1.0
 
 
 def test_regions_are_drawn_around_estimates(hopper):

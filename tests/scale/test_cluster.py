@@ -103,8 +103,6 @@ def test_draws_must_stay_alike():
         hj.monte_carlo(lambda rng: next(turns), 2)
     with pytest.raises(hj.DefinitionError, match="draw 1 has no `value`"):
         hj.monte_carlo(lambda rng: next(turns), 2)
-    with pytest.raises(hj.DefinitionError, match=r"`client` of \(rank, size\) needs a `store`"):
-        hj.monte_carlo(walk, DRAWS, client=(1, 2))
 
 
 def drawn(rng, size=1.0, *, offset=0.0):

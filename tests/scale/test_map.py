@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.scale import Points
+from hybridjax.scale.family import Points
 
 
 pytest.importorskip("xarray")
@@ -72,15 +72,6 @@ def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path
     again = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, **options)
     assert again.load().identical(whole)
     assert (store / "period/c/0/1").stat().st_mtime_ns == kept
-
-
-def test_processes_share_a_store(whole, options, tmp_path):
-    store = tmp_path / "map.zarr"
-    half = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, client=(0, 2), **options)
-    assert np.isnan(half.period).any() and np.isfinite(half.period).any()
-    assert (half.result == -1).any()
-    both = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, client=(1, 2), **options)
-    assert both.load().identical(whole)
 
 
 def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
@@ -149,8 +140,6 @@ WRONG = {
                  "1e.09 points, .* hours .* GB: say `force=True`"),
     "no client": ({"slope": [0.08]}, {"client": "tcp://here"}, "`client` must be .* `submit`"),
     "a store below a file": ({"slope": [0.08]}, {"store": "{}/file/map.zarr"}, "file"),
-    "no share": ({"slope": [0.08]}, {"client": (2, 2)}, "0 <= rank < size"),
-    "a share of nothing": ({"slope": [0.08]}, {"client": (0, 2)}, "needs a `store`"),
     "no want": ({"slope": [0.08]}, {"want": "speed"}, "`want` must be"),
     "no name": ({"slope": [0.08]}, {"want": lambda cycle: 1.0}, "needs a name of its own"),
 }  # fmt: skip

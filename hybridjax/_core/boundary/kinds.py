@@ -53,7 +53,7 @@ PeriodCount = Annotated[int, Whole(1, limits.PERIODS)]
 ExperimentCount = Annotated[int, Whole(1, limits.PERIODS)]
 Order = Annotated[int, Whole(1, limits.ORDER)]
 StepCount = Annotated[int, Whole(1, limits.COUNT)]
-WorkerCount = Annotated[int, Whole(1, limits.WORKERS)]
+WorkerCount = Annotated[int, Whole(1, limits.ORDER)]
 Seed = Annotated[int, Whole(0)]
 
 # Real numbers that have to be known. (`float` alone: any finite one.)
@@ -70,7 +70,6 @@ Wait = Annotated[Numbers, Number("a number that is not negative", low=0)]
 # Numbers that JAX may trace.
 Scalar = Annotated[Numbers, Reals("")]
 PositiveScalar = Annotated[Numbers, Reals("", sign="positive")]
-NonNegativeScalar = Annotated[Numbers, Reals("", sign="nonnegative")]
 Vector = Annotated[Numbers, Reals("n")]
 
 # Words.

@@ -58,12 +58,6 @@ def run_on(client: Any, job: Any, store: MemoryStore | ZarrStore, missing: Seque
                 client.cancel(list(pieces))
 
 
-def call_on(client: Any, job: Any, method: str) -> Any:
-    """Return the result of a method of a job, computed by a worker."""
-    with _job(client, job, None) as name:
-        return client.submit(_method, name, method, pure=False).result()
-
-
 @contextlib.contextmanager
 def _job(client: Any, job: Any, address: str | None) -> Iterator[str]:
     """Give a job to all workers; the context is its name.
@@ -150,12 +144,5 @@ def _piece(name: str, k: int) -> dict[str, np.ndarray] | None:
     job, store = _jobs[name]
     if store is None:
         return job.run(k, 1)
-    if not store.has(k):
-        store.write(k, job.run(k, 1))
+    store.write(k, job.run(k, 1))
     return None
-
-
-def _method(name: str, method: str) -> Any:
-    if name not in _jobs:
-        raise Reschedule
-    return getattr(_jobs[name][0], method)()

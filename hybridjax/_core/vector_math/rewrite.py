@@ -21,7 +21,7 @@ from jax.extend.core import primitives
 from ..boundary.checked import checked
 from ..executor import on_cpu
 from . import factorizations
-from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
+from .trigonometry import arccos, arcsin, arctan, arctan2, are_double, cos, sin, tan
 
 
 _TRIGONOMETRY = {
@@ -38,11 +38,8 @@ _FACTORIZATIONS = {
     primitives.triangular_solve_p: factorizations.triangular_solve,
     primitives.lu_p: factorizations.lu,
 }
-# With up to so many of our functions behind it, a vector is concatenated from its numbers. Twice as
-# many: XLA makes a loop without vector instructions of a field with two sines.
-_TOGETHER = 1
 # Primitives whose inner programs are replaced too. Functions with derivative rules of their own
-# are left alone, unless they factorize a matrix.
+# are left alone.
 _OUTER = ("jit", "pjit", "cond", "while", "scan", "custom_linear_solve")
 
 
@@ -124,11 +121,11 @@ def jaxprs(params: dict[str, Any]) -> list[jex.Jaxpr]:
 
 
 def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
-    """A program that puts the numbers of a vector in their places one after the other, if more
-    than a few of our functions are behind them.
+    """Return a program that puts the numbers of a vector in their places one after the other, if
+    more than one of our functions is behind them.
 
-    What is concatenated is compiled into one loop. With more than a few of our functions in it,
-    XLA does not find vector instructions for that loop.
+    XLA compiles a concatenation into one loop. With two sines in it, XLA does not find vector
+    instructions for that loop.
     """
     eqns = []
     behind: dict[jex.Var, frozenset] = {}
@@ -137,7 +134,7 @@ def _row_by_row(jaxpr: jex.Jaxpr) -> jex.Jaxpr:
         functions = frozenset((k, j) for j in range(_number(eqn))).union(*sources)
         behind |= dict.fromkeys(eqn.outvars, functions)
         vector = eqn.primitive.name in ("stack", "concatenate") and len(_shape(eqn.outvars[0])) == 1
-        if vector and len(functions) > _TOGETHER:
+        if vector and len(functions) > 1:
             rows = _equation(_rows, tuple(v.aval for v in eqn.invars))
             eqn = rows.replace(invars=eqn.invars, outvars=eqn.outvars, source_info=eqn.source_info)
         eqns.append(eqn)
@@ -174,8 +171,6 @@ def _replaced(jaxpr: jex.Jaxpr, trigonometry: bool) -> jex.Jaxpr:
 def _replaced_equation(eqn: jex.JaxprEqn, trigonometry: bool) -> jex.JaxprEqn:
     if eqn.primitive in _FACTORIZATIONS:
         ours = _factorization(eqn)
-    elif eqn.primitive.name == "custom_jvp_call":
-        ours = _with_own_derivative(eqn, trigonometry)
     else:
         ours = _trigonometric(eqn) if trigonometry else None
     if ours is not None:
@@ -225,8 +220,8 @@ def _trigonometric(eqn: jex.JaxprEqn) -> _Ours | None:
     if eqn.primitive not in _TRIGONOMETRY or eqn.params.get("accuracy") is not None:
         return None
     avals = _avals(eqn)
-    same = of_one_type(*(aval.dtype for aval in avals))
-    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if same else None
+    ours = are_double(*(aval.dtype for aval in avals))
+    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if ours else None
 
 
 def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:
@@ -239,36 +234,6 @@ def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:
     names = ("left_side", "lower", "transpose_a", "unit_diagonal")
     options = tuple((name, given[name]) for name in names if name in given)
     return _Ours(_FACTORIZATIONS[eqn.primitive], avals, options)
-
-
-def _with_own_derivative(eqn: jex.JaxprEqn, trigonometry: bool) -> _Ours | None:
-    """A function with a derivative rule of its own that factorizes a matrix, as `det` does; its
-    rule is rewritten, too."""
-    variables = [v for v in eqn.invars if isinstance(v, jex.Var)]
-    kept = all(type(v).__name__ != "DropVar" for v in eqn.outvars)
-    if not (len(set(variables)) == len(eqn.invars) and kept and _factorizes(eqn)):
-        return None
-    program = eqn.params["call_jaxpr"]
-    alone = program.jaxpr.replace(constvars=[], invars=variables, outvars=eqn.outvars, eqns=[eqn])
-    theirs = jex.jaxpr_as_fun(program.replace(jaxpr=alone, consts=[]))
-    ours = jex.jaxpr_as_fun(_replaced_program(program, trigonometry))
-    return _Ours(_derived_as(theirs, ours, trigonometry), _avals(eqn))
-
-
-def _factorizes(eqn: jex.JaxprEqn) -> bool:
-    return eqn.primitive in _FACTORIZATIONS or any(map(_factorizes, _inner(eqn)))
-
-
-def _derived_as(theirs: Callable, ours: Callable, trigonometry: bool) -> Callable:
-    """`ours`, with the derivative of `theirs`, in which we replace the same."""
-    function = jax.custom_jvp(lambda *x: tuple(ours(*x)))
-
-    @function.defjvp
-    def rule(primals, tangents):
-        derivative = lambda *both: jax.jvp(lambda *x: tuple(theirs(*x)), *both)  # noqa: E731
-        return vectorized(derivative, trigonometry=trigonometry)(primals, tangents)
-
-    return jax.jit(function)
 
 
 def _shape(v: Any) -> tuple[int, ...]:

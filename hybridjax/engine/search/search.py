@@ -16,7 +16,7 @@ from ..arrays import Array, Index, Inputs, Mask, Times
 from ..events import arm
 from ..lanes import Lanes
 from ..settings import Settings
-from ..tape import EventLog, Tape, blank_log, blank_tape, log_events, write_row
+from ..tape import Tape, blank_tape, write_row
 from ..target import Target
 from ..watch import watch
 from .accept import uneventful
@@ -36,8 +36,6 @@ class Moved(NamedTuple):
     """Sum of the steps' error estimates, relative to the tolerance."""
     result: Index
     """`Result` codes. A lane that failed stays where it failed."""
-    log: EventLog | None
-    """The events on the way, if requested."""
 
 
 class Recorded(NamedTuple):
@@ -60,8 +58,6 @@ class Options(NamedTuple):
     """Arm the guards for the input u, which may have jumped."""
     tangents: Bool[Array, ""] | bool = False
     """Make steps also short enough for the derivatives of a replay."""
-    event_log: int = 0
-    """Keep a log of so many events of each lane."""
 
 
 def search(
@@ -81,15 +77,14 @@ def search(
     task = Task(u, target, target.limit - lanes.t, stride, settings, options.tangents)
     begin = _begin(s, lanes, result, task, options.new_input)
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
-    log = blank_log(options.event_log, lanes) if options.event_log else None
 
     def all_the_way() -> Recorded:
         def going(carry):
-            state, *_ = carry
+            state, _ = carry
             return (state.i < settings.max_steps) & state.active.any()
 
         def iterate(carry):
-            state, tape, log = carry
+            state, tape = carry
             aim = take_aim(s, state, task)
             new = attempt(s, state, aim, task)
             end, row = cond(
@@ -97,12 +92,11 @@ def search(
                 lambda: without_events(s, state, aim, new, task),
                 lambda: with_events(s, state, aim, new, task),
             )
-            tape = None if tape is None else write_row(tape, state.i, row)
-            return end, tape, None if log is None else log_events(log, row)
+            return end, None if tape is None else write_row(tape, state.i, row)
 
-        end, written, events = while_loop(going, iterate, (begin, tape, log))
+        end, written = while_loop(going, iterate, (begin, tape))
         result = update_result(end.result, end.active, Result.STEP_LIMIT)
-        return Recorded(Moved(end.lanes, end.h, end.error, result, events), written)
+        return Recorded(Moved(end.lanes, end.h, end.error, result), written)
 
     if not options.glide:
         return all_the_way()
@@ -111,7 +105,7 @@ def search(
     def in_one_step() -> Recorded:
         end, row = without_events(s, begin, aim, new, task)
         written = None if tape is None else write_row(tape, begin.i, row)
-        return Recorded(Moved(end.lanes, end.h, end.error, end.result, log), written)
+        return Recorded(Moved(end.lanes, end.h, end.error, end.result), written)
 
     return cond(arrives.all(), in_one_step, all_the_way)
 

@@ -26,7 +26,7 @@ from ..._core.boundary.kinds import (
 )
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
-from .partition import check_sharing, is_real, meets_itself, regular
+from .partition import check_sharing, is_real, needs_two_phases, regular
 
 
 InputNames = Count | SignalNames
@@ -41,9 +41,9 @@ _SAME_PHASES = 1e-6
 # A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Smaller: estimates divide
 # by almost zero. Larger: weak signals are refused.
 _VANISHING = 1e-3
-# Frequencies may miss multiples of 1/P by this, in lines. Smaller: rounding of f is refused.
-# Larger: a wrong frequency is moved without an error.
-_OFF_LINE = 1e-6
+# Frequencies and edges of a band may miss multiples of 1/P by this, in lines. Smaller: rounding of
+# f is refused. Larger: a wrong frequency is moved without an error.
+OFF_LINE = 1e-6
 
 
 @checked
@@ -64,7 +64,6 @@ class Design(eqx.Module):
     - `channel`: index of the input it is applied to.
     - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
     - `n_sections`: N. `periods`: P. `experiments`: their number S. `input_names`.
-    - `highest_harmonic`: M, beyond which harmonics are taken as zero, or None for no assumption.
     """
 
     experiment: Int[np.ndarray, " K"]
@@ -76,7 +75,6 @@ class Design(eqx.Module):
     periods: PeriodCount = eqx.field(static=True)
     experiments: ExperimentCount = eqx.field(static=True)
     input_names: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
-    highest_harmonic: Index | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         self.check()
@@ -140,8 +138,7 @@ class Design(eqx.Module):
         """Check the rules under which the HTFs follow from the experiments uniquely (Sec. V).
 
         - every f lies in [0, N/2], amplitudes are positive, phases finite;
-        - in one experiment no two frequencies differ by, or add up to, an integer (with
-          `highest_harmonic` M: an integer up to 2 M, counted around the circle of N);
+        - in one experiment no two frequencies differ by, or add up to, an integer;
         - a frequency that excites several inputs together does so in as many experiments, with
           phases that tell them apart;
         - a frequency on a multiple of 1/2 (eq. 16) is excited in two experiments at least, with
@@ -169,14 +166,13 @@ class Design(eqx.Module):
         nu = len(self.input_names)
         outside = (self.channel < 0) | (self.channel >= nu)
         self._refuse(outside, f"is applied to an input that is not one of the {nu}")
-        highest = None if self.highest_harmonic is None else 2 * self.highest_harmonic
         # Several inputs may share a line, but none may have it twice.
         entry = np.stack([self.experiment, self.line, self.channel], axis=1)
         _, again = np.unique(entry, axis=0, return_counts=True)
         if (again > 1).any():
             check_sharing(self.experiment, self.line, P)
         pair = np.unique(entry[:, :2], axis=0)
-        check_sharing(pair[:, 0], pair[:, 1], P, n_sections=N, highest=highest)
+        check_sharing(pair[:, 0], pair[:, 1], P)
         self._check_together(len(pair))
 
         u = self.amplitude * np.exp(1j * self.phase)
@@ -185,7 +181,7 @@ class Design(eqx.Module):
         re, im = np.bincount(group, np.real(square)), np.bincount(group, np.imag(square))
         alike = np.hypot(re, im) / power
         self._refuse(
-            (meets_itself(self.line, P, N, highest) & (alike > 1 - _SAME_PHASES)[group]),
+            (needs_two_phases(self.line, P, N) & (alike > 1 - _SAME_PHASES)[group]),
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (multisine(lines='two-phase') does so), or "
             "leave it out",
@@ -335,7 +331,7 @@ class Design(eqx.Module):
     def __repr__(self) -> str:
         f, sizes = self.frequencies, np.bincount(self.experiment)
         crest, per = self.crest_factors(), self.expected_variance()
-        per, M = per[np.isfinite(per)], self.highest_harmonic
+        per = per[np.isfinite(per)]
         rows = [
             f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
             f"{self.n_sections} sections, inputs {', '.join(self.input_names)})",
@@ -345,8 +341,6 @@ class Design(eqx.Module):
             f"  cost         {self.cycles(0)} cycles, without those discarded",
             f"  noise        of std s in an output gives H_m a std of {_span(np.sqrt(per))} s",
         ]
-        if M is not None:
-            rows.append(f"  assumes      H_m = 0 for |m| > {M}")
         return "\n".join(rows)
 
 
@@ -379,7 +373,7 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
     """
     exact = np.asarray(frequencies, float) * periods
     lines = np.rint(exact)
-    wrong = ~(np.abs(exact - lines) < _OFF_LINE)
+    wrong = ~(np.abs(exact - lines) < OFF_LINE)
     if wrong.any():
         f = float(np.asarray(frequencies)[np.argmax(wrong)])
         raise DefinitionError(

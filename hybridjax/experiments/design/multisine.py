@@ -5,12 +5,10 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
     ExperimentCount,
-    Index,
     NonNegative,
     PeriodCount,
     Positive,
@@ -20,10 +18,9 @@ from ..._core.boundary.kinds import (
     Vector,
 )
 from ...errors import DefinitionError
-from .design import Design, InputNames, check_window, input_names, to_lines
+from .design import OFF_LINE, Design, InputNames, check_window, input_names, to_lines
 from .partition import (
     assign,
-    assign_apart,
     avoid_second_order,
     fewest_experiments,
     is_half_integer,
@@ -36,9 +33,6 @@ Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "disjoint", "orthogonal"]
 
-# Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at
-# the edges. Larger: a line outside of the band is taken.
-_EDGE = 1e-9
 # Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
 # (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
 _POWERS = (4, 8, 16, 32, 64, 128)
@@ -58,7 +52,6 @@ def multisine(
     lines: Lines = "all",
     division: Division = "random",
     experiments: ExperimentCount | None = None,
-    highest_harmonic: Index | None = None,
     inputs: InputNames = 1,
 ) -> Design:
     """Return a design of multisines that measure every frequency `j / periods` in a band.
@@ -94,9 +87,6 @@ def multisine(
       weaker and have fewer cosines each, and so less distortion. With the fewest for all
       frequencies, every second-order product falls on a frequency of the same experiment, so
       amplitudes must be small. Default: the fewest possible.
-    - `highest_harmonic`: M, beyond which harmonics are taken as zero. Then 2 M + 1 experiments may
-      suffice instead of 20. Pass M to the estimate, too: `estimate_htf(data, highest=M)`. Default:
-      no assumption.
     - `inputs`: their number or names. Default: 1.
 
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too few
@@ -104,27 +94,19 @@ def multisine(
     """
     names = input_names(inputs)
     check_window(n_sections, periods)
-    _check_choices(lines, division, periods, highest_harmonic)
+    _check_choices(lines, division, periods)
     j = _lines(n_sections, periods, band or (0.0, min(10.0, n_sections / 2)), lines)
     # A frequency that needs two phases is listed twice; `second` marks the repetition.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, n_sections)]]))
     second = np.concatenate([[False], j[1:] == j[:-1]])
     nu, rng = len(names), np.random.default_rng(seed)
-    if highest_harmonic is not None:
-        each = None if experiments is None else experiments // nu
-        sets = [
-            assign_apart(j, periods, n_sections, highest_harmonic, rng, each) for _ in range(nu)
-        ]
-        total = nu * (int(sets[0].max()) + 1)
-    else:
-        sets, total = [], _number(j, periods, nu, experiments)
+    total = _number(j, periods, nu, experiments)
     shares = [total // nu + (i < total % nu) for i in range(nu)]
-    phases = []
+    sets, phases = [], []
     for i in range(nu):
-        if highest_harmonic is None:
-            sets.append(assign(j, periods, shares[i], rng))
-            if division == "sum-free":
-                sets[i] = avoid_second_order(sets[i], j, periods, rng)
+        sets.append(assign(j, periods, shares[i], rng))
+        if division == "sum-free":
+            sets[i] = avoid_second_order(sets[i], j, periods, rng)
         phase = rng.uniform(0, 2 * np.pi, len(j))
         phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
         phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
@@ -149,7 +131,6 @@ def multisine(
         periods=periods,
         experiments=int(experiment.max()) + 1,
         input_names=names,
-        highest_harmonic=highest_harmonic,
     )
 
 
@@ -171,16 +152,9 @@ def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> in
     return experiments
 
 
-def _check_choices(lines, division, periods, highest_harmonic) -> None:
-    if lines == "two-phase" and (
-        division not in ("random", "sum-free") or highest_harmonic is not None
-    ):
-        raise DefinitionError(
-            "lines='two-phase' goes with division='random' or 'sum-free' only, and not with "
-            "highest_harmonic."
-        )
-    if highest_harmonic is not None and division != "random":
-        raise DefinitionError(f"highest_harmonic and division={division!r} exclude each other.")
+def _check_choices(lines, division, periods) -> None:
+    if lines == "two-phase" and division not in ("random", "sum-free"):
+        raise DefinitionError("lines='two-phase' goes with division='random' or 'sum-free' only.")
     if lines == "odd" and periods % 2:
         raise DefinitionError(
             f"lines='odd' needs an even number of periods, not {periods}: else the even-order "
@@ -196,7 +170,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
             f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}] cycles per "
             "period."
         )
-    low, high = int(np.ceil(f_min * periods - _EDGE)), int(np.floor(f_max * periods + _EDGE))
+    low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~is_half_integer(j, periods)]
@@ -325,6 +299,8 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
 def _lower(phase, free, line, size, length: int):
     """Return the free phases of one signal that minimize its peak."""
+    from scipy.optimize import minimize  # (a third of a second, needed by few designs)
+
     spectrum, best, least = np.zeros(length // 2 + 1, complex), phase[free], np.inf
 
     def signal(x):

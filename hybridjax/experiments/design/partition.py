@@ -48,22 +48,6 @@ def needs_two_phases(
     return is_half_integer(line, periods) & ~is_real(line, periods, n_sections)
 
 
-def meets_itself(
-    line: Int[np.ndarray, " K"], periods: int, n_sections: int, highest: int | None = None
-) -> Bool[np.ndarray, " K"]:
-    """Return whether f needs two phases if harmonics beyond `highest` are zero."""
-    meets = needs_two_phases(line, periods, n_sections)
-    if highest is not None:
-        meets &= _around(2 * line, periods, n_sections) <= highest
-    return meets
-
-
-def _around(lines: Int[np.ndarray, " K"], periods: int, n_sections: int) -> Int[np.ndarray, " K"]:
-    """Return the harmonic between lines at this distance, around the circle of N."""
-    turns = (lines // periods) % n_sections
-    return np.minimum(turns, n_sections - turns)
-
-
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
@@ -96,45 +80,6 @@ def assign(
         experiment[members] = least_full
         load[least_full] += 1
     return experiment
-
-
-def assign_apart(
-    line: Int[np.ndarray, " K"],
-    periods: int,
-    n_sections: int,
-    highest: int,
-    rng: np.random.Generator,
-    experiments: int | None = None,
-) -> Int[np.ndarray, " K"]:
-    """Return a partition in which no harmonic up to `2 highest` leads from one line to another.
-
-    All lines of a class are integers k apart, if f = c + k and -f = c + k are both brought to the
-    form c + k. Lines with the same remainder of k modulo S share an experiment: then they are S or
-    more apart, also around the circle of N where that is so for the given S. Without `experiments`
-    the smallest such S from `2 highest + 1` on is taken.
-
-    **Raises:** `DefinitionError` for a number of experiments that does not do.
-    """
-    cell = np.where(2 * (line % periods) < periods, line // periods, -(line // periods) - 1)
-    classes = line_class(line, periods)
-    fewest = fewest_experiments(line, periods)
-    least = 2 * highest + 1
-    _, place = np.unique(classes, return_inverse=True)
-    for S in range(least, fewest) if experiments is None else [experiments]:
-        offsets = rng.integers(0, S, place.max() + 1)
-        experiment = (cell + offsets[place]) % S
-        try:
-            check_sharing(experiment, line, periods, n_sections=n_sections, highest=2 * highest)
-        except DefinitionError:
-            continue
-        return experiment
-    if experiments is None or experiments >= fewest:
-        return assign(line, periods, experiments or fewest, rng)
-    raise DefinitionError(
-        f"{experiments} experiments are too few for harmonics up to {highest}: lines of one "
-        f"experiment would be closer than {least} cycles per period (around the circle of N = "
-        f"{n_sections}); take at least {least}, or leave the number open."
-    )
 
 
 def avoid_second_order(
@@ -217,11 +162,8 @@ def check_sharing(
     line: Int[np.ndarray, " K"],
     periods: int,
     hint: Callable[[int], str] = lambda experiment: "",
-    n_sections: int = 0,
-    highest: int | None = None,
 ) -> None:
-    """Check that no two lines of one experiment have the same class; or, where harmonics beyond
-    `highest` are taken as zero, that no such harmonic leads from one to the other.
+    """Check that no two lines of one experiment have the same class.
 
     **Raises:** `DefinitionError` that names the experiment and the first pair; the text of
     `hint(experiment)` is added to it.
@@ -229,18 +171,10 @@ def check_sharing(
     classes = line_class(line, periods)
     order = np.lexsort((line, classes, experiment))
     e, c, j = experiment[order], classes[order], line[order]
-    for step in range(1, len(e)):
-        same = (e[step:] == e[:-step]) & (c[step:] == c[:-step])
-        if not same.any():
-            return
-        low, high = j[:-step], j[step:]
-        clash = same
-        if highest is not None:
-            apart = np.where((high - low) % periods == 0, high - low, high + low)
-            clash = same & (_around(apart, periods, n_sections) <= highest)
-        if clash.any():
-            first = int(np.argmax(clash))
-            _refuse(int(low[first]), int(high[first]), int(e[first]), periods, hint)
+    clash = (e[1:] == e[:-1]) & (c[1:] == c[:-1])
+    if clash.any():
+        k = int(np.argmax(clash))
+        _refuse(int(j[k]), int(j[k + 1]), int(e[k + 1]), periods, hint)
 
 
 def _refuse(low: int, high: int, number: int, periods: int, hint: Callable[[int], str]) -> None:

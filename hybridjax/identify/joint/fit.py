@@ -1,6 +1,5 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import equinox as eqx
@@ -21,7 +20,7 @@ from ...linear.frequency_response import Harmonics, all_harmonics, check_harmoni
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import multipliers_of
-from ..htf_errors import ROUNDING, check_values, error_weights
+from ..htf_errors import SMALLEST_ERROR, check_values, error_weights
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
@@ -34,9 +33,6 @@ from .realization import given_dims, realize
 from .subspace import subspace_model
 
 
-# Cost, relative to its expectation, above which a `repr` reports a misfit. Larger: errors 1.4 times
-# as large as their variances go unmentioned; smaller: chance does.
-_TOO_LARGE = 2.0
 # Periods of the impulse response from which a minimal model is made, and lags at least. Fewer:
 # states that appear late are missed.
 _PERIODS, _LAGS = 4, 17
@@ -158,7 +154,7 @@ class LDTPFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > _TOO_LARGE * self.freedom:
+        if self.cost > 2 * self.freedom:
             about += (
                 " (errors are larger than their variances: too few dimensions, or a local minimum "
                 "that another guess avoids)"
@@ -260,7 +256,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
-        weight = problem.weight / np.maximum(np.sqrt(square / 2), ROUNDING)[:, None]
+        weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
         point, converged = minimize(problem, point.model, direct, max_steps)
     model = point.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)
@@ -282,7 +278,7 @@ def _fit_to_series(
             "(`lead`), those of an LDTP on earlier ones only: use `fit_series`."
         )
     N, ny, scale = records.n_sections, len(records.outputs), records.scale
-    parts = SeriesParts(records)
+    parts = [SeriesPart.of(grid, scale) for grid in records.grids]
     first = [n for part in parts for n in part.first.tolist()]
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
@@ -315,20 +311,6 @@ def _fit_to_series(
     fitted = model.to_ldtp(scale, records.inputs, records.outputs)
     harmonics = all_harmonics(N)
     return _finished(point, converged, fitted, scale, harmonics, freedom, False, sources)
-
-
-class SeriesParts:
-    """The grids of records by section, which can be iterated over again and again."""
-
-    def __init__(self, records: PreparedRecords):
-        self._records = records
-        self._kept = list(self._read()) if records.in_memory else None
-
-    def _read(self) -> Iterator[SeriesPart]:
-        return (SeriesPart.of(grid, self._records.scale) for grid in self._records)
-
-    def __iter__(self) -> Iterator[SeriesPart]:
-        return self._read() if self._kept is None else iter(self._kept)
 
 
 def _without_direct(model: PeriodicModel, direct: bool) -> PeriodicModel:

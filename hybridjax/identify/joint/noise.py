@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.arguments import require_same
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Scalar, Vector
 from ...errors import DefinitionError
@@ -14,13 +13,8 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.ldtp import LDTP
 from ..series.records import CycleGrid
 from .frequency import adjoints
-from .model import Blocks, PeriodicModel
+from .model import PeriodicModel
 from .prediction import SeriesPart, SeriesProblem
-
-
-# Periods after which a gain that still changes raises an error, and the last change of a
-# covariance, relative to the standard deviations.
-_MAX_PERIODS, _SETTLED = 10_000, 1e-12
 
 
 @checked
@@ -113,30 +107,6 @@ class Predictor(NamedTuple):
     def dims(self) -> list[int]:
         return self.model.dims
 
-    @classmethod
-    def of(cls, model: LDTP, noise: LDTP) -> "Predictor":
-        """Return the predictor of outputs that are the sum of those of a model and of noise.
-
-        **Raises:** `DefinitionError` if these do not fit together, or an output has no noise of its
-        own.
-        """
-        require_same("model and noise", model, noise, ("n_sections", "outputs"))
-        ones = np.ones(len(model.outputs))
-        plant, source = PeriodicModel.of(model, ones), PeriodicModel.of(noise, ones)
-        K, S = _innovations(source)
-        d, after = plant.dims, [len(A) for A in plant.A]
-        both = PeriodicModel(
-            A=[
-                np.block([[a, np.zeros((len(a), e))], [np.zeros((len(b), i)), b]])
-                for a, b, i, e in zip(plant.A, source.A, d, source.dims, strict=True)
-            ],
-            B=[np.pad(b, [(0, len(k)), (0, 0)]) for b, k in zip(plant.B, K, strict=True)],
-            C=[np.concatenate(pair, axis=1) for pair in zip(plant.C, source.C, strict=True)],
-            D=plant.D,
-            K=[np.pad(k, [(i, 0), (0, 0)]) for k, i in zip(K, after, strict=True)],
-        )
-        return cls(both, S, model.inputs, model.outputs)
-
     def predict(self, record: Record, free_start: bool) -> Float[np.ndarray, "n ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(CycleGrid.from_records([record]), np.ones(len(self.outputs)))
@@ -148,37 +118,3 @@ class Predictor(NamedTuple):
         expected = np.where(part.sampled, part.y - np.stack(path.error), np.stack(expected))
         rows = slice(record.first_section, record.first_section + len(record.u))
         return np.moveaxis(expected[:, 0], 0, 1).reshape(-1, len(self.outputs))[rows]
-
-
-def _innovations(noise: PeriodicModel) -> tuple[Blocks, Float[np.ndarray, "N ny ny"]]:
-    """Return the Kalman gain and the covariance of the innovations of the steady state.
-
-    The periodic Riccati equation is iterated (Bittanti and Colaneri 2009) from the covariance of
-    the state without measurements, after as many periods as the state has coordinates: it has the
-    units of the states, and all noise has reached it.
-    """
-    P = np.zeros((noise.dims[0], noise.dims[0]))
-    for _ in range(noise.dims[0]):
-        for A, B in zip(noise.A, noise.B, strict=True):
-            P = A @ P @ A.T + B @ B.T
-    unit, S = np.sqrt(np.diag(P)), np.zeros((noise.n_sections, *noise.D[0].shape[:1] * 2))
-    for _ in range(_MAX_PERIODS):
-        before, K = (P, S), []
-        S = np.zeros_like(S)
-        for n, (A, B, C, D) in enumerate(zip(noise.A, noise.B, noise.C, noise.D, strict=True)):
-            S[n] = C @ P @ C.T + D @ D.T
-            if not np.linalg.eigvalsh(S[n])[0] > 0:
-                raise DefinitionError(
-                    "the outputs have no noise of their own at a section: give each some, however "
-                    "small, by an input of its own in `noise.D`."
-                )
-            K.append(np.linalg.solve(S[n], (A @ P @ C.T + B @ D.T).T).T)
-            left, entering = A - K[-1] @ C, B - K[-1] @ D
-            P = left @ P @ left.T + entering @ entering.T
-        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-        if all(
-            (np.abs(new - old) <= _SETTLED * size[..., :, None] * size[..., None, :]).all()
-            for new, old, size in zip((P, S), before, (unit, sizes), strict=True)
-        ):
-            return K, S
-    raise DefinitionError("the noise has no steady state: give a stable model of it.")

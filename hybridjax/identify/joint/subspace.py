@@ -1,32 +1,27 @@
 """A first periodic model of time series: regression on the past, then a common state."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ...errors import DefinitionError
+from ..denominator import SLOWEST
 from .model import PeriodicModel
 from .prediction import SeriesPart
+from .realization import SHORTEST_HORIZON
 
 
 # Samples of a section for each coefficient of the regression on its past, and periods of the past
 # at most. Larger: a short past, which states outlast; smaller: noise.
 _ROWS, _PERIODS = 3, 2
-# Sections in which a state is observed, at least. Smaller: less averaging.
-_SHORTEST_HORIZON = 8
 # Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
 # combinations that are hardly excited.
 _SHRINKAGE = 1e-6
-# Largest modulus of a multiplier of a start, and of the errors of its predictions. Larger:
-# predictions overflow.
-_LARGEST_MODULUS = 0.99
-# Samples that are used, of data that are read in parts. Larger: memory.
-_SAMPLES = 200_000
 
 
 def subspace_model(
-    parts: Iterable[SeriesPart], dims: Sequence[int], innovations: bool
+    parts: Sequence[SeriesPart], dims: Sequence[int], innovations: bool
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K.
 
@@ -42,7 +37,7 @@ def subspace_model(
     columns = z.shape[2]
     sections = [_Section(z, y, inside, n, N) for n in range(N)]
     samples = min(len(section.y) for section in sections)
-    past = min(samples // (_ROWS * columns), max(_PERIODS * N, _SHORTEST_HORIZON))
+    past = min(samples // (_ROWS * columns), max(_PERIODS * N, SHORTEST_HORIZON))
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
@@ -51,7 +46,7 @@ def subspace_model(
             "`hj.identify.realize(hj.fit_series(...))`."
         )
     rules = [section.regression(past) for section in sections]
-    horizon = max(-(-most // ny) + 1, min(past, N, _SHORTEST_HORIZON))
+    horizon = max(-(-most // ny) + 1, min(past, N, SHORTEST_HORIZON))
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
@@ -101,22 +96,15 @@ class _Section:
 
 
 def _signals(
-    parts: Iterable[SeriesPart],
+    parts: Sequence[SeriesPart],
 ) -> tuple[Float[np.ndarray, "R n columns"], Float[np.ndarray, "R n ny"], Bool[np.ndarray, "R n"]]:
-    """Return inputs and outputs of some records side by side, with zeros for missing samples; the
+    """Return inputs and outputs of all records side by side, with zeros for missing samples; the
     outputs, with NaN there; and whether a sample lies inside of a record."""
-    chosen: list[SeriesPart] = []
-    size = 0
-    for part in parts:
-        if size and size + part.y[..., 0].size > _SAMPLES:
-            break
-        chosen.append(part)
-        size += part.y[..., 0].size
-    longest = max(part.shape[1] for part in chosen)
+    longest = max(part.shape[1] for part in parts)
 
     def flat(name: str) -> np.ndarray:  # (N R T k) -> (R, T N, k)
         out = []
-        for part in chosen:
+        for part in parts:
             x = getattr(part, name)
             x = np.pad(x, [(0, 0), (0, 0), (0, longest - x.shape[2]), (0, 0)])
             out.append(np.moveaxis(x, 0, 2).reshape(x.shape[1], -1, x.shape[3]))
@@ -154,9 +142,9 @@ def _from_states(
         K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
     model = PeriodicModel(A, B, C, D, K)
     size = np.abs(np.linalg.eigvals(model.monodromy())).max()
-    shrunk = (_LARGEST_MODULUS / max(size, _LARGEST_MODULUS)) ** (1 / N)
+    shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
     model = model._replace(A=[a * shrunk for a in A])
-    while innovations and _slowest_error(model) > _LARGEST_MODULUS:
+    while innovations and _slowest_error(model) > SLOWEST:
         model = model._replace(K=[k / 2 for k in model.K])
     return model
 

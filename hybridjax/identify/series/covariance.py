@@ -16,14 +16,12 @@ from ..denominator import (
     sandwich,
 )
 from ..htf_errors import amounts
-from .linearization import Linearization, each_part, linearize, measured_outputs
+from .linearization import Linearization, each_fit, linearize, measured_outputs
 from .output_error import OutputErrorProblem
 from .records import CycleGrid, divide_by_chi
 from .robust import Loss, efficiency
 
 
-# Largest correction of a covariance for the degrees of freedom that the minimum takes: to 1 / 0.5.
-_SMALLEST_FREEDOM = 0.5
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
 # by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
 _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
@@ -67,9 +65,6 @@ def gradient_covariance(
     """
     d = len(solution.c)
     memory = fading(solution.c)
-    scores: dict[int, Float[np.ndarray, "B C d"]] = {}
-    expectations: dict[int, Float[np.ndarray, "B d d"]] = {}
-    squares, filtered = np.zeros((2, 1 + _FILTERED_DRAWS)), np.zeros((d, d))
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
@@ -101,21 +96,17 @@ def gradient_covariance(
             expected -= np.einsum("brid,brie->bde", along, along)
         return score, expected, square, np.einsum("stid,stie->de", late, late)
 
-    def collect(k, results):
-        scores[k] = sum(score for score, *_ in results)
-        expectations[k] = sum(expected for _, expected, *_ in results)
-        for _, _, square, late in results:
-            squares[:] += square
-            filtered[:] += late
-
     fits = linearize(problem, solution.c, outputs).fits
-    each_part(problem, solution._replace(fits=fits), section, collect)
+    results = each_fit(problem, solution._replace(fits=fits), section)
+    score, by_white = (
+        np.concatenate([sum(result[i] for result in grid) for grid in results]) for i in (0, 1)
+    )
+    squares = np.sum([result[2] for grid in results for result in grid], axis=0)
+    filtered = sum(result[3] for grid in results for result in grid)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
     white = np.array([[solution.freedom.sum(), first], [first, second]])
     of_white, of_filtered = amounts(white, squares[:, 0])
-    score = np.concatenate(list(scores.values()))
-    by_white = np.concatenate(list(expectations.values()))
     by_filtered = np.einsum("bcd,bce->de", score[:, 1:], score[:, 1:]) / _FILTERED_DRAWS
     expected = of_white * by_white.sum(axis=0) + of_filtered * by_filtered
     true = of_white * solution.curvature.sum(axis=0) + of_filtered * filtered
@@ -129,5 +120,5 @@ def gradient_covariance(
     scaled, share = score[:, 0] @ half.T, share @ by_white @ share.T
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
-    matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, _SMALLEST_FREEDOM)
+    matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
     return Covariance(matrix, block_freedom(scaled, share))

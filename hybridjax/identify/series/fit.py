@@ -19,13 +19,14 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import Denominator, chi, multipliers_of
+from ..htf_errors import SMALLEST_ERROR
 from ..multiplier_estimate import MultiplierEstimate
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .covariance import coefficient_covariance
 from .linearization import Linearization, minimize
 from .output_error import OutputErrorProblem
 from .records import PreparedRecords
-from .robust import ROUNDING, Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
+from .robust import Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
 
 
 class SeriesFit(MultiplierEstimate):
@@ -145,14 +146,12 @@ def fit_series(
 
     - `data`: a `Record` of any length, with gaps or without; `ExperimentData`, of which all cycles
       of the experiments that did not fail are used; `SectionData`; or several of these.
-      `StoredExperiments` are read in parts, about thirty times.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model with this number.
     - `overhang`: number of lags of the numerators beyond d N. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `loss`: function of the errors that is minimized. "squares" is the most accurate for Gaussian
-      errors. "huber" and "student" are for outliers: squares up to 1.345 standard deviations and
-      linear beyond, or the likelihood of Student's distribution with 4 degrees of freedom
+      errors. "huber" is for outliers: squares up to 1.345 standard deviations and linear beyond
       (iteratively reweighted, standard deviations from the median). `noise` is then the standard
       deviation of Gaussian errors for which squares are as accurate. Default: "squares".
     - `errors`: source of the covariance. "residuals": the residuals of blocks of successive cycles,
@@ -194,7 +193,7 @@ def fit_records(
         c, solution, converged = minimize(problem, c, max_steps)
         noise = _noise(solution) * problem.scale
     else:
-        problem, c, solution, converged = minimize_robust(problem, c, loss, max_steps)
+        problem, c, solution, converged = minimize_robust(problem, c, max_steps)
         _require_freedom(problem, solution)
         noise = rms_of(usual, misfit(problem, solution)) * problem.scale
     if check:
@@ -244,7 +243,7 @@ def assemble(
 def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     """Return the standard deviation of each output's noise, in units of the problem's scale."""
     left = solution.freedom.sum(axis=0) - len(solution.c) / solution.freedom.shape[1]
-    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), ROUNDING)
+    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:

@@ -1,20 +1,22 @@
 """The linearized output-error problem at some c: sums over all records, and its minimum in c."""
 
-from collections.abc import Callable
-from functools import cached_property
+import functools
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..._core.execution import on_all_cores
 from ..descent import Coefficients, least_squares
-from .output_error import OutputErrorProblem, SectionRegression, in_passes, root_of
+from .output_error import OutputErrorProblem, SectionRegression, root_of
 from .records import CycleGrid, divide_by_chi
 
 
 Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
 """C columns for each output, as a function of the number of a grid, the grid and a section."""
-Regress = Callable[[CycleGrid, Any, int], list[SectionRegression]]
+Regress = Callable[[int, CycleGrid, int], list[SectionRegression]]
+"""The regressions of a section, one for each list of outputs."""
 
 
 class SectionFit(NamedTuple):
@@ -45,66 +47,54 @@ class SectionFit(NamedTuple):
         return left, regression.residual(self.slopes, fitted)
 
 
-class SectionSums:
-    """Sums over all records for some outputs of a section, in three passes.
+class SectionSums(NamedTuple):
+    """Sums over all records for some outputs of a section."""
 
-    Each pass solves with the sums of the previous ones, and the last removes rounding errors: the
-    result is as accurate as that of one QR decomposition.
-    """
+    fit: SectionFit
+    freedom: float
+    products: Float[np.ndarray, "m C C"]
+    """Products of the residuals of different columns."""
+    gradient: Float[np.ndarray, "m d"]
+    curvature: Float[np.ndarray, "m d d"]
 
-    def __init__(self, outputs: list[int], c: Coefficients):
-        self.outputs, self._c = outputs, c
-        self._gram: Any = 0.0
-        self._along: Any = 0.0
-        self._along_left: Any = 0.0
-        self._along_slopes: Any = 0.0
-        self._along_last: Any = 0.0
-        self._curvature: Any = 0.0
-        self.freedom = 0.0
-        self.products: Any = 0.0
-        """(m, C, C): products of the residuals of different columns."""
-        self.gradient: Any = 0.0
+    @classmethod
+    def of(
+        cls,
+        outputs: list[int],
+        c: Coefficients,
+        regressions: list[SectionRegression],
+        columns: list[Float[np.ndarray, "S T m C"]],
+    ) -> "SectionSums":
+        """Fit the columns of all grids.
 
-    def begin(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        self._gram = self._gram + regression.along(regression.remainder)
-        self._along = self._along + regression.along(regression.reduced(x))
-        self.freedom += regression.freedom
+        The normal equations are solved twice, and the second solution removes rounding errors: the
+        result is as accurate as that of one QR decomposition.
+        """
+        pairs = list(zip(regressions, columns, strict=True))
+        root = root_of(_total(r.along(r.remainder) for r in regressions))
 
-    def refine(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        left = regression.residual(self._first, x)
-        fitted = filtered_response(self._first, self._c, regression, x)
-        self._along_left = self._along_left + regression.along(left)
-        self._along_slopes = self._along_slopes + regression.along(regression.reduced(fitted))
+        def solve(along: np.ndarray) -> np.ndarray:
+            return np.tensordot(root, np.tensordot(root.T, along, 1), 1)
 
-    def finish(self, regression: SectionRegression, x: Float[np.ndarray, "S T m C"]) -> None:
-        left, slopes = self.fit.samples(self._c, regression, x)
-        self._along_last = self._along_last + regression.along(slopes)
-        self.products = self.products + np.einsum("rmk,rml->mkl", left, left)
-        self.gradient = self.gradient + np.einsum("rjmk,rmk->mj", slopes, left)
-        self._curvature = self._curvature + np.einsum("rimk,rjmk->mij", slopes, slopes)
+        first = solve(_total(r.along(r.reduced(x)) for r, x in pairs))
+        a = first + solve(_total(r.along(r.residual(first, x)) for r, x in pairs))
+        fitted = (r.reduced(filtered_response(first, c, r, x)) for r, x in pairs)
+        slopes = solve(_total(r.along(x) for r, x in zip(regressions, fitted, strict=True)))
+        fit = SectionFit(outputs, root, a, slopes)
+        samples = [fit.samples(c, r, x) for r, x in pairs]
+        missed = _total(r.along(s) for r, (_, s) in zip(regressions, samples, strict=True))
+        curvature = _total(np.einsum("rimk,rjmk->mij", s, s) for _, s in samples)
+        return cls(
+            fit,
+            sum(r.freedom for r in regressions),
+            _total(np.einsum("rmk,rml->mkl", x, x) for x, _ in samples),
+            _total(np.einsum("rjmk,rmk->mj", s, x) for x, s in samples),
+            curvature - np.einsum("rimk,rjmk->mij", missed, solve(missed)),
+        )
 
-    @cached_property
-    def _root(self) -> Float[np.ndarray, "r k"]:
-        return root_of(self._gram)
 
-    @cached_property
-    def _first(self) -> Float[np.ndarray, "r m C"]:
-        return self._solved(self._along)
-
-    @cached_property
-    def fit(self) -> SectionFit:
-        """The fit, after the second pass."""
-        a = self._first + self._solved(self._along_left)
-        return SectionFit(self.outputs, self._root, a, self._solved(self._along_slopes))
-
-    @property
-    def curvature(self) -> Float[np.ndarray, "m d d"]:
-        """The products of derivatives, after the last pass."""
-        missed = self._solved(self._along_last)
-        return self._curvature - np.einsum("rimk,rjmk->mij", self._along_last, missed)
-
-    def _solved(self, along: np.ndarray) -> np.ndarray:
-        return np.tensordot(self._root, np.tensordot(self._root.T, along, 1), 1)
+def _total(terms: Iterable[np.ndarray]) -> np.ndarray:
+    return functools.reduce(np.add, terms)
 
 
 def filtered_response(
@@ -159,26 +149,20 @@ def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T 
 
 
 def sum_up(
-    problem: OutputErrorProblem,
-    c: Coefficients,
-    outputs: Outputs,
-    regress: Regress,
-    prepare: Callable[[CycleGrid], Any],
+    problem: OutputErrorProblem, c: Coefficients, outputs: Outputs, regress: Regress
 ) -> list[list[SectionSums]]:
     """Return the sums of each section, with one regression for each list of outputs."""
-    sums = [[SectionSums(outputs, c) for outputs in alike] for alike in problem.alike]
+    parts = problem.parts()
 
-    def of(work: Callable) -> Callable:
-        def section(k, part, n, regressions):
-            y = outputs(k, part, n)
-            for each, regression in zip(sums[n], regressions, strict=True):
-                work(each, regression, y[:, :, each.outputs])
+    def section(n: int) -> list[SectionSums]:
+        regressions = [regress(k, part, n) for k, part in enumerate(parts)]
+        columns = [outputs(k, part, n) for k, part in enumerate(parts)]
+        return [
+            SectionSums.of(alike, c, list(each), [x[:, :, alike] for x in columns])
+            for alike, each in zip(problem.alike[n], zip(*regressions, strict=True), strict=True)
+        ]
 
-        return section
-
-    passes = [of(work) for work in (SectionSums.begin, SectionSums.refine, SectionSums.finish)]
-    in_passes(problem, passes, regress, prepare)
-    return sums
+    return on_all_cores(section, range(problem.records.n_sections))
 
 
 def linearize(
@@ -190,7 +174,7 @@ def linearize(
     """
     N, nu, ny = problem.shape
     d, columns = len(c), problem.lags * nu
-    sums = sum_up(problem, c, outputs, *_regressions_at(problem, c))
+    sums = sum_up(problem, c, outputs, _regressions_at(problem, c))
     out = Linearization(
         c=c,
         square=np.zeros((N, ny)),
@@ -204,7 +188,7 @@ def linearize(
     )
     for n, (section, to_lags) in enumerate(zip(sums, problem.to_lags, strict=True)):
         for each in section:
-            which, fit = each.outputs, each.fit
+            fit, which = each.fit, each.fit.outputs
             out.square[n, which] = np.trace(each.products, axis1=1, axis2=2)
             out.gradient[which] += each.gradient
             out.curvature[which] += each.curvature
@@ -216,32 +200,34 @@ def linearize(
     return out
 
 
-def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> tuple[Regress, Callable]:
-    def regress(part: CycleGrid, v: np.ndarray, n: int) -> list[SectionRegression]:
-        return [problem.regression(part, v, c, n, alike[0]) for alike in problem.alike[n]]
+def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
+    inputs = [divide_by_chi(c, part.u) for part in problem.parts()]
 
-    return regress, lambda part: divide_by_chi(c, part.u)
+    def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
+        return [problem.regression(part, inputs[k], c, n, alike[0]) for alike in problem.alike[n]]
+
+    return regress
 
 
-def each_part(
+def each_fit(
     problem: OutputErrorProblem,
     solution: Linearization,
     work: Callable[[int, CycleGrid, int, SectionFit, SectionRegression], Any],
-    collect: Callable[[int, list[Any]], None],
-) -> None:
-    """Go through all grids, sections and lists of outputs once more, with the fits of a solution.
+) -> list[list[Any]]:
+    """Return, for each grid, the results of `work` at all sections and lists of outputs."""
+    parts, regress = problem.parts(), _regressions_at(problem, solution.c)
 
-    **Arguments:** `collect`: takes the number of each grid and the results of `work`.
-    """
+    def section(n: int) -> list[list[Any]]:
+        return [
+            [
+                work(k, part, n, fit, regression)
+                for fit, regression in zip(solution.fits[n], regress(k, part, n), strict=True)
+            ]
+            for k, part in enumerate(parts)
+        ]
 
-    def section(k, part, n, regressions):
-        pairs = zip(solution.fits[n], regressions, strict=True)
-        return [work(k, part, n, fit, regression) for fit, regression in pairs]
-
-    def flat(k, results):
-        collect(k, [x for section in results for x in section])
-
-    in_passes(problem, [section], *_regressions_at(problem, solution.c), flat)
+    by_section = on_all_cores(section, range(problem.records.n_sections))
+    return [[x for grids in by_section for x in grids[k]] for k in range(len(parts))]
 
 
 def minimize(

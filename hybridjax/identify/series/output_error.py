@@ -8,23 +8,21 @@ where g is free in the first cycles of each record: it represents inputs and out
 record. For given c every section is a linear regression of its own, in b and g.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
-from ..descent import Coefficients
+from ..descent import ROUNDING, Coefficients
 from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
 
 
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
 # Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
 RANK = 1e-10
-# The same for the eigenvalues of a Gram matrix, which are squares.
-_GRAM_RANK = 1e-12
 
 
 class SectionRegression(NamedTuple):
@@ -141,7 +139,7 @@ class OutputErrorProblem(NamedTuple):
             )
         triangles = [np.zeros((0, lags * nu))] * N
         equal = np.ones((N, ny, ny), bool)
-        for grid in records:
+        for grid in records.grids:
             for i in range(ny):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
             triangles = _with_rows(triangles, grid, lags, records.lead, free)
@@ -155,11 +153,13 @@ class OutputErrorProblem(NamedTuple):
         """N, and the numbers of inputs and outputs."""
         return self.records.n_sections, len(self.records.inputs), len(self.records.outputs)
 
-    def parts(self) -> Iterator[CycleGrid]:
-        """Iterate over all grids, with the outputs in units of `scale` and these weights."""
-        for k, grid in enumerate(self.records):
-            weight = grid.weight if self.weights is None else self.weights[k]
-            yield grid._replace(y=grid.y / self.scale, weight=weight)
+    def parts(self) -> list[CycleGrid]:
+        """Return all grids, with the outputs in units of `scale` and these weights."""
+        weights = self.weights or [grid.weight for grid in self.records.grids]
+        return [
+            grid._replace(y=grid.y / self.scale, weight=weight)
+            for grid, weight in zip(self.records.grids, weights, strict=True)
+        ]
 
     def rescale(self, noise: Float[np.ndarray, " ny"]) -> "OutputErrorProblem":
         """Return the problem with outputs in units of their noise, given in the present units."""
@@ -211,49 +211,5 @@ def _independent(triangle: np.ndarray) -> np.ndarray:
 def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:
     """Return a matrix R such that R R^T is the pseudoinverse of a Gram matrix."""
     w, q = np.linalg.eigh(gram)
-    kept = w > _GRAM_RANK * w.max(initial=0)
+    kept = w > ROUNDING * w.max(initial=0)
     return q[:, kept] / np.sqrt(w[kept])
-
-
-def in_passes(
-    problem: OutputErrorProblem,
-    passes: Sequence[Callable[[int, CycleGrid, int, Any], Any]],
-    regress: Callable[[CycleGrid, Any, int], Any],
-    prepare: Callable[[CycleGrid], Any],
-    collect: Callable[[int, Sequence[Any]], None] = lambda k, results: None,
-) -> None:
-    """Go through all grids and sections several times. Stored data are read once in each pass.
-
-    **Arguments:**
-
-    - `passes`: functions of the number of a grid, the grid, a section, and the return value of
-      `regress`, a function of the grid, the return value of `prepare(grid)` and the section. Data
-      in memory keep this value for all passes.
-    - `collect`: takes the number of each grid and the results of the last pass at all sections.
-    """
-    sections = range(problem.records.n_sections)
-    if problem.records.in_memory:
-        parts = [(part, prepare(part)) for part in problem.parts()]
-
-        def all_passes(n: int) -> list[Any]:
-            regressions = [regress(part, ready, n) for part, ready in parts]
-            grids = [(k, part) for k, (part, _) in enumerate(parts)]
-            results: list[Any] = []
-            for work in passes:
-                pairs = zip(grids, regressions, strict=True)
-                results = [work(*grid, n, regression) for grid, regression in pairs]
-            return results
-
-        for k, results in enumerate(zip(*on_all_cores(all_passes, sections), strict=True)):
-            collect(k, results)
-        return
-
-    def visit(k: int, part: CycleGrid, work: Callable) -> list[Any]:
-        ready = prepare(part)
-        return on_all_cores(lambda n: work(k, part, n, regress(part, ready, n)), sections)
-
-    for work in passes:
-        for k, part in enumerate(problem.parts()):
-            results = visit(k, part, work)
-            if work is passes[-1]:
-                collect(k, results)

@@ -1,6 +1,6 @@
 """Records as fits use them: grids of records, cycles and sections, with delays and filters."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,21 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
 from ...errors import DefinitionError
-from ...experiments.record import (
-    HasRecords,
-    Record,
-    RecordedData,
-    each_uninterrupted_record,
-    uninterrupted_records,
-)
-
-
-# Samples in a grid, unless a single record has more: 16 MB with 20 columns. Larger: stored data
-# may exceed the memory; smaller: loops over many small grids.
-_SAMPLES = 100_000
-# Length of the shortest record of a grid, relative to the longest. Larger: as many grids as there
-# are lengths; smaller: most of a grid is padding.
-_SHORTEST = 0.5
+from ...experiments.record import Record, RecordedData, uninterrupted_records
 
 
 class CycleGrid(NamedTuple):
@@ -85,29 +71,25 @@ def drift_waves(record: Record) -> Float[np.ndarray, "T K"]:
 
 
 class PreparedRecords:
-    """Records as grids of bounded size, which can be iterated over again and again.
+    """Records as grids of similar lengths.
 
-    Data that can be iterated over more than once, and are no sequence (`StoredExperiments`), are
-    read anew each time; the grids of other data are kept.
-
-    **Fields:** `n_sections`, `lead`, `inputs`, `outputs`: as in `Record`. `cycles`: of the longest
-    record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
+    **Fields:** `n_sections`, `lead`, `inputs`, `outputs`: as in `Record`. `grids`: the grids.
+    `cycles`: number of cycles of the longest record. `sampled` (N, ny): number of samples. `scale`
+    (ny,): rms of the outputs.
     """
 
     def __init__(self, data: RecordedData):
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for signals that are zero
         or missing at every sample."""
-        self.in_memory = isinstance(data, HasRecords | Sequence) or iter(data) is data
-        kept = self.in_memory and not isinstance(data, HasRecords)
-        self._data = list(data) if kept else data
-        about = next(each_uninterrupted_record(self._data))
+        self._records = uninterrupted_records(data)
+        about = self._records[0]
         self.n_sections, self.lead = about.n_sections, about.lead
         self.inputs, self.outputs = about.inputs, about.outputs
-        self._grids = list(_grids(self._data)) if self.in_memory else None
+        self.grids = _grids(self._records)
         self.cycles = 0
         self.sampled = np.zeros((self.n_sections, len(self.outputs)), int)
         excited, square = np.zeros(len(self.inputs), bool), np.zeros(len(self.outputs))
-        for grid in self:
+        for grid in self.grids:
             self.cycles = max(self.cycles, grid.y.shape[1])
             self.sampled += grid.sampled.sum(axis=(0, 1))
             excited |= grid.u.any(axis=(0, 1, 2))
@@ -120,36 +102,19 @@ class PreparedRecords:
                 raise DefinitionError(f"the output {name} is zero or missing at every sample.")
         self.scale: Float[np.ndarray, " ny"] = np.sqrt(square / self.sampled.sum(axis=0))
 
-    def __iter__(self) -> Iterator[CycleGrid]:
-        return _grids(self._data) if self._grids is None else iter(self._grids)
-
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
-        return CycleGrid.from_records(uninterrupted_records(self._data))
+        return CycleGrid.from_records(self._records)
 
 
-def _grids(data: RecordedData) -> Iterator[CycleGrid]:
-    for group in in_groups(each_uninterrupted_record(data)):
-        left = sorted(group, key=count_cycles, reverse=True)
-        while left:
-            enough = _SHORTEST * count_cycles(left[0])
-            alike = [r for r in left if count_cycles(r) >= enough]
-            yield CycleGrid.from_records(alike)
-            left = left[len(alike) :]
-
-
-def in_groups(records: Iterable[Record]) -> Iterator[list[Record]]:
-    """Collect records in lists of bounded size."""
-    group: list[Record] = []
-    size = 0
-    for record in records:
-        if group and size + len(record.u) > _SAMPLES:
-            yield group
-            group, size = [], 0
-        group.append(record)
-        size += len(record.u)
-    if group:
-        yield group
+def _grids(records: Sequence[Record]) -> list[CycleGrid]:
+    left, grids = sorted(records, key=count_cycles, reverse=True), []
+    while left:
+        enough = 0.5 * count_cycles(left[0])
+        alike = [r for r in left if count_cycles(r) >= enough]
+        grids.append(CycleGrid.from_records(alike))
+        left = left[len(alike) :]
+    return grids
 
 
 def lagged_inputs(

@@ -6,104 +6,83 @@ import numpy as np
 from jaxtyping import Float
 
 from ..descent import Coefficients
-from .linearization import Linearization, SectionFit, each_part, minimize
+from ..htf_errors import SMALLEST_ERROR
+from .linearization import Linearization, SectionFit, each_fit, minimize
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid
 
 
-Loss = Literal["squares", "huber", "student"]
+Loss = Literal["squares", "huber"]
 Samples = list[Float[np.ndarray, "S T N ny"]]
 """A number for each sample of each grid."""
 
 # Where Huber's loss becomes linear, in standard deviations: 95 % as efficient as squares for
 # Gaussian errors. Larger: outliers count more; smaller: Gaussian errors are met less efficiently.
 _HUBER = 1.345
-# Degrees of freedom of Student's distribution (Lange, Little and Taylor 1989). Larger: outliers
-# count more; smaller: Gaussian errors are met less efficiently.
-_STUDENT = 4.0
 # The median of the modulus of a standard normal variable.
 _MEDIAN = 0.6745
 # Outputs beyond so many standard deviations are left out of the start. Larger: outliers move the
 # start; smaller: large responses are left out.
 _FAR = 6.0
-# Smallest share of its own error that a fit leaves to a sample, as far as weights are concerned.
-# Larger: outliers that the fit nearly interpolates count more; smaller: weights are unstable.
-_SMALLEST_REMAINDER = 0.5
-# Smallest noise of an output, relative to its rms: rounding.
-ROUNDING = 1e-15
 # Iterations of the weights at most, and the change of c, relative to 1 + |c|, of the last one.
 _MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
 
 
-def _root_weights(loss: Loss, error: np.ndarray) -> np.ndarray:
-    """Return the roots of the weights with which least squares minimize the loss.
+def _root_weights(error: np.ndarray) -> np.ndarray:
+    """Return the roots of the weights with which least squares minimize Huber's loss.
 
     **Arguments:** `error`: in standard deviations (Holland and Welsch 1977).
     """
-    if loss == "huber":
-        return np.sqrt(_HUBER / np.maximum(np.abs(error), _HUBER))
-    return np.sqrt((_STUDENT + 1) / (_STUDENT + error**2))
-
-
-def _second_derivative(loss: Loss, error: np.ndarray) -> np.ndarray:
-    if loss == "huber":
-        return (np.abs(error) < _HUBER).astype(float)
-    return (_STUDENT + 1) * (_STUDENT - error**2) / (_STUDENT + error**2) ** 2
+    return np.sqrt(_HUBER / np.maximum(np.abs(error), _HUBER))
 
 
 def without_outliers(problem: OutputErrorProblem) -> OutputErrorProblem:
     """Return the problem without the outputs that are far from all others."""
-    parts = list(problem.parts())
+    parts = problem.parts()
     spread = _spread(problem, [part.y for part in parts])
     weights = [np.where(np.abs(part.y) > _FAR * spread, 0.0, part.weight) for part in parts]
     return problem.weighed(weights)
 
 
 def minimize_robust(
-    problem: OutputErrorProblem, start: Coefficients, loss: Loss, max_steps: int
+    problem: OutputErrorProblem, start: Coefficients, max_steps: int
 ) -> tuple[OutputErrorProblem, Coefficients, Linearization, bool]:
-    """Return the minimum of a robust loss by iteratively reweighted least squares.
-
-    The minimum of Huber's loss, which has no other minima, comes first.
-    """
+    """Return the minimum of Huber's loss by iteratively reweighted least squares."""
     outputs = [part.y for part in problem.parts()]
-    spread = np.maximum(_spread(problem, outputs), ROUNDING)
-    problem = _with_weights(problem, "huber", [y / spread for y in outputs])
+    spread = np.maximum(_spread(problem, outputs), SMALLEST_ERROR)
+    problem = _with_weights(problem, [y / spread for y in outputs])
     c, solution, converged = minimize(problem, start, max_steps)
-    for kind in dict.fromkeys(("huber", loss)):
-        for _ in range(_MAX_REWEIGHTINGS):
-            before, error = c, misfit(problem, solution)
-            scale = np.maximum(_spread(problem, error), ROUNDING)
-            problem = _with_weights(problem.rescale(scale), kind, [e / scale for e in error])
-            c, solution, _ = minimize(problem, c, 1)
-            converged = bool(np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max()))
-            if converged:
-                break
+    for _ in range(_MAX_REWEIGHTINGS):
+        before, error = c, misfit(problem, solution)
+        scale = np.maximum(_spread(problem, error), SMALLEST_ERROR)
+        problem = _with_weights(problem.rescale(scale), [e / scale for e in error])
+        c, solution, _ = minimize(problem, c, 1)
+        converged = bool(np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max()))
+        if converged:
+            break
     return problem, c, solution, converged
 
 
-def _with_weights(problem: OutputErrorProblem, loss: Loss, error: Samples) -> OutputErrorProblem:
+def _with_weights(problem: OutputErrorProblem, error: Samples) -> OutputErrorProblem:
     pairs = zip(problem.parts(), error, strict=True)
-    return problem.weighed([_root_weights(loss, e) * part.sampled for part, e in pairs])
+    return problem.weighed([_root_weights(e) * part.sampled for part, e in pairs])
 
 
 def misfit(problem: OutputErrorProblem, solution: Linearization) -> Samples:
     """Return the residuals, unweighted and corrected for the share that the fit takes of them."""
-    errors = [np.zeros(part.y.shape) for part in problem.parts()]
 
     def section(_, part: CycleGrid, n: int, fit: SectionFit, regression: SectionRegression):
         x = part.y[:, :, n, fit.outputs]
         error = regression.residual(fit.coefficients[..., 0], x).reshape(x.shape)
         weight = part.weight[:, :, n, fit.outputs]
-        remainder = np.maximum(1 - regression.leverage(fit.root), _SMALLEST_REMAINDER)
+        remainder = np.maximum(1 - regression.leverage(fit.root), 0.5)
         left = weight * np.sqrt(remainder)[..., None]
         return n, fit.outputs, np.where(weight > 0, error / np.where(left > 0, left, 1.0), 0.0)
 
-    def collect(k, results):
+    errors = [np.zeros(part.y.shape) for part in problem.parts()]
+    for whole, results in zip(errors, each_fit(problem, solution, section), strict=True):
         for n, outputs, error in results:
-            errors[k][:, :, n, outputs] = error
-
-    each_part(problem, solution, section, collect)
+            whole[:, :, n, outputs] = error
     return errors
 
 
@@ -112,7 +91,7 @@ def rms_of(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
     pairs = [(part.sampled, a) for part, a in zip(problem.parts(), x, strict=True)]
     square = sum(((a**2) * sampled).sum(axis=(0, 1, 2)) for sampled, a in pairs)
     count = sum(sampled.sum(axis=(0, 1, 2)) for sampled, _ in pairs)
-    return np.maximum(np.sqrt(square / count), ROUNDING)
+    return np.maximum(np.sqrt(square / count), SMALLEST_ERROR)
 
 
 def _spread(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
@@ -145,7 +124,7 @@ def efficiency(problem: OutputErrorProblem, solution: Linearization, loss: Loss)
     total = slope = count = np.zeros(ny)
     for part, error in zip(problem.parts(), misfit(problem, solution), strict=True):
         total = total + (part.weight**2).sum(axis=(0, 1, 2))
-        slope = slope + (_second_derivative(loss, error) * part.sampled).sum(axis=(0, 1, 2))
+        slope = slope + ((np.abs(error) < _HUBER) & part.sampled).sum(axis=(0, 1, 2))
         count = count + part.sampled.sum(axis=(0, 1, 2))
     # The unknowns take a share of the residuals' squares, as in least squares.
     kept = solution.freedom.sum(axis=0) / count

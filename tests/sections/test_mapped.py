@@ -49,18 +49,3 @@ def test_many_systems_side_by_side(lossy_cycle):
         assert alone["result"] == hj.Result.OK
         for name, value in alone.items():
             np.testing.assert_allclose(mapped[name][index], value, atol=1e-9, err_msg=name)
-
-
-@pytest.mark.slow
-def test_gradients_of_many_systems_side_by_side(lossy_cycle):
-    def size(k):
-        found = analyze(lossy_cycle, k)
-        return jnp.sum(found["monodromy"] ** 2) + jnp.sum(found["arrival"] ** 2)
-
-    k = STIFFNESS[0]
-    by_map = compiled(jax.vmap(jax.grad(size)))(k)
-    of_map = compiled(jax.grad(lambda k: jnp.sum(jax.vmap(size)(k))))(k)
-    np.testing.assert_allclose(of_map, by_map, rtol=1e-9)
-    e = 1e-4
-    ends = compiled(jax.vmap(size))(jnp.array([k[0] + e, k[0] - e]))
-    np.testing.assert_allclose(by_map[0], (ends[0] - ends[1]) / (2 * e), rtol=1e-6)

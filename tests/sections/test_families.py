@@ -5,6 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jaxtyping import Array, Float
 
 import hybridjax as hj
@@ -77,6 +78,7 @@ def test_a_family_of_clock_phases(hopper_cycle):
     np.testing.assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_family_of_levels(vanderpol_cycle):
     family = FallingPast([1.0, 0.0, -1.0])
     one_by_one = [hj.Crossing("x", "falling", value=float(x)) for x in family.values]

@@ -69,15 +69,6 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle, offset)
     assert abs(placed.lanes.q[1, 0]) < 1e-12
 
 
-def test_sections_follow_the_cycle_of_another_hopper(hopper_cycle, lossy_cycle):
-    """A family is a definition, bound to no cycle: its anchor moves with the apex."""
-    family = hj.ClockPhase(32, anchor=APEX)
-    for cycle in (hopper_cycle, lossy_cycle):
-        placed = hj.place_sections(cycle, family)
-        assert abs(placed.lanes.q[1, 0]) < 1e-11
-        np.testing.assert_allclose(placed.duration, 1 / 32, atol=1e-13)
-
-
 def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     """Time has no origin there: a multiplier of 1 beside the true one."""
     ldtp = hj.linearize(vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling")))
@@ -87,23 +78,6 @@ def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     ldtp = hj.linearize(vanderpol_cycle, family, "x")
     np.testing.assert_array_equal(ldtp.dims, np.ones(8))
     np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
-
-
-def test_the_unit_of_a_level_does_not_matter(vanderpol_cycle, unit=1e-9):
-    position, speed = (
-        hj.Output(name, lambda t, q, u, k=k: unit * q[k]) for k, name in enumerate(("X", "V"))
-    )
-    plain = [Crossing("x", "falling", value=0.3), Crossing("v", "rising", value=-0.2)]
-    scaled = [
-        Crossing(position, "falling", value=0.3 * unit),
-        Crossing(speed, "rising", value=-0.2 * unit),
-    ]
-    a, b = (hj.place_sections(vanderpol_cycle, x) for x in (plain, scaled))
-    np.testing.assert_allclose(b.lanes.q, a.lanes.q, atol=1e-11)
-    assert a.coordinates() == b.coordinates()
-    tangent = Crossing(position, "rising", value=2.00861986 * unit)
-    with pytest.raises(hj.ComputationError, match=r"\(X rising\) is tangent"):
-        hj.place_sections(vanderpol_cycle, [tangent, scaled[0]])
 
 
 TOP = Crossing("v", "falling")
@@ -120,10 +94,6 @@ TOP = Crossing("v", "falling")
             r"section 1 \(xv falling\) is crossed 2 times in one period",
         ),
         (hj.ClockPhase(4, anchor=Crossing("x", "rising", value=9.0)), "no point where x rising"),
-        (
-            hj.KinematicPhase(4, position="x", velocity="v", center=(9.0, 0.0), anchor=TOP),
-            r"section 1 \(kinematic phase 1/4 after section 0\) is not reached from section 0",
-        ),
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
@@ -138,29 +108,11 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
 
 
 @pytest.mark.parametrize(
-    "define, message",
-    [
-        (lambda: hj.ClockPhase(0), "`n_sections` must be an integer from 1 to 100000, not 0"),
-        (lambda: hj.ClockPhase(2.5), "`n_sections` must be .*, not 2.5"),
-        (lambda: hj.SectionList([]), "needs at least one Crossing or AtEvent"),
-        (lambda: hj.SectionList(["x"]), r"`items\[0\]` must be a Crossing or an AtEvent, not 'x'"),
-    ],
-)
-def test_bad_families(define, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        define()
-
-
-@pytest.mark.parametrize(
     "sections, message",
     [
-        ("x", "`sections` must be an AbstractSections, .* not 'x'"),
-        (None, "`sections` must be an AbstractSections, .* not None"),
         ([AtEvent("bounce")], "there is no event 'bounce'"),
         ([Crossing("y", "falling")], "there is no output 'y'; outputs are 'x', 'v'"),
-        ([Crossing("x", "falling", charts=("a",))], "there is no chart 'a'"),
         (hj.KinematicPhase(4, position="x", velocity="w"), "there is no output 'w'"),
-        (hj.ClockPhase(4, anchor=Crossing("w", "falling")), "there is no output 'w'"),
     ],
 )
 def test_families_that_do_not_fit_the_system(sections, message, vanderpol_cycle):

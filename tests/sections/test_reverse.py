@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import hybridjax as hj
 from hybridjax._core.compilation import compiler_options
@@ -12,6 +13,7 @@ from hybridjax._core.compilation import compiler_options
 QUICK = compiler_options()
 
 
+@pytest.mark.slow
 def test_the_trace_of_the_jugglers_monodromy():
     """Beside the gradient of its closed form (Holmes 1982)."""
     juggler = hj.models.PaddleJuggler()

@@ -1,0 +1,46 @@
+"""Public names by their tables, and one line for names that are gone or have a new name."""
+
+import pathlib
+from collections.abc import Callable
+
+import lazy_loader
+
+
+def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
+    `__init__.pyi`, if it has one. Each name is imported when it is first used (PEP 562)."""
+    find: Callable | None = None
+    listed: Callable = lambda: []  # noqa: E731
+    names: list[str] = []
+    if pathlib.Path(file).with_suffix(".pyi").exists():
+        find, listed, names = lazy_loader.attach_stub(package, file)
+    prefix = package.removeprefix("hybridjax").removeprefix(".")
+
+    def __getattr__(name: str):
+        try:
+            if find is not None:
+                return find(name)
+        except AttributeError as error:
+            raise AttributeError(_message(package, prefix, name)) from error
+        raise AttributeError(_message(package, prefix, name))
+
+    return __getattr__, listed, names
+
+
+def _message(package: str, prefix: str, name: str) -> str:
+    """The line of `moved.txt` for this name, or for all names of a namespace that is gone."""
+    old = f"{prefix}.{name}".removeprefix(".")
+    table = (pathlib.Path(__file__).with_name("moved.txt")).read_text().splitlines()
+    rows = [row.partition(" -> ") for row in table if " -> " in row]
+    for keys, _, new in rows:
+        if old in keys.split(", "):
+            return f"hj.{old} is gone or has a new name: {new}."
+    moved = [
+        f"{key}: {new}"
+        for keys, _, new in rows
+        for key in keys.split(", ")
+        if key.startswith(f"{old}.")
+    ]
+    if moved:
+        return f"the namespace hj.{old} is gone: {'; '.join(moved)}."
+    return f"module {package!r} has no attribute {name!r}"
