@@ -1,7 +1,6 @@
 import json
 import pickle
 import zipfile
-from fractions import Fraction
 
 import jax
 import numpy as np
@@ -11,7 +10,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
-from hybridjax.identify.rational import RationalFit
 
 
 def same(a, b):
@@ -93,9 +91,6 @@ def test_a_file_can_be_read_without_the_package(folder, things):
     assert "evaluated at the input frequency" in header["conventions"]
 
 
-numbers = st.floats(width=64)  # with NaN, infinities, signed zeros and subnormals
-
-
 @settings(max_examples=30)
 @given(st.data())
 def test_round_trip_of_any_htf(folder, data):
@@ -109,21 +104,7 @@ def test_round_trip_of_any_htf(folder, data):
     assert same(htf, trip(folder, htf))
 
 
-@settings(max_examples=30)
-@given(st.data())
-def test_round_trip_of_any_fit(folder, data):
-    ny, p, q = (data.draw(st.integers(1, 3)) for _ in range(3))
-    real = [data.draw(arrays(float, s, elements=numbers)) for s in ((ny, q + 1), (ny, p + 1), ny)]
-    other = [data.draw(arrays(complex, s)) for s in ((ny, p), (ny, q), (ny, p))]
-    code = data.draw(arrays(np.int64, ny))
-    names = tuple(f"y{i}" for i in range(ny))
-    fit = RationalFit(
-        *real[:2], *other, real[2], code, 0, 32, "delayed", "uniform", names, data.draw(st.text())
-    )
-    assert same(fit, trip(folder, fit))
-
-
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.data())
 def test_damaged_files_are_refused_or_harmless(folder, things, data):
     thing = things[data.draw(st.integers(0, len(things) - 1))]
@@ -216,9 +197,7 @@ def test_other_files(folder):
         hj.load(path)
 
 
-@pytest.mark.parametrize(
-    "thing", [None, 3, Fraction(1, 2), {"f": np.zeros(3)}, np.zeros(3), hj.HTF]
-)
+@pytest.mark.parametrize("thing", [None, {"f": np.zeros(3)}, hj.HTF])
 def test_other_objects(folder, thing):
     with pytest.raises(hj.DefinitionError, match="`thing` must be a"):
         hj.save(folder / "x.npz", thing)

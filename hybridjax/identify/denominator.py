@@ -11,17 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
-from .descent import Coefficients
+from .descent import ROUNDING, Coefficients
 
 
-# Smallest eigenvalue of the curvature relative to its largest. Smaller: rounding counts as
-# information; larger: coefficients that are identified count as unknown.
-_SINGULAR = 1e-12
 # Part of a response that is left when it counts as forgotten (the number of cycles whose scores
 # are correlated). Smaller: more lags, and covariances that scatter more; larger: they miss more.
 _FORGOTTEN = 0.1
-# Largest modulus of a multiplier assumed here: 0.99 takes 230 cycles.
-_SLOWEST = 0.99
+# Largest modulus of a multiplier that is assumed before a fit: 0.99 takes 230 cycles. Larger:
+# simulations from starts overflow; smaller: slow modes start far from their minimum.
+SLOWEST = 0.99
 # Share of a record that lags may take. Larger: sums over fewer pairs, which scatter more.
 _LARGEST_SHARE = 0.25
 # Smallest share of its errors that a fit leaves to a block or line. Smaller: blocks that alone
@@ -78,7 +76,7 @@ def sandwich(
     shares (Satterthwaite 1946). Default: M is exact.
     """
     values, vectors = np.linalg.eigh(curvature)
-    if not values[0] > _SINGULAR * values[-1]:
+    if not values[0] > ROUNDING * values[-1]:
         return Covariance.unknown(len(curvature))
     inverse = vectors / values @ vectors.T
     freedom = np.inf
@@ -94,15 +92,15 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
 
     At most a quarter of a record.
     """
-    slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, _SLOWEST)
+    slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     needed = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
     return int(min(needed, int(cycles * _LARGEST_SHARE)))
 
 
 def fading(c: Coefficients) -> Coefficients:
     """Return the coefficients of chi, with multipliers moved to a modulus of at most 0.99."""
-    slowest = np.abs(np.roots([1.0, *c])).max(initial=_SLOWEST)
-    return c * (_SLOWEST / slowest) ** np.arange(1, len(c) + 1)
+    slowest = np.abs(np.roots([1.0, *c])).max(initial=SLOWEST)
+    return c * (SLOWEST / slowest) ** np.arange(1, len(c) + 1)
 
 
 def in_blocks(x: Float[np.ndarray, "S T *rest"], count: int) -> Float[np.ndarray, "B length *rest"]:

@@ -11,6 +11,12 @@ from jaxtyping import Float
 Coefficients = Float[np.ndarray, " d"]
 P = TypeVar("P", bound="Point")
 
+# Singular values, steps and numbers, relative to the largest of their kind, that are rounding.
+# Smaller: rounding counts as information; larger: information of exact data is lost.
+ROUNDING = 1e-12
+# Leading coefficient of a null vector, relative to its largest one, below which c would overflow:
+# the solution of the linearized problem is not used.
+NO_LEADING_COEFFICIENT = 1e-8
 # Damping after the first failed step, relative to the squared length of each column. Larger: short
 # steps; smaller: several attempts until a step lowers the cost.
 FIRST_DAMPING = 1e-4
@@ -23,8 +29,6 @@ _MOST_DAMPING = 1e8
 # Expected decrease of the cost, relative to it, at the minimum: coefficients are off by 1e-7 of
 # their standard errors, times the root of the residuals' number. Smaller: steps lost in rounding.
 _SETTLED_GAIN = 1e-14
-# Length of a step relative to 1 + |c| that is rounding (exact data have no other end).
-_SETTLED_STEP = 1e-12
 # If no step lowers the cost: the gain, relative to the cost, that rounding explains. Smaller:
 # minima of exact data count as not converged; larger: stalled descents count as converged.
 _STALLED_GAIN = 1e-6
@@ -127,7 +131,7 @@ class _Squares(Point):
         return _Squares(self._linearize, self.c + step, self._settled_gain)
 
     def settled(self, step: Coefficients, gain: float) -> bool:
-        small = np.linalg.norm(step) <= _SETTLED_STEP * (1 + np.linalg.norm(self.c))
+        small = np.linalg.norm(step) <= ROUNDING * (1 + np.linalg.norm(self.c))
         return bool(gain <= max(_SETTLED_GAIN * self.cost, self._settled_gain) or small)
 
     def stalled(self, step: Coefficients, gain: float) -> bool:

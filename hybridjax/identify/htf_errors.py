@@ -19,7 +19,7 @@ from .variable_projection import HTFGroup, misfit_of
 
 # Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
 # rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
-ROUNDING = 1e-15
+SMALLEST_ERROR = 1e-15
 # Alternations between the factors of frequency and of harmonic. Fewer: weights that are no product
 # yet; more: the same to 6 digits.
 _SMOOTHING_SWEEPS = 20
@@ -72,7 +72,7 @@ def weights_of(
     variance: Float[np.ndarray, "... ny _"], rms: Float[np.ndarray, " ny"]
 ) -> Float[np.ndarray, "... ny _"]:
     """Return one over the standard deviation of real and imaginary part of these variances."""
-    return np.sqrt(2 / np.maximum(variance, (ROUNDING * rms[:, None]) ** 2))
+    return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
 
 
 def _product_of_factors(

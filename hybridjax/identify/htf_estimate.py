@@ -11,6 +11,7 @@ from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF, Scatter
+from .descent import ROUNDING
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
@@ -21,8 +22,6 @@ _SAME_PHASES = 1e-6
 # Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
 # errors of constant size are too small; the mean of more is normally distributed.
 _FEW_REALIZATIONS = 16
-# Residuals of a line, relative to its power, that are rounding and have no shape.
-_NO_RESIDUAL = 1e-13
 
 
 @checked
@@ -181,7 +180,7 @@ def _roundness(
     power = np.einsum("kii->ki", gram).real[None, :, None]
     energy, turned = (x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned))
     square = energy - np.abs(H) ** 2 * power
-    square = np.where(square > _NO_RESIDUAL * energy, square, 0.0)
+    square = np.where(square > ROUNDING * energy, square, 0.0)
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
 
 

@@ -12,7 +12,8 @@ from .._core.execution import one_blas_thread
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
-from .htf_errors import ROUNDING, check_values, error_weights, require_frequencies
+from .descent import ROUNDING
+from .htf_errors import SMALLEST_ERROR, check_values, error_weights, require_frequencies
 from .variable_projection import (
     HTFGroup,
     delayed_responses,
@@ -22,10 +23,8 @@ from .variable_projection import (
 )
 
 
-# Largest misfit, relative to the rms, that rounding alone may leave. Smaller: rounding errors of
-# exact HTFs count as multipliers; larger: weak multipliers of clean HTFs are missed.
-_NOTHING_BUT_ROUNDING = 1e-12
-# Largest ratio of squares of rounding errors, with the same consequences.
+# Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
+# larger: weak multipliers of clean HTFs are missed.
 _ROUNDING_VARIES = 1e6
 # Probability that noise alone is taken for a multiplier, and the random matrices from which its
 # quantile is taken. Smaller: weak multipliers are missed; larger: orders are too high.
@@ -128,11 +127,11 @@ def select_order(
             residual = misfit_of(group, c).residual
             np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
             np.add.at(number, group.channel[:, 0], group.freedom)
-        noise = np.maximum(np.sqrt(square / number), ROUNDING)
+        noise = np.maximum(np.sqrt(square / number), SMALLEST_ERROR)
         weights = weights / noise[:, None]
         largest = group_htf(htf, weights, sizes[-1])
     values, deviation = _noise_ratios(largest, max_order)
-    if noise.max() < _NOTHING_BUT_ROUNDING:  # rounding errors differ by orders of magnitude
+    if noise.max() < ROUNDING:  # rounding errors differ by orders of magnitude
         values = values / _ROUNDING_VARIES
 
     costs, freedoms, parameters = [], [], []

@@ -14,7 +14,7 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
-from .descent import least_squares
+from .descent import ROUNDING, least_squares
 from .multiplier_estimate import (
     MultiplierComparison,
     Multipliers,
@@ -31,8 +31,6 @@ _STARTS = (0, 1, 4, 29)
 _ACCURACY = 1e-8
 # Relative difference of costs that are equal: a converged fit is then preferred.
 _EQUAL_COST = 1e-9
-# |H| relative to its rms that counts as zero: relative weights would be infinite.
-_ZERO = 1e-12
 
 
 class RationalFit(eqx.Module):
@@ -181,7 +179,7 @@ def fit_rational(
         if not np.isfinite(h).all():
             raise DefinitionError(f"{name} holds NaN or infinity.")
         rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
-        if rms == 0 or (weighting == "relative" and np.abs(h).min() < _ZERO * rms):
+        if rms == 0 or (weighting == "relative" and np.abs(h).min() < ROUNDING * rms):
             raise DefinitionError(f"{name} is zero at a frequency: there is nothing to fit there.")
         weight = rms / np.abs(h) if weighting == "relative" else np.ones(len(h))
         problem = _Problem(powers_b, powers_a, h / rms, weight / np.sqrt(len(h)))

@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float, Int
 from scipy import optimize, stats
 
 from ..experiments.record import Record
+from .series.output_error import RANK
 
 
 # Samples of a section, below which its correlations are not tested. Fewer: their distribution is
 # not normal; more: short records cannot be validated.
 FEWEST_SAMPLES = 8
-# Singular values of lagged inputs relative to the largest one that are rounding errors.
-_RANK = 1e-9
 # Probability with which a misfit that counts as visible is detected, and the draws over which
 # Gaussian deviates are averaged. Fewer draws: the second digit of `visible` is wrong.
 _POWER, _DRAWS = 0.8, 1000
@@ -101,7 +100,7 @@ def independence_test(
             size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
             z[n, :, i] = (U.T @ r / np.where(size > 0, size, 1.0)).reshape(lags, nu)
             left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > _RANK * s[0]][:, : count // 2]
+            left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
             a, b = left.shape[1], count - left.shape[1]
             inside = ((left.T @ r) ** 2).sum()

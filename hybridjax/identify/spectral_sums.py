@@ -15,6 +15,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.partition import check_sharing, needs_two_phases, regular
 from ..linear.frequency_response import Harmonics, check_harmonics
+from .descent import ROUNDING
 
 
 Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
@@ -24,8 +25,6 @@ Experiments = ExperimentData | Annotated[Iterable[ExperimentData], Stream(Experi
 # Largest change of a line of the input from one window to the next, relative to the largest line.
 # Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
 _REPEATS = 1e-2
-# Part of the largest line of all inputs below which a line is rounding.
-_ROUNDING = 1e-12
 # Part of the largest line of an input below which a line is not excited, where nobody chose it.
 # Smaller: rounding counts as a line; larger: weak lines are missed.
 SILENT_LINE = 1e-6
@@ -206,7 +205,7 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
             f"periods differ by {worst:.2g} of the largest line. Take fewer `repeats`, or the "
             "right number of periods."
         )
-    excited = ((size > threshold * peak) & (size > _ROUNDING * peak.max())).any(axis=2)
+    excited = ((size > threshold * peak) & (size > ROUNDING * peak.max())).any(axis=2)
     experiment, line = np.nonzero(excited)
     number = excited.sum(axis=1)
 

@@ -28,8 +28,6 @@ from .spectral_sums import SILENT_LINE
 _LARGEST_ORDER = 4
 # Change of the input after P periods, relative to its largest value, that is rounding.
 _REPEATS = 1e-6
-# Scale of steps for coefficients that start near zero. Smaller: they hardly move.
-_SMALLEST_SCALE = 0.1
 
 
 class TransientFit(eqx.Module):
@@ -208,7 +206,7 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
             out.append((z - q @ (q.T @ z)).ravel())
         return np.concatenate(out)
 
-    fit = least_squares(residual, start, x_scale=np.maximum(np.abs(start), _SMALLEST_SCALE))
+    fit = least_squares(residual, start, x_scale="jac")
     parameters = len(start) * (series + 1)
     mean = max(2 * fit.cost, 1e-300) / count
     return count * np.log(mean) + parameters * np.log(count), fit.x

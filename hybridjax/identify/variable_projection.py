@@ -15,20 +15,15 @@ from jaxtyping import Complex, Float, Inexact, Int
 
 from ..linear.htf import HTF
 from .denominator import Covariance, chi, inverse_of_remainder, sandwich
-from .descent import Coefficients, Minimum, least_squares
+from .descent import NO_LEADING_COEFFICIENT, ROUNDING, Coefficients, Minimum, least_squares
 
 
-# Singular values of the powers of z^-1 relative to the largest one. Smaller: bases of rounding
-# errors; larger: combinations of powers are missing from the numerators.
-_RANK = 1e-13
 # Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
 # group for each entry, which takes longer; fewer: weights that are off by as much.
 _EQUAL_WEIGHTS = 9
 # Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
 # that ends them. More, smaller: a closer start, which the descent does not need.
 _MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
-# Leading coefficient of a solution relative to its largest one, below which c would be infinite.
-_NO_LEADING_COEFFICIENT = 1e-8
 
 
 class HTFGroup(NamedTuple):
@@ -196,7 +191,7 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
         responses = delayed_responses(groups, c)
         vectors, _, _ = np.linalg.svd(responses.whitened())
         null = np.linalg.solve(np.linalg.cholesky(responses.noise_gram).T, vectors[:, -1])
-        if abs(null[0]) < _NO_LEADING_COEFFICIENT * np.abs(null).max():
+        if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
             break
         c, last = null[1:] / null[0], c
         if np.abs(c - last).max() < _SETTLED_START * (1 + np.abs(c).max()):
@@ -340,5 +335,5 @@ def powers_basis(
     (smallest) coefficients that make each element.
     """
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
-    kept = s > _RANK * s[0]
+    kept = s > ROUNDING * s[0]
     return u[:, kept], vh[kept].conj().T / s[kept]

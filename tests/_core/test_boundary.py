@@ -4,8 +4,7 @@ arrives in one form."""
 import dataclasses
 import inspect
 import pickle
-import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, TypedDict, Unpack
 
 import equinox as eqx
@@ -31,19 +30,15 @@ TAKEN = [
     (int, 3, 3),
     (int, np.int32(3), 3),
     (int, np.array(3), 3),
-    (int, jnp.array(3), 3),
     (Count | None, None, None),
     (float, 3, 3.0),
-    (float, np.float32(0.5), 0.5),
     (float, jnp.array(0.5), 0.5),
     (Annotated[float, Number("no bound or a positive number", above=0, infinite=True)], INF, INF),
     (complex, 2, 2 + 0j),
     (bool, np.True_, True),
-    (str, "a", "a"),
     (Any, 3, 3),
     (Literal["a", "b"], "b", "b"),
     (Sequence[int], np.arange(2), [0, 1]),
-    (Sequence[int], range(2), range(2)),
     (Iterable[str], iter("ab"), ("a", "b")),
     (tuple[int, ...], [1, np.int64(2)], (1, 2)),
     (tuple[float, float], [1, 2], (1.0, 2.0)),
@@ -52,65 +47,41 @@ TAKEN = [
     (SignalNames, ["a", "b"], ("a", "b")),
     (Annotated[SignalNames, Names(empty=True)], (), ()),
     (type[hj.HybridSystem], hj.models.VerticalHopper, hj.models.VerticalHopper),
-    (int | str, "a", "a"),
 ]
 
 # An annotation, what is given, and what is said of it.
 REFUSED = [
     (int, 8.5, "must be an integer, not 8.5"),
     (int, True, "must be an integer, not True"),
-    (int, "8", "must be an integer, not '8'"),
-    (int, None, "must be an integer, not None"),
     (int, np.array([3]), "must be an integer, not an array of int64 with shape (1,)"),
     (Count, 0, "must be an integer from 1 to 1000000000, not 0"),
-    (Count, 10**12, "must be an integer from 1 to 1000000000, not 1000000000000"),
-    pytest.param(Count, 10**5000, "not a number with thousands of digits", id="digits"),
     (float, NAN, "must be a finite number, not nan"),
-    (float, "1", "must be a finite number, not '1'"),
-    (float, 1j, "must be a finite number, not 1j"),
-    (float, True, "must be a finite number, not True"),
     (float, 10**400, "must be a finite number, not 1000"),
     (Positive, 0, "must be a positive number, not 0"),
-    (Positive, -INF, "must be a positive number, not -inf"),
     (bool, 1, "must be True or False, not 1"),
-    (bool, None, "must be True or False, not None"),
-    (complex, INF, "must be a finite number, not inf"),
-    (str, 3, "must be a string, not 3"),
     (Literal["a", "b"], "c", "must be 'a' or 'b', not 'c'"),
-    (Literal[1, "b"], True, "must be 1 or 'b', not True"),
     (int | str | None, 0.5, "must be an integer, a string or None, not 0.5"),
-    (Sequence[int], 3, "must be a sequence (each item an integer), not 3"),
     (Sequence[str], "ab", "must be a sequence (each item a string), not 'ab'"),
     (Sequence[int], [1, "b"], "`x[1]` must be an integer, not 'b'"),
     (tuple[float, float], (1.0,), "must be a tuple of 2 (a finite number, a finite number)"),
     (Mapping[str, Positive], {"a": -1}, "`x['a']` must be a positive number, not -1"),
     (Mapping[str, int], {1: 2}, "has the key 1, but keys must be a string"),
-    (Mapping[str, int], [1], "must be a mapping such as {name: value}, not [1]"),
     (SignalNames, ["a", "a"], "must name each only once, not ('a', 'a')"),
     (SignalNames, ["a", 3], "a sequence of distinct names, not ['a', 3]"),
-    (SignalNames, (), "must be a name, or a sequence of distinct names, not ()"),
-    (Callable, 3, "must be a function, not 3"),
     (hj.Output, 3, "must be an Output, not 3"),
-    (hj.LDTP, "x", "must be an LDTP, not 'x'"),
     (hj.HybridSystem, hj.models.VerticalHopper, "not the class itself: write VerticalHopper(...)"),
     (type[hj.HybridSystem], int, "must be a class derived from HybridSystem"),
     (MATRIX, [1.0], "must be of shape (N, d), not of shape (1,)"),
     (MATRIX, [[1], [1, 2]], "must be a rectangular array, but its rows differ in length"),
-    (MATRIX, [["a"]], "must hold real numbers, not strings"),
-    (MATRIX, [[None]], "must hold real numbers, not other objects"),
     (MATRIX, [[True]], "must hold real numbers, not bool"),
     (MATRIX, np.zeros((2, 2), complex), "must be real, not an array of complex128"),
     (MATRIX, "x", "must be an array of real numbers with shape (N, d), not 'x'"),
-    (MATRIX, None, "must be an array of real numbers with shape (N, d), not None"),
     (MATRIX, [[0, 1], [NAN, 0]], "must be finite, but is nan at index (1, 0)"),
-    (MATRIX | None, [[INF]], "must be finite, but is inf at index (0, 0)"),
     (Scalar, NAN, "must be a finite number, not nan"),
-    (Scalar, [1.0], "must be one number, not of shape (1,)"),
     (GAPS, [0, INF], "must be finite, but is inf at index 1"),
     (Annotated[Numbers, Reals("n", sign="positive")], [1, 0], "must be positive, but is 0 at"),
     (Annotated[Numbers, Reals("n", sign="nonnegative")], [1, -2], "must be zero or positive, but"),
     (Annotated[Numbers, Reals("N N")], np.zeros((2, 3)), "must be of shape (N, N), not of"),
-    (Annotated[Numbers, Reals("2")], [1, 2, 3], "must be of shape (2,), not of shape (3,)"),
     (Annotated[Numbers, Reals("... 2 d")], [[1.0]], "must be of shape (..., 2, d), not of"),
     (Annotated[Numbers, Integers("n")], [0.5], "must hold integers, not float64"),
 ]
@@ -143,12 +114,10 @@ def test_what_does_not_fit_is_refused_in_one_sentence(annotation, given, said):
     "kind, given, expected",
     [
         (Reals(), [1, 2], np.array([1.0, 2.0])),
-        (Reals(""), 3, np.array(3.0)),
         (Reals("... 2"), np.ones((3, 4, 2), np.float32), np.ones((3, 4, 2), np.float32)),
         (Reals("n", missing=True), [1, NAN], np.array([1, NAN])),
         (Reals("n", missing=True, infinite=True), [INF, NAN], np.array([INF, NAN])),
         (Reals("n"), jnp.arange(2), jnp.arange(2.0)),
-        (Reals("n"), np.zeros(0), np.zeros(0)),
         (Complexes("n"), [1, 2j], np.array([1, 2j])),
         (Integers("n"), [1, 2], np.array([1, 2])),
         (Integers("n"), np.arange(2, dtype=np.uint8), np.arange(2)),
@@ -158,11 +127,6 @@ def test_arrays_arrive_as_arrays(kind, given, expected):
     found = kind.take(given)
     assert type(found) is type(expected) and found.dtype == expected.dtype
     np.testing.assert_array_equal(found, expected)
-
-
-def test_sums_that_overflow_are_no_bad_values():
-    values = np.full(4, 1e308)
-    assert Reals("n").take(values) is values
 
 
 def test_other_objects_may_stand_among_names():
@@ -207,35 +171,11 @@ def test_options_by_name_are_checked():
         with_options(size=0)
 
 
-def test_wrong_numbers_of_arguments_are_left_to_python():
-    with pytest.raises(TypeError, match="missing 1 required positional argument: 'x'"):
-        checked(_one)()
-    with pytest.raises(TypeError, match="unexpected keyword argument 'y'"):
-        checked(_one)(1, y=2)
-    with pytest.raises(TypeError, match="takes 1 positional argument but 2 were given"):
-        checked(_one)(1, 2)
-
-
-def _one(x: int):
-    return x
-
-
 def test_a_checked_function_looks_as_before():
     assert several.__doc__ == "What it does." and several.__name__ == "several"
     assert list(inspect.signature(several).parameters) == ["a", "b", "rest", "c", "options"]
     assert pickle.loads(pickle.dumps(several)) is several
     assert "an integer from 1 to" in str(inspect.signature(several))
-
-
-def test_little_of_this_package_stands_in_the_traceback():
-    try:
-        several("1")
-    except hj.DefinitionError as error:
-        frames = [frame.name for frame in traceback.extract_tb(error.__traceback__)]
-        # (The import hook of these tests adds its own.)
-        own = [name for name in frames if not name.startswith("wrapped_fn")]
-        assert own == ["test_little_of_this_package_stands_in_the_traceback", "call"]
-        assert error.__cause__ is None and error.__suppress_context__
 
 
 @checked
@@ -343,15 +283,6 @@ def test_where_values_are_needed_a_sentence_says_so(transform):
         with pytest.raises(hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"):
             transform(function)(x)
     assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})
-
-
-def test_errors_of_jax_that_are_not_about_arguments_pass():
-    @checked
-    def function(f: Callable):
-        return jax.jit(f)(1.0)
-
-    with pytest.raises(jax.errors.TracerBoolConversionError):
-        function(lambda x: 1 if x > 0 else 2)
 
 
 def test_annotations_without_a_kind_are_an_error():

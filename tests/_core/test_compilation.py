@@ -22,10 +22,9 @@ from hybridjax._core.compilation import (
     is_left_to_lapack,
     kernel,
     quick_jit,
-    uncollected,
 )
 from hybridjax._core.executor import is_inside_program
-from hybridjax._core.lanes import PerLane, by_lane
+from hybridjax._core.lanes import by_lane
 
 
 @quick_jit
@@ -42,11 +41,9 @@ X = jnp.arange(3.0)
 WAYS = {
     "plain": lambda f: f(X),
     "jit": lambda f: jax.jit(f)(X),
-    "jit without arguments": lambda f: jax.jit(lambda: f(X))(),
     "cond": lambda f: jax.lax.cond(True, lambda: f(X), lambda: X),
     "vmap": lambda f: jax.vmap(f)(X),
     "jvp": lambda f: jax.jvp(f, (X,), (X,))[1],
-    "gradient over something else": lambda f: jax.grad(lambda z: z * f(X).sum())(1.0) * X / 3,
     "no jit": lambda f: jax.disable_jit()(f)(X),
 }
 
@@ -139,17 +136,6 @@ def test_threads_share_one_program(tiers):
     assert len(set(map(float, results))) == 1 and tiers == ["quick"]
 
 
-def test_vector_math_that_is_switched_off_makes_another_program(tiers):
-    job = TwoTiers(total, large=False)
-    job(X, by_lane(jnp.sin), 1)
-    try:
-        hj.enable_vector_math(False)
-        job(X, by_lane(jnp.sin), 1)
-    finally:
-        hj.enable_vector_math()
-    assert len(compilation._by_kind) == 2
-
-
 def point(power, tree, x, y):
     return tree["k"] * 3.0 * jnp.sin(x) ** power + y
 
@@ -172,13 +158,6 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
     np.testing.assert_allclose(values[:, some], expected, rtol=1e-15)
 
 
-def test_a_kernel_with_a_number_for_each_lane():
-    k = np.linspace(1.0, 2.0, 4)
-    own = PerLane({"k": jnp.asarray(k)}, (True,))
-    values = kernel(point, plain, (1,), (own,), 4)(k[None], np.zeros((1, 1)))
-    np.testing.assert_allclose(values, k * 3 * np.sin(k[None]), rtol=1e-15)
-
-
 def test_programs_that_call_lapack_take_turns():
     A = np.eye(2)
     assert is_left_to_lapack(eqx.filter_jit(lambda A: jnp.linalg.eigvals(A)), A)
@@ -199,25 +178,6 @@ def test_programs_that_call_lapack_take_turns():
     for thread in threads:
         thread.join()
     assert counts == [1] * 200
-
-
-def test_garbage_is_collected_again_after_the_last_thread():
-    entered, leave = threading.Event(), threading.Event()
-
-    def other():
-        with uncollected:
-            entered.set()
-            leave.wait(10.0)
-
-    thread = threading.Thread(target=other)
-    with pytest.raises(KeyError), uncollected:
-        thread.start()
-        entered.wait(10.0)
-        raise KeyError
-    assert not gc.isenabled()
-    leave.set()
-    thread.join()
-    assert gc.isenabled()
 
 
 def test_a_cache_that_others_can_write_to_is_refused(tmp_path):

@@ -46,23 +46,6 @@ def test_accuracy(name):
     assert np.max(ulps(compiled(name)(x), truth)) <= BOUNDS[name]
 
 
-def single(name):
-    if name == "arctan2":
-        return RNG.normal(size=(2, 40000)) * np.exp(RNG.uniform(-20, 20, (2, 40000)))
-    x = arguments(name)
-    return x[(np.abs(x) < 1.2e4) & (np.abs(x) > 1e-30)][None]
-
-
-@pytest.mark.parametrize("name", [*NAMES, "arctan2"])
-def test_accuracy_in_single_precision(name):
-    xs = single(name).astype(np.float32)
-    truth = getattr(np, name)(*xs.astype(float))
-    value = compiled(name)(*xs)
-    assert value.dtype == np.float32
-    error = np.abs(np.asarray(value, float) - truth) / np.spacing(np.abs(truth.astype(np.float32)))
-    assert np.max(error) <= (BOUNDS | {"arctan": 3, "arctan2": 3})[name]
-
-
 def test_accuracy_of_arctan2():
     y, x = RNG.normal(size=(2, 40000)) * np.exp(RNG.uniform(-20, 20, (2, 40000)))
     truth = np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble))
@@ -110,13 +93,6 @@ def test_special_values_of_arctan2():
     np.testing.assert_array_equal(np.signbit(value)[number], np.signbit(truth)[number])
 
 
-@given(ANY)
-def test_sin_and_cos_lie_on_the_circle(x):
-    s, c = float(compiled("sin")(x)), float(compiled("cos")(x))
-    assert abs(s) <= 1 and abs(c) <= 1 and abs(s * s + c * c - 1) < 1e-15
-    assert float(compiled("sin")(-x)) == -s and float(compiled("cos")(-x)) == c
-
-
 @given(ANY, ANY)
 def test_arctan2_agrees_with_the_standard_library(y, x):
     assert math.isclose(compiled("arctan2")(y, x), math.atan2(y, x), rel_tol=1e-15, abs_tol=1e-306)
@@ -135,17 +111,7 @@ def test_derivatives(name):
         np.testing.assert_allclose(value, truth, rtol=1e-12, atol=1e-13)
 
 
-def test_derivatives_of_arctan2():
-    points = jnp.array([[0.3, -0.7], [2.0, 0.1], [-1.0, 1.0]])
-    for derivative in (jax.grad, jax.hessian, lambda f, n: jax.jacfwd(jax.jacrev(f, n), n)):
-        ours, plain = (
-            jax.jit(jax.vmap(derivative(f, (0, 1))))(*points.T)
-            for f in (trigonometry.arctan2, jnp.arctan2)
-        )
-        np.testing.assert_allclose(np.ravel(ours), np.ravel(plain), rtol=1e-13, atol=1e-15)
-
-
-@pytest.mark.parametrize("x", [1, np.float16(0.5), jnp.float16(0.5), 0.5 + 1j], ids=repr)
+@pytest.mark.parametrize("x", [1, np.float16(0.5), jnp.float32(0.5), 0.5 + 1j], ids=repr)
 def test_other_types_are_left_to_jnp(x):
     value, truth = trigonometry.sin(x), jnp.sin(x)
     assert value == truth and value.dtype == truth.dtype

@@ -96,10 +96,6 @@ def block_by_link(folder):
     os.symlink(folder / "copy", folder / "report.html")
 
 
-def block_by_dangling_link(folder):
-    os.symlink("nowhere", folder / "report.html")
-
-
 def block_by_folder(folder):
     (folder / "report.html").mkdir()
 
@@ -115,10 +111,6 @@ def block_list_by_link(folder):
     os.symlink(folder / "notes.txt", folder / LIST)
 
 
-def block_list_by_garbage(folder):
-    (folder / LIST).write_text("[1, 2]")
-
-
 def block_list_by_names_outside(folder):
     (folder / LIST).write_text(json.dumps({"../away/file": [""]}))
 
@@ -126,11 +118,9 @@ def block_list_by_names_outside(folder):
 BLOCKS = [
     block_by_file,
     block_by_link,
-    block_by_dangling_link,
     block_by_folder,
     block_by_linked_folder,
     block_list_by_link,
-    block_list_by_garbage,
     block_list_by_names_outside,
 ]
 
@@ -147,16 +137,6 @@ def test_what_is_in_the_way_stays(full, block, early):
             (new / "figures").mkdir()
             for name, text in RESULTS.items():
                 (new / name).write_text(text)
-    assert tree(full.parent) == before
-
-
-@pytest.mark.parametrize("names", ["../away/file", "/etc/hostname", "a/../../away/file"])
-def test_a_list_cannot_name_what_is_outside(full, names):
-    digest = "6f1f6b0d" * 8
-    (full / LIST).write_text(json.dumps({names: [digest]}))
-    before = tree(full.parent)
-    with pytest.raises(hj.DefinitionError, match="is in the way"):
-        write(full, {"report.html": "page"})
     assert tree(full.parent) == before
 
 
@@ -198,17 +178,6 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     write(full, new)
     assert {k: v for k, v in tree(full).items() if v == "new"} == new
     assert not [name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST]
-
-
-def test_the_folder_at_hand(full, monkeypatch):
-    monkeypatch.chdir(full)
-    write(pathlib.Path("."), RESULTS)
-    assert (full / "report.html").read_text() == "page"
-
-
-def test_a_folder_may_be_named_by_a_link(full, tmp_path):
-    write(full / "link", RESULTS)
-    assert (tmp_path / "away" / "report.html").read_text() == "page"
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a place where nobody may write")
@@ -277,22 +246,3 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
     (folder / name).unlink()
     writer(folder / name)
     assert (folder / name).stat().st_size > 100
-
-
-@pytest.mark.parametrize("path", [".", "/"])
-def test_a_figure_needs_a_name(path):
-    with pytest.raises(hj.DefinitionError, match="is a folder: add the name"):
-        hj.plot.save(path, Figure())
-
-
-def test_a_figure_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
-    (tmp_path / "x.png").write_text("old")
-
-    def savefig(self, path, **options):
-        path.write_text("half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    with pytest.raises(hj.DefinitionError, match="cannot write .*x.png': No space left"):
-        hj.plot.save(tmp_path / "x", Figure())
-    assert tree(tmp_path) == {"x.png": "old"}

@@ -97,18 +97,6 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     assert (ahead - back) / 2e-6 == pytest.approx(-2 * gradient @ step, rel=1e-5)
 
 
-def test_a_change_of_states_changes_no_prediction(small, gappy):
-    part = SeriesPart.of(CycleGrid.from_records(gappy), ONE)
-    model = in_innovation_form(small)
-    problem = SeriesProblem([part], COVARIANCES, True, True, 0)
-    normal = local_coordinates(model, True)
-    assert problem.cost(normal.model) == pytest.approx(problem.cost(model), rel=1e-9)
-    dims = np.asarray(small.dims)
-    after = np.roll(dims, -1)
-    entries = (after * dims + after * (1 + 2) + 2 * dims + 2).sum()
-    assert normal.size == entries - (dims**2).sum()
-
-
 @pytest.mark.parametrize("start", ("free", "cycle"))
 def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None

@@ -146,18 +146,3 @@ def test_bad_inputs_are_named(message, data):
         data = hj.ExperimentData(0 * data.u, data.y, n_sections=8, periods=8)
     with pytest.raises(hj.DefinitionError, match=message):
         hj.estimate_htf(data)
-
-
-def test_bad_options(paper_data):
-    with pytest.raises(hj.DefinitionError, match="Harmonic 16 does not exist"):
-        hj.estimate_htf(paper_data, (0, 16))
-    with pytest.raises(hj.DefinitionError, match="`threshold` must be a number between 0 and 1"):
-        hj.estimate_htf(paper_data, threshold=2.0)
-
-
-def test_inputs_must_all_be_applied():
-    u = np.zeros((1, 32, 2))
-    u[0, :, 0] = np.cos(np.pi / 4 * np.arange(32) / 4)
-    data = hj.ExperimentData(u, u, n_sections=8, periods=4)
-    with pytest.raises(hj.DefinitionError, match="measured from each of the 2 inputs"):
-        hj.estimate_htf(data)

@@ -62,11 +62,3 @@ def test_what_noise_hides_is_not_reported(small, variance):
     _, htf = small
     with pytest.raises(hj.DefinitionError, match="the data carry [01] multipliers, not 2"):
         hj.fit_multipliers(noisy(htf, 1e6 * variance, np.random.default_rng(0)), 2)
-
-
-def test_bad_requests(small):
-    _, htf = small
-    with pytest.raises(hj.DefinitionError, match="`max_order` must be an integer from 1"):
-        hj.select_order(htf, 0)
-    with pytest.raises(hj.DefinitionError, match="80 frequencies are too few"):
-        hj.select_order(htf, 60)

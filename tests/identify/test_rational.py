@@ -74,21 +74,11 @@ def test_a_rational_function_is_found_exactly(form):
     assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)
 
 
-def test_one_output_of_several(exact):
-    both, one = hj.fit_rational(exact), hj.fit_rational(exact, output="vM")
-    assert one.outputs == ("vM",) and one.multipliers.shape == (1, 2)
-    np.testing.assert_allclose(one.multipliers[0], both.multipliers[1], atol=1e-12)
-    assert "yM: multipliers" in repr(both) and "delayed, uniform weighting" in repr(both)
-
-
 @pytest.mark.parametrize(
     "message, arguments",
     {
         "there is no output 'xM'; the outputs are yM, vM": dict(output="xM"),
-        "there is no output 2": dict(output=2),
-        "there is no input 'v'": dict(input="v"),
         "Harmonic 40|not stored": dict(harmonic=2),
-        "`poles` must be an integer from 1": dict(poles=0),
         "too many for 3 frequencies": dict(poles=4, zeros=3),
     }.items(),
 )

@@ -175,8 +175,6 @@ def test_first_order_covariances_and_regions(pair_and_real):
 
 def test_bad_requests(pair_and_real, small, variance):
     estimate, _ = pair_and_real
-    with pytest.raises(hj.DefinitionError, match="`level` must be a number between 0 and 1"):
-        estimate.contains([0.5], 95.0)
     with pytest.raises(hj.DefinitionError, match="no multiplier 3: the fit has 3"):
         estimate.ellipse(3)
     model, htf = small

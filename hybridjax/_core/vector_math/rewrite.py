@@ -21,7 +21,7 @@ from jax.extend.core import primitives
 from ..boundary.checked import checked
 from ..executor import on_cpu
 from . import factorizations
-from .trigonometry import arccos, arcsin, arctan, arctan2, cos, of_one_type, sin, tan
+from .trigonometry import arccos, arcsin, arctan, arctan2, are_double, cos, sin, tan
 
 
 _TRIGONOMETRY = {
@@ -220,8 +220,8 @@ def _trigonometric(eqn: jex.JaxprEqn) -> _Ours | None:
     if eqn.primitive not in _TRIGONOMETRY or eqn.params.get("accuracy") is not None:
         return None
     avals = _avals(eqn)
-    same = of_one_type(*(aval.dtype for aval in avals))
-    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if same else None
+    ours = are_double(*(aval.dtype for aval in avals))
+    return _Ours(_TRIGONOMETRY[eqn.primitive], avals) if ours else None
 
 
 def _factorization(eqn: jex.JaxprEqn) -> _Ours | None:

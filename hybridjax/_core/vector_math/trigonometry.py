@@ -1,20 +1,18 @@
 """Trigonometric functions that the CPU computes for many numbers at once.
 
 XLA on CPU turns `jnp.sin` and its relatives in float64 into one call of the C library for every
-number, 8 to 22 ns each; in float32 they take 2 to 9 ns. The functions here are written in
-additions, multiplications, divisions and selections, which become vector instructions: 2 to 3 ns in
-float64, 0.6 in float32. `rewrite.vectorized` puts them into functions that were written with `jnp`.
+number, 8 to 22 ns each. The functions here are written in additions, multiplications, divisions and
+selections, which become vector instructions: 2 to 3 ns. `rewrite.vectorized` puts them into
+functions that were written with `jnp`.
 
-- Argument reduction: x = k pi/2 + r with pi/2 cut into pieces of 33 bits (in float32, of 11) (W. J.
-  Cody, W. Waite, Software Manual for the Elementary Functions, 1980). Exact for |x| < 1.6e6
-  (1.2e4). Beyond, the result may be that of a neighbor of x, at most two units in the last place
-  away.
-- Polynomials: minimax (Remez) for the relative error of each function, below 2^-57; in float32
-  those of the Cephes library (S. L. Moshier, 1992).
-- Accuracy, in units in the last place: `sin`, `cos` 1.5 (|x| < 1e6), `arctan` 2 (in float32, 2.6),
-  `arctan2` 3, `tan`, `arcsin`, `arccos` 3.3. No result of `sin` and `cos` exceeds 1, `cos(0)` is 1,
-  and signs of zeros, infinities and NaN are treated as `jnp` treats them. Subnormal numbers may
-  count as zero, as they do in all arithmetic of XLA on CPU.
+- Argument reduction: x = k pi/2 + r with pi/2 cut into pieces of 33 bits (W. J. Cody, W. Waite,
+  Software Manual for the Elementary Functions, 1980). Exact for |x| < 1.6e6. Beyond, the result may
+  be that of a neighbor of x, at most two units in the last place away.
+- Polynomials: minimax (Remez) for the relative error of each function, below 2^-57.
+- Accuracy, in units in the last place: `sin`, `cos` 1.5 (|x| < 1e6), `arctan` 2, `arctan2` 3,
+  `tan`, `arcsin`, `arccos` 3.3. No result of `sin` and `cos` exceeds 1, `cos(0)` is 1, and signs of
+  zeros, infinities and NaN are treated as `jnp` treats them. Subnormal numbers may count as zero,
+  as they do in all arithmetic of XLA on CPU.
 
 Each has derivatives of all orders, in forward and reverse mode. Arguments of other types go to
 `jnp`'s own function.
@@ -30,11 +28,10 @@ import jax.numpy as jnp
 
 
 class _Numbers(NamedTuple):
-    """Constants of the functions below, for one type of numbers."""
+    """Constants of the functions below."""
 
     pi_2: tuple[float, ...]
-    """pi/2 in pieces whose products with integers below 2^20 (in float32, 2^13) are exact, and the
-    rest."""
+    """pi/2 in pieces whose products with integers below 2^20 are exact, and the remainder."""
     sin: tuple[float, ...]
     """S in sin(r) = r + r^3 S(r^2) for |r| <= pi/4."""
     cos: tuple[float, ...]
@@ -42,10 +39,11 @@ class _Numbers(NamedTuple):
     arctan: tuple[float, ...]
     """A in arctan(r) = r + r^3 A(r^2) for |r| <= tan(pi/8)."""
     pi_4_low: float
-    """What the nearest number misses of pi/4; twice and four times as much of pi/2 and pi."""
+    """The difference of pi/4 from the nearest number; that of pi/2 and pi is twice and four times
+    as large."""
 
 
-_DOUBLE = _Numbers(
+_N = _Numbers(
     (1.5707963267341256, 6.077100506303966e-11, 2.0222662487111665e-21, 8.4784276603689e-32),
     (-0.1666666666666663, 0.008333333333322103, -0.00019841269829577054, 2.7557313616915243e-06,
      -2.5050747041638134e-08, 1.5896187163960848e-10),
@@ -56,14 +54,6 @@ _DOUBLE = _Numbers(
      -0.05039793699138138, 0.03807697614533479, -0.017920777271075074),
     3.061616997868383e-17,
 )  # fmt: skip
-_SINGLE = _Numbers(
-    (1.5703125, 4.837512969970703e-4, 7.549533620476723e-08, 2.5633440682570896e-12),
-    (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4),
-    (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5),
-    (-3.33329491539e-1, 1.99777106478e-1, -1.38776856032e-1, 8.05374449538e-2),
-    -2.1855695000931213e-8,
-)
-_NUMBERS = {jnp.dtype("float64"): _DOUBLE, jnp.dtype("float32"): _SINGLE}
 _TAN_PI_8 = math.tan(math.pi / 8)
 
 
@@ -76,7 +66,7 @@ def _polynomial(coefficients, z):
 
 @jax.custom_jvp
 def _sincos(x):
-    n = _NUMBERS[x.dtype]
+    n = _N
     k = jax.lax.round(x * (2 / jnp.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
     a = x - k * n.pi_2[0]
     b = k * n.pi_2[1]
@@ -110,7 +100,7 @@ def _tan(x):
 
 def _arctan2(y, x):
     y, x = jnp.broadcast_arrays(y, x)
-    n, ax, ay = _NUMBERS[x.dtype], abs(x), abs(y)
+    n, ax, ay = _N, abs(x), abs(y)
     low, high = jax.lax.min(ax, ay), jax.lax.max(ax, ay)
     ratio = jnp.where(low == high, jnp.where(high == 0, 0.0, 1.0), low / high)
     steep = ratio > _TAN_PI_8
@@ -140,9 +130,9 @@ def _leg(x):
     return jnp.sqrt((1 - x) * (1 + x))
 
 
-def of_one_type(*dtypes) -> bool:
-    """Return whether arguments of these types are all float64, or all float32."""
-    return dtypes[0] in _NUMBERS and all(x == dtypes[0] for x in dtypes)
+def are_double(*dtypes) -> bool:
+    """Return whether arguments of these types are all float64."""
+    return all(x == jnp.float64 for x in dtypes)
 
 
 def _with_derivatives(kernel: Callable, *rules: Callable) -> Callable:
@@ -153,13 +143,13 @@ def _with_derivatives(kernel: Callable, *rules: Callable) -> Callable:
 
 
 def _function(plain: Callable, fast: Callable) -> Callable:
-    """`fast` for float64 and float32, and `plain` for everything else."""
+    """Return a function that is `fast` for float64, and `plain` for other types."""
     fast.__name__ = plain.__name__
     fast = jax.jit(fast)  # traced once: every further use costs one equation
 
     @ft.wraps(plain, assigned=("__name__", "__qualname__", "__doc__"), updated=())
     def function(*xs):
-        return (fast if of_one_type(*map(jnp.result_type, xs)) else plain)(*xs)
+        return (fast if are_double(*map(jnp.result_type, xs)) else plain)(*xs)
 
     return function
 

@@ -6,13 +6,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Inexact
 
-from ..descent import FIRST_DAMPING, Point, descend
+from ..descent import FIRST_DAMPING, ROUNDING, Point, descend
 from .model import LocalCoordinates, PeriodicModel, characteristic_slopes, local_coordinates
 
 
-# Eigenvalues of the scaled matrix, relative to the largest, that are rounding errors. Larger:
-# weakly determined combinations count as undetermined; smaller: rounding errors count as data.
-_SINGULAR = 1e-13
 # Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
 # Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
 _SETTLED_GAIN = 1e-2
@@ -37,7 +34,7 @@ class NormalEquations:
         self._size = np.where(size > 0, size, 1.0)
         self._values, self._vectors = np.linalg.eigh(gram / self._size / self._size[:, None])
         self._slope = self._vectors.T @ (gradient / self._size)
-        self._shown = self._values > _SINGULAR * self._values[-1]
+        self._shown = self._values > ROUNDING * self._values[-1]
 
     def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
         """Return a Levenberg-Marquardt step and the decrease of the cost expected from it.
@@ -52,7 +49,7 @@ class NormalEquations:
 
     def spread(self, unit: float = 1.0) -> "Spread":
         """Return the uncertainty of the solution, for errors of this variance."""
-        vectors, least = self._vectors / self._size[:, None], _SINGULAR * self._values[-1]
+        vectors, least = self._vectors / self._size[:, None], ROUNDING * self._values[-1]
         root = vectors * np.sqrt(unit / np.maximum(self._values, least))
         return Spread(root[:, self._shown], root[:, ~self._shown])
 

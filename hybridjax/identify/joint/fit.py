@@ -20,7 +20,7 @@ from ...linear.frequency_response import Harmonics, all_harmonics, check_harmoni
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import multipliers_of
-from ..htf_errors import ROUNDING, check_values, error_weights
+from ..htf_errors import SMALLEST_ERROR, check_values, error_weights
 from ..multiplier_estimate import MultiplierEstimate
 from ..multipliers import exact_htf
 from ..series.records import PreparedRecords
@@ -33,9 +33,6 @@ from .realization import given_dims, realize
 from .subspace import subspace_model
 
 
-# Cost, relative to its expectation, above which a `repr` reports a misfit. Larger: errors 1.4 times
-# as large as their variances go unmentioned; smaller: chance does.
-_TOO_LARGE = 2.0
 # Periods of the impulse response from which a minimal model is made, and lags at least. Fewer:
 # states that appear late are missed.
 _PERIODS, _LAGS = 4, 17
@@ -157,7 +154,7 @@ class LDTPFit(MultiplierEstimate):
     def _about(self) -> str:
         state = "" if self.result == Result.OK else f"; {Result(self.result).message}"
         about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > _TOO_LARGE * self.freedom:
+        if self.cost > 2 * self.freedom:
             about += (
                 " (errors are larger than their variances: too few dimensions, or a local minimum "
                 "that another guess avoids)"
@@ -259,7 +256,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, direct: bool, max_steps: int) -> LDTPFit
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
-        weight = problem.weight / np.maximum(np.sqrt(square / 2), ROUNDING)[:, None]
+        weight = problem.weight / np.maximum(np.sqrt(square / 2), SMALLEST_ERROR)[:, None]
         problem = problem._replace(weight=weight)
         point, converged = minimize(problem, point.model, direct, max_steps)
     model = point.coordinates.model.to_ldtp(scale, htf.inputs, htf.outputs)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ...errors import DefinitionError
 from ...linear.ldtp import LDTP
+from ..descent import ROUNDING
 
 
 Blocks = list[Float[np.ndarray, "rows columns"]]
@@ -26,8 +27,6 @@ Blocks = list[Float[np.ndarray, "rows columns"]]
 _LARGEST_MODULUS = 0.5
 # Doublings of the periods that are summed up: the remainder is 0.5^(2^6), rounding.
 _DOUBLINGS = 6
-# Smallest eigenvalue of the observability Gramian, relative to its largest: rounding.
-_UNOBSERVABLE = 1e-13
 
 
 class PeriodicModel(NamedTuple):
@@ -176,7 +175,7 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
 def _root(n: int, gramian: Float[np.ndarray, "d d"]) -> tuple[np.ndarray, np.ndarray]:
     """Return L with L L^T = P, and L^-T."""
     values, vectors = np.linalg.eigh(gramian)
-    if not values[0] > _UNOBSERVABLE * values[-1]:
+    if not values[0] > ROUNDING * values[-1]:
         raise DefinitionError(
             f"a state at section {n} of the model is never seen in the outputs: give a minimal "
             "model, as of `hj.identify.realize`."

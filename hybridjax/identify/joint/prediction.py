@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..htf_errors import SMALLEST_ERROR
 from ..series.output_error import RANK
 from ..series.records import CycleGrid
-from ..series.robust import ROUNDING
 from .descent import NormalEquations
 from .model import LocalCoordinates, PeriodicModel
 
@@ -129,7 +129,7 @@ class SeriesProblem(NamedTuple):
         if not self.by_section:
             square[:], count[:] = square.sum(axis=0), count.sum(axis=0)
         values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
-        floor = np.maximum(ROUNDING**2, ROUNDING * values[:, -1:])
+        floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * values[:, -1:])
         S = vectors * np.maximum(values, floor)[:, None] @ vectors.swapaxes(1, 2)
         return self._replace(S=S)
 

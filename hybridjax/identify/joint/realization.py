@@ -14,6 +14,8 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
+from ..descent import ROUNDING
+from ..htf_errors import SMALLEST_ERROR
 from ..series.fit import SeriesFit
 from .frequency import FrequencyProblem
 from .model import PeriodicModel
@@ -21,15 +23,11 @@ from .model import PeriodicModel
 
 Names = tuple[str, ...] | None
 
-# Singular values, relative to the largest, that are rounding errors.
-_ROUNDING = 1e-12
 # Factor by which a singular value must exceed the largest that noise alone makes, on average.
 # Larger: weak states are missed; smaller: noise makes states.
 _NOISE_MARGIN = 1.1
 # Sections in which a state is observed, at least, by default. Smaller: less averaging.
-_SHORTEST_HORIZON = 8
-# Smallest standard deviation of an HTF, relative to the largest HTF: rounding.
-_SMALLEST_ERROR = 1e-15
+SHORTEST_HORIZON = 8
 
 
 @checked
@@ -110,7 +108,7 @@ def realize(
 
 
 def _horizon(horizon: int | None, N: int) -> int:
-    return max(_SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
+    return max(SHORTEST_HORIZON, 2 * N) if horizon is None else horizon
 
 
 def _scale(scale: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
@@ -138,7 +136,7 @@ def _bases(
     most = min(matrices[0].shape[0] - ny, matrices[0].shape[1])
     for n, matrix in enumerate(matrices):
         left, s, _ = np.linalg.svd(matrix, full_matrices=False)
-        rank = int((s > max(edge, _ROUNDING * s[0])).sum())
+        rank = int((s > max(edge, ROUNDING * s[0])).sum())
         d = max(order, rank, 1) if dims is None else dims[n]
         if d > most:
             raise DefinitionError(
@@ -178,14 +176,14 @@ def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
         # Real and imaginary part have half of the variance each.
         spread = np.sqrt(np.asarray(htf.variance).sum(axis=0) / 2)
         scale = _scale(np.sqrt((spread**2).mean(axis=(0, 2))))
-        weight = 1 / np.maximum(spread, _SMALLEST_ERROR * np.abs(G).max())
+        weight = 1 / np.maximum(spread, SMALLEST_ERROR * np.abs(G).max())
         edge = _NOISE_MARGIN * (np.sqrt((p + 1) * ny) + np.sqrt(2 * F * nu))
 
     # One weight for each column, that of its noise, keeps the rows of an input as they are.
     column = np.sqrt(np.mean(weight**2 * scale[:, None] ** 2, axis=1)).T.ravel()  # (nu F)
     powers = np.exp(2j * np.pi / N * f) ** np.arange(p + 1)[:, None]
     _, s, vh = np.linalg.svd(_real(np.kron(np.eye(nu), powers) * column), full_matrices=False)
-    Q = vh[s > _ROUNDING * s[0]]
+    Q = vh[s > ROUNDING * s[0]]
     matrices = []
     for n in range(N):
         Y = np.stack([G[(n + i) % N] * powers[i][:, None, None] for i in range(p + 1)])

@@ -6,21 +6,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ...errors import DefinitionError
+from ..denominator import SLOWEST
 from .model import PeriodicModel
 from .prediction import SeriesPart
+from .realization import SHORTEST_HORIZON
 
 
 # Samples of a section for each coefficient of the regression on its past, and periods of the past
 # at most. Larger: a short past, which states outlast; smaller: noise.
 _ROWS, _PERIODS = 3, 2
-# Sections in which a state is observed, at least. Smaller: less averaging.
-_SHORTEST_HORIZON = 8
 # Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
 # combinations that are hardly excited.
 _SHRINKAGE = 1e-6
-# Largest modulus of a multiplier of a start, and of the errors of its predictions. Larger:
-# predictions overflow.
-_LARGEST_MODULUS = 0.99
 
 
 def subspace_model(
@@ -40,7 +37,7 @@ def subspace_model(
     columns = z.shape[2]
     sections = [_Section(z, y, inside, n, N) for n in range(N)]
     samples = min(len(section.y) for section in sections)
-    past = min(samples // (_ROWS * columns), max(_PERIODS * N, _SHORTEST_HORIZON))
+    past = min(samples // (_ROWS * columns), max(_PERIODS * N, SHORTEST_HORIZON))
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
@@ -49,7 +46,7 @@ def subspace_model(
             "`hj.identify.realize(hj.fit_series(...))`."
         )
     rules = [section.regression(past) for section in sections]
-    horizon = max(-(-most // ny) + 1, min(past, N, _SHORTEST_HORIZON))
+    horizon = max(-(-most // ny) + 1, min(past, N, SHORTEST_HORIZON))
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
@@ -145,9 +142,9 @@ def _from_states(
         K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
     model = PeriodicModel(A, B, C, D, K)
     size = np.abs(np.linalg.eigvals(model.monodromy())).max()
-    shrunk = (_LARGEST_MODULUS / max(size, _LARGEST_MODULUS)) ** (1 / N)
+    shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
     model = model._replace(A=[a * shrunk for a in A])
-    while innovations and _slowest_error(model) > _LARGEST_MODULUS:
+    while innovations and _slowest_error(model) > SLOWEST:
         model = model._replace(K=[k / 2 for k in model.K])
     return model
 

@@ -9,18 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..denominator import multipliers_of
-from ..descent import Coefficients
+from ..denominator import SLOWEST, multipliers_of
+from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..order import refuse_invented
 from .linearization import sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, delay_cycles, lagged_inputs
-
-
-# The leading coefficient, relative to the largest, below which c would overflow: c = 0 is returned.
-_NO_LEADING_COEFFICIENT = 1e-8
-# Largest modulus of a multiplier of a start. Larger: simulations from unstable starts overflow.
-_LARGEST_MODULUS = 0.99
 
 
 class DelayedOutputs(NamedTuple):
@@ -65,10 +59,10 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     """Return c without bias by white noise in the outputs."""
     order = delayed.gram.shape[1] - 1
     null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
-    if abs(null[0]) < _NO_LEADING_COEFFICIENT * np.abs(null).max():
+    if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])
-    size = np.maximum(np.abs(roots) / _LARGEST_MODULUS, 1.0)
+    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
     return np.pad(np.poly(roots / size).real[1:], (0, order - len(roots)))
 
 

@@ -22,8 +22,6 @@ from .records import CycleGrid, divide_by_chi
 from .robust import Loss, efficiency
 
 
-# Largest correction of a covariance for the degrees of freedom that the minimum takes: to 1 / 0.5.
-_SMALLEST_FREEDOM = 0.5
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
 # by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
 _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
@@ -122,5 +120,5 @@ def gradient_covariance(
     scaled, share = score[:, 0] @ half.T, share @ by_white @ share.T
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
-    matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, _SMALLEST_FREEDOM)
+    matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
     return Covariance(matrix, block_freedom(scaled, share))

@@ -19,13 +19,14 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from ..denominator import Denominator, chi, multipliers_of
+from ..htf_errors import SMALLEST_ERROR
 from ..multiplier_estimate import MultiplierEstimate
 from .arx import delayed_outputs, refuse_order, total_least_squares
 from .covariance import coefficient_covariance
 from .linearization import Linearization, minimize
 from .output_error import OutputErrorProblem
 from .records import PreparedRecords
-from .robust import ROUNDING, Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
+from .robust import Loss, efficiency, minimize_robust, misfit, rms_of, without_outliers
 
 
 class SeriesFit(MultiplierEstimate):
@@ -242,7 +243,7 @@ def assemble(
 def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     """Return the standard deviation of each output's noise, in units of the problem's scale."""
     left = solution.freedom.sum(axis=0) - len(solution.c) / solution.freedom.shape[1]
-    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), ROUNDING)
+    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:

@@ -16,15 +16,13 @@ from jaxtyping import Float, Shaped
 
 from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
-from ..descent import Coefficients
+from ..descent import ROUNDING, Coefficients
 from .records import CycleGrid, PreparedRecords, lagged_inputs, start_responses
 
 
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
 # Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
 RANK = 1e-10
-# The same for the eigenvalues of a Gram matrix, which are squares.
-_GRAM_RANK = 1e-12
 
 
 class SectionRegression(NamedTuple):
@@ -213,5 +211,5 @@ def _independent(triangle: np.ndarray) -> np.ndarray:
 def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:
     """Return a matrix R such that R R^T is the pseudoinverse of a Gram matrix."""
     w, q = np.linalg.eigh(gram)
-    kept = w > _GRAM_RANK * w.max(initial=0)
+    kept = w > ROUNDING * w.max(initial=0)
     return q[:, kept] / np.sqrt(w[kept])

@@ -11,11 +11,6 @@ from ...errors import DefinitionError
 from ...experiments.record import Record, RecordedData, uninterrupted_records
 
 
-# Length of the shortest record of a grid, relative to the longest. Larger: as many grids as there
-# are lengths; smaller: most of a grid is padding.
-_SHORTEST = 0.5
-
-
 class CycleGrid(NamedTuple):
     """S records of T cycles. Samples outside of a record and in its gaps have the weight zero."""
 
@@ -115,7 +110,7 @@ class PreparedRecords:
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
     left, grids = sorted(records, key=count_cycles, reverse=True), []
     while left:
-        enough = _SHORTEST * count_cycles(left[0])
+        enough = 0.5 * count_cycles(left[0])
         alike = [r for r in left if count_cycles(r) >= enough]
         grids.append(CycleGrid.from_records(alike))
         left = left[len(alike) :]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..descent import Coefficients
+from ..htf_errors import SMALLEST_ERROR
 from .linearization import Linearization, SectionFit, each_fit, minimize
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid
@@ -23,11 +24,6 @@ _MEDIAN = 0.6745
 # Outputs beyond so many standard deviations are left out of the start. Larger: outliers move the
 # start; smaller: large responses are left out.
 _FAR = 6.0
-# Smallest share of its own error that a fit leaves to a sample, as far as weights are concerned.
-# Larger: outliers that the fit nearly interpolates count more; smaller: weights are unstable.
-_SMALLEST_REMAINDER = 0.5
-# Smallest noise of an output, relative to its rms: rounding.
-ROUNDING = 1e-15
 # Iterations of the weights at most, and the change of c, relative to 1 + |c|, of the last one.
 _MAX_REWEIGHTINGS, _SETTLED = 50, 1e-6
 
@@ -53,12 +49,12 @@ def minimize_robust(
 ) -> tuple[OutputErrorProblem, Coefficients, Linearization, bool]:
     """Return the minimum of Huber's loss by iteratively reweighted least squares."""
     outputs = [part.y for part in problem.parts()]
-    spread = np.maximum(_spread(problem, outputs), ROUNDING)
+    spread = np.maximum(_spread(problem, outputs), SMALLEST_ERROR)
     problem = _with_weights(problem, [y / spread for y in outputs])
     c, solution, converged = minimize(problem, start, max_steps)
     for _ in range(_MAX_REWEIGHTINGS):
         before, error = c, misfit(problem, solution)
-        scale = np.maximum(_spread(problem, error), ROUNDING)
+        scale = np.maximum(_spread(problem, error), SMALLEST_ERROR)
         problem = _with_weights(problem.rescale(scale), [e / scale for e in error])
         c, solution, _ = minimize(problem, c, 1)
         converged = bool(np.abs(c - before).max() <= _SETTLED * (1 + np.abs(c).max()))
@@ -79,7 +75,7 @@ def misfit(problem: OutputErrorProblem, solution: Linearization) -> Samples:
         x = part.y[:, :, n, fit.outputs]
         error = regression.residual(fit.coefficients[..., 0], x).reshape(x.shape)
         weight = part.weight[:, :, n, fit.outputs]
-        remainder = np.maximum(1 - regression.leverage(fit.root), _SMALLEST_REMAINDER)
+        remainder = np.maximum(1 - regression.leverage(fit.root), 0.5)
         left = weight * np.sqrt(remainder)[..., None]
         return n, fit.outputs, np.where(weight > 0, error / np.where(left > 0, left, 1.0), 0.0)
 
@@ -95,7 +91,7 @@ def rms_of(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
     pairs = [(part.sampled, a) for part, a in zip(problem.parts(), x, strict=True)]
     square = sum(((a**2) * sampled).sum(axis=(0, 1, 2)) for sampled, a in pairs)
     count = sum(sampled.sum(axis=(0, 1, 2)) for sampled, _ in pairs)
-    return np.maximum(np.sqrt(square / count), ROUNDING)
+    return np.maximum(np.sqrt(square / count), SMALLEST_ERROR)
 
 
 def _spread(problem: OutputErrorProblem, x: Samples) -> Float[np.ndarray, " ny"]:
