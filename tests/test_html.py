@@ -133,7 +133,6 @@ def test_fits():
     assert (np.abs(values - parts) < 0.1 * widths).all()
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1
-    assert "error" in shown(fit.compare(model.multipliers)).texts
     htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
     assert {"yM & co", "pole"} <= set(shown(hj.fit_rational(htf)).texts)
 

@@ -18,9 +18,8 @@ from ..errors import DefinitionError
 from .record import Record
 
 
-# Experiments that the notebook summary evaluates, and cycles of the one that it draws. More: the
-# summary of large data takes seconds. Fewer: its rms values scatter, and the picture is empty.
-_EVALUATED, _DRAWN = 64, 4
+# Cycles that the notebook summary draws. Fewer: the picture is empty. More: it is illegible.
+_DRAWN = 4
 # Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
 # recorded inputs separates pairs. Larger: even-order distortion is left in the odd part.
 _OPPOSITE = 1e-9
@@ -217,26 +216,27 @@ class ExperimentData(eqx.Module):
             "window": f"the last {self.periods} periods",
             "sections": self.label,
         }
-        good = np.flatnonzero(self.ok)
-        rows = good[:: max(1, len(good) // _EVALUATED)]
-        if not len(rows):
+        if not self.ok.any():
             return card("ExperimentData", self.summary(), facts(about))
-        signals = [(x, self.u[rows, :, k]) for k, x in enumerate(self.inputs)]
-        signals += [(y, self.y[rows, :, k]) for k, y in enumerate(self.outputs)]
+        signals = [(x, self.u[self.ok, :, k]) for k, x in enumerate(self.inputs)]
+        signals += [(y, self.y[self.ok, :, k]) for k, y in enumerate(self.outputs)]
         sizes = [
             (x, f"{np.sqrt(np.mean(v**2)):.4g} {unit_of(x)}", f"{np.abs(v).max():.4g}")
             for x, v in signals
         ]
-        part = "" if len(rows) == len(good) else f" of {len(rows)} of them"
         k = slice(self.window.start, self.window.start + _DRAWN * self.n_sections)
-        t = np.arange(n)[k] / self.n_sections
         drawn = [
-            picture([Curve(t, v[0, k], color=color)], "cycles", with_unit(x, unit_of(x)))
-            for (x, v), color in zip(
-                (signals[0], signals[len(self.inputs)]), (COLORS[-1], COLORS[0]), strict=True
+            picture(
+                [Curve(np.arange(n)[k] / self.n_sections, v[0, k], color=color)],
+                "cycles",
+                with_unit(x, unit_of(x)),
+            )
+            for (x, v), color in (
+                (signals[0], COLORS[-1]),
+                (signals[len(self.inputs)], COLORS[0]),
             )
         ]
-        rms = table(("signal", f"rms{part}", "largest"), sizes)
+        rms = table(("signal", "rms", "largest"), sizes)
         return card("ExperimentData", self.summary(), facts(about), rms, *drawn)
 
     def odd_part(self) -> "ExperimentData":

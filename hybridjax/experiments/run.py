@@ -12,16 +12,12 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import DesignLike, Options, prepare
+from .campaign import CHUNK, DesignLike, Options, prepare
 from .data import ExperimentData
 from .noise import ProcessNoise
 from .plan import Accuracy
 from .start import StartName
 from .stored import StoredExperiments, store_experiments
-
-
-# Experiments of a chunk. More need more memory; fewer leave batches and threads unfilled.
-_CHUNK = 640
 
 
 @checked
@@ -80,7 +76,7 @@ def stream_experiments(
     outputs: OutputNames,
     options: Options = Options(),  # noqa: B008 (immutable)
     *,
-    chunk: ExperimentCount = _CHUNK,
+    chunk: ExperimentCount = CHUNK,
     store: Path | None = None,
     client: DaskClient | None = None,
 ) -> Iterator[ExperimentData] | StoredExperiments:

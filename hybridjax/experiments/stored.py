@@ -22,7 +22,7 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle, rough
 from ..sections.placed import SectionsLike
 from ..systems.output import OutputNames
-from .campaign import Campaign, DesignLike, Options, prepare
+from .campaign import CHUNK, Campaign, DesignLike, Options, prepare
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
 
@@ -244,5 +244,5 @@ def _design(source: Design | np.ndarray) -> str:
     if isinstance(source, Design):
         arrays = jax.tree_util.tree_leaves(eqx.filter(source, eqx.is_array))
         return digest_of(*map(array_digest, arrays), repr(source.input_names))
-    parts = (source[k : k + 1024] for k in range(0, len(source), 1024))  # (may lie on disk)
+    parts = (source[k : k + CHUNK] for k in range(0, len(source), CHUNK))  # (may lie on disk)
     return digest_of(*map(array_digest, parts))

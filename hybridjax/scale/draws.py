@@ -18,9 +18,6 @@ from ..errors import ComputationError, DefinitionError
 # Pieces of a call, unless `chunk` is given. Fewer: more is lost with a worker. More: many small
 # files.
 _PIECES = 256
-# Draws that may fail before the first success. Fewer: computations that fail often are refused.
-# More: it takes longer to report that none succeeds.
-_ATTEMPTS = 20
 
 
 @checked
@@ -62,8 +59,8 @@ def monte_carlo(
     `value`; and `failed`, 1 for draws that raised `ComputationError`.
 
     **Raises:** `DefinitionError` for results that are no numbers, or that change their names, their
-    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if the first draws
-    fail, so that the form of results is unknown; any other error that `function` raises.
+    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if all draws
+    fail; any other error that `function` raises.
     """
     blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
     return fill(Draws(function, seed, blocks), store, client).dataset()
@@ -109,7 +106,7 @@ class Draws:
     def first(self) -> dict[str, Variable]:
         """Return the form of results, from the first draw that succeeds."""
         failure = None
-        for i in range(min(_ATTEMPTS, *self.blocks.shape)):
+        for i in range(*self.blocks.shape):
             try:
                 values = self._draw(i)
             except ComputationError as error:
@@ -120,7 +117,7 @@ class Draws:
                 for name, x in values.items()
             }
             return variables | {"failed": Variable("<i8")}
-        raise ComputationError(f"the first draws all failed, the last because {failure}")
+        raise ComputationError(f"all draws failed, the last because {failure}")
 
     def run(self, k: int, workers: int | None) -> dict[str, np.ndarray]:
         """Return the draws of piece k."""

@@ -1,7 +1,5 @@
 """A state that rests: experiments take the sizes of states from their limit cycle."""
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,16 +51,3 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle(resting):
     sizes = [float(resting.period), *(resting.scale[name] for name in "xvw")]
     np.testing.assert_array_equal(scales, np.tile(sizes, (4, 1)))
     assert sizes[-1] == 1.0
-
-
-def test_sections_may_be_constants_of_several_compiled_functions(resting):
-    """Charts hold what the system computes for them, which belongs to the function's trace."""
-    placed = hj.place_sections(resting, hj.ClockPhase(4))
-    placed = eqx.tree_at(lambda p: p.cycle.system, placed, Resting(damping=1.1))
-
-    def field(q):
-        return placed.structure().field(0, 0.0, q, jnp.zeros(1))
-
-    q = jnp.array([0.1, 0.2, 0.3])
-    twice = jax.jit(lambda q: 2 * field(q))(q)
-    np.testing.assert_allclose(twice, 2 * jax.jit(field)(q), rtol=1e-12)

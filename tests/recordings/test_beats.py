@@ -54,6 +54,7 @@ def rms(values):
     return np.sqrt(np.mean(values**2))
 
 
+@pytest.mark.slow
 def test_a_curve_may_jump_at_the_reset_and_be_flat():
     jump = 0.3 + 1.4 * X
     found = hj.recordings.phase_response(beats(0.05, trials=8, curve=jump), BEAT, input="u")

@@ -117,6 +117,7 @@ def test_responses_to_pushes(hopper_recording, hopper_cycle, angle):
             assert (miss < 0.03 * np.abs(found.values[..., 0]).max(axis=(0, 1))).all()
 
 
+@pytest.mark.slow
 def test_order_and_advice(hopper_recording, angle):
     noisy = spoil(hopper_recording, noise=1e-3)
     options = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}

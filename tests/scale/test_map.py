@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.scale import Points
+from hybridjax.scale.family import Points
 
 
 pytest.importorskip("xarray")

@@ -144,6 +144,5 @@ def _piece(name: str, k: int) -> dict[str, np.ndarray] | None:
     job, store = _jobs[name]
     if store is None:
         return job.run(k, 1)
-    if not store.has(k):
-        store.write(k, job.run(k, 1))
+    store.write(k, job.run(k, 1))
     return None

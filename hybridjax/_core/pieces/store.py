@@ -174,10 +174,6 @@ class ZarrStore:
         pieces = set(range(len(self.layout.blocks)))
         return sorted(pieces - set.intersection(*map(self._present, self._arrays.values())))
 
-    def has(self, k: int) -> bool:
-        """Return whether piece k is present."""
-        return all(_sync(x.store.exists(self._chunk(x, k))) for x in self._arrays.values())
-
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""
         with _writing(self.address):

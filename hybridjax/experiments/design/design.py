@@ -41,9 +41,9 @@ _SAME_PHASES = 1e-6
 # A cosine at 0 or N/2 vanishes if the cosine of its phase is below this. Smaller: estimates divide
 # by almost zero. Larger: weak signals are refused.
 _VANISHING = 1e-3
-# Frequencies may miss multiples of 1/P by this, in lines. Smaller: rounding of f is refused.
-# Larger: a wrong frequency is moved without an error.
-_OFF_LINE = 1e-6
+# Frequencies and edges of a band may miss multiples of 1/P by this, in lines. Smaller: rounding of
+# f is refused. Larger: a wrong frequency is moved without an error.
+OFF_LINE = 1e-6
 
 
 @checked
@@ -373,7 +373,7 @@ def to_lines(frequencies: Float[np.ndarray, " K"], periods: int) -> Int[np.ndarr
     """
     exact = np.asarray(frequencies, float) * periods
     lines = np.rint(exact)
-    wrong = ~(np.abs(exact - lines) < _OFF_LINE)
+    wrong = ~(np.abs(exact - lines) < OFF_LINE)
     if wrong.any():
         f = float(np.asarray(frequencies)[np.argmax(wrong)])
         raise DefinitionError(

@@ -18,7 +18,7 @@ from ..._core.boundary.kinds import (
     Vector,
 )
 from ...errors import DefinitionError
-from .design import Design, InputNames, check_window, input_names, to_lines
+from .design import OFF_LINE, Design, InputNames, check_window, input_names, to_lines
 from .partition import (
     assign,
     avoid_second_order,
@@ -33,9 +33,6 @@ Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "disjoint", "orthogonal"]
 
-# Edges of a band may miss a line by this much, in lines. Smaller: rounding excludes the lines at
-# the edges. Larger: a line outside of the band is taken.
-_EDGE = 1e-9
 # Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
 # (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
 _POWERS = (4, 8, 16, 32, 64, 128)
@@ -173,7 +170,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
             f"the band from {f_min} to {f_max} must lie in [0, N/2 = {n_sections / 2}] cycles per "
             "period."
         )
-    low, high = int(np.ceil(f_min * periods - _EDGE)), int(np.floor(f_max * periods + _EDGE))
+    low, high = int(np.ceil(f_min * periods - OFF_LINE)), int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~is_half_integer(j, periods)]

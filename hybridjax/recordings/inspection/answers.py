@@ -16,12 +16,6 @@ _SECTIONS, _ENOUGH = (8, 4, 2), 3
 # Cycles of a part, at least, and parts of a record, at most. More: short faults are diluted, or
 # long records take longer. Fewer: the gain of a part is noise.
 _SHORTEST, _PARTS = 16, 4
-# Ridge, relative to the mean variance of the regressors. Larger: answers to narrow-band inputs are
-# damped. Smaller: collinear inputs (a constant push) are singular.
-_RIDGE = 1e-4
-# Outputs are clipped at this many robust standard deviations. Larger: single outliers make gains.
-# Smaller: the answer itself is clipped.
-_LARGEST = 8.0
 # Standard errors that count as certain. Larger: weak answers pass for none. Smaller: chance is
 # reported.
 _CLEAR = 4.0
@@ -34,9 +28,9 @@ _BETTER = 0.5
 # Unexplained power of a part relative to the median that makes a disturbance, and relative to what
 # the input explains. Larger: stumbles pass. Smaller: noisy parts are reported.
 _DISTURBED, _MUCH = 9.0, 0.25
-# Fraction of an input's variance that repeats with the cycle, from which on it is feedback, and
-# the cycles that show it. Larger: triggers pass. Smaller: it repeats by chance.
-_REPEATS, _FEWEST = 0.5, 6
+# Fraction of an input's variance that repeats with the cycle, from which on it is feedback.
+# Larger: triggers pass. Smaller: it repeats by chance.
+_REPEATS = 0.5
 
 
 class _Part(NamedTuple):
@@ -112,11 +106,7 @@ def _odd(name: str, answers: list[_Answer], names: tuple[str, ...]) -> Iterator[
     usual = float(np.median(gain))
     together = abs(error**-2.0 @ gain) / np.sqrt((error**-2.0).sum())
     if together < _CLEAR and np.mean((gain / error) ** 2) < _CLEAR:
-        yield Finding(
-            "no answer",
-            f"the outputs do not answer {name}: look whether it was recorded in these trials, and "
-            "at the same times.",
-        )
+        yield Finding("no answer", f"the outputs do not answer {name}: was it recorded with them?")
         return
     left, explained = np.array([a.unexplained() for a in answers]).T
     N = answers[0].part.u.shape[1]
@@ -142,12 +132,9 @@ def _odd(name: str, answers: list[_Answer], names: tuple[str, ...]) -> Iterator[
         where.setdefault(cause, []).append(place(names[a.part.trial], a.part.time))
     texts = {
         "another sign": "the outputs answer {} with the other sign ({}): turn it.",
-        "displaced input": "the outputs answer {} earlier or later than elsewhere ({}): look at "
-        "the clocks of the instruments.",
-        "foreign input": "the outputs do not answer {}, but do elsewhere ({}): it may be that of "
-        "another trial.",
-        "disturbed": "something else than {} moved the outputs ({}): a push that was not "
-        "recorded, a stumble, a sensor that failed.",
+        "displaced input": "the outputs answer {} earlier or later than elsewhere ({}).",
+        "foreign input": "the outputs do not answer {}, but do elsewhere ({}).",
+        "disturbed": "something else than {} moved the outputs ({}).",
     }
     for cause, spans in where.items():
         text = texts[cause].format(name, listed(spans))
@@ -171,7 +158,7 @@ def _answers(parts: list[_Part], i: int) -> list[_Answer]:
         if sum(len(regressors[k]) for k in training) < _ENOUGH * unknowns:
             return []
         square = np.sum([squares[k] for k in training], axis=0)
-        square += _RIDGE * np.trace(square) / unknowns * np.eye(unknowns)
+        square += 1e-4 * np.trace(square) / unknowns * np.eye(unknowns)  # of collinear inputs
         b = np.linalg.solve(square, np.sum([products[k] for k in training], axis=0))
         ny, wide = part.y.shape[1], part.inputs(i).shape[1]
         rows = slice(ny + i * wide, ny + (i + 1) * wide)
@@ -204,7 +191,7 @@ def _parts(data: SectionData, r: int, sections: int) -> list[_Part]:
         where = slice(first + a * N, first + b * N)
         u = (record.u[where] / size_u).reshape(b - a, N, -1)
         y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
-        y = np.clip(y, -_LARGEST, _LARGEST)
+        y = np.clip(y, -8, 8)  # outliers
         finite_u = np.asarray(np.isfinite(u).all(axis=(1, 2)))
         finite_y = np.asarray(np.isfinite(y).all(axis=1))
         rows = np.arange(1, b - a - ahead)
@@ -226,7 +213,7 @@ def feedback(data: SectionData) -> Iterator[Finding]:
     regression on it is unbiased (Söderström and Stoica, *System Identification*, 1989, ch. 10:
     direct identification in closed loop).
     """
-    if data.cycles < _FEWEST:
+    if data.cycles < 6:
         return
     deviations, _ = data.rms()
     for i, name in enumerate(data.inputs):
@@ -235,9 +222,6 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         if share > _REPEATS:
             yield Finding(
                 "feedback",
-                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle, of an "
-                f"input that knows nothing of it {100 / data.cycles:.2g} % would: it is not "
-                "exogenous, but feedback, learning or a trigger. Fits take it as given, and "
-                "intervals do not know of the bias: add a known perturbation to it, and name that "
-                "as the input.",
+                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: it is not "
+                "exogenous, and fits are biased. Add a perturbation, and name that as the input.",
             )

@@ -80,8 +80,7 @@ def inspect(
         if not lost.any():
             kept.append(trial)
         elif not rows.all():
-            name = outputs[int(np.argmax(lost))]
-            text = f"nothing is left of {name} in trial '{trial.name}': the trial is left out."
+            text = f"trial '{trial.name}' has no samples of {outputs[int(np.argmax(lost))]}."
             findings.append(Finding("an empty trial", text, "left out"))
     if not kept:
         text = "no trial has samples of all outputs that can be used."

@@ -15,9 +15,6 @@ from ..smoothing import Series
 # Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
 # signals of the order of 100. Smaller: genuine extremes are left out.
 _FAR = 3.0
-# Fewest equal samples in a row that form a plateau. More: short plateaus pass. Fewer: rounding
-# makes plateaus everywhere.
-_PLATEAU = 3
 # Plateaus per cycle from which on they belong to the rhythm, as those of a foot on the ground.
 # More: the rests of a limb are left out. Fewer: a sensor that fails now and then is believed.
 _BELONGS = 0.3
@@ -47,22 +44,15 @@ class Signal(NamedTuple):
     is_input: bool
 
     def left_out(self, cause: str, bad: Rows, text: str) -> tuple[Rows, list[Finding]]:
-        """Return the rows and a finding, if there are any; {} in `text`: number and places."""
-        count = sum(int(rows.sum()) for rows in bad)
-        text = f"{self.name} {text.format(count, places(self.trials, bad))}"
-        return bad, [Finding(cause, text, "left out")] if count else []
+        """Return the rows and a finding, if there are any."""
+        text = f"{self.name} {text} ({places(self.trials, bad)}): taken for missing."
+        return bad, [Finding(cause, text, "left out")] if any(map(np.any, bad)) else []
 
 
 def placeholders(s: Signal) -> tuple[Rows, list[Finding]]:
     """Find numbers such as -9999, far from all other samples."""
     bad = [_placeholders(x) for x in s.values]
-    used = np.unique(np.concatenate([x[b] for x, b in zip(s.values, bad, strict=True)]))
-    return s.left_out(
-        "no value",
-        bad,
-        f"is {', '.join(f'{v:.6g}' for v in used)} at {{}} samples ({{}}), which is taken for "
-        "missing; write NaN, or an empty field.",
-    )
+    return s.left_out("no value", bad, "has samples that stand for no value, such as -9999")
 
 
 def _placeholders(x: Series) -> Bool[np.ndarray, " n"]:
@@ -91,18 +81,14 @@ def _is_placeholder(value: float) -> bool:
 
 def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
     """Find a sensor that stays at one value for longer than its rhythm allows."""
-    return s.left_out(
-        "frozen",
-        [_frozen(x, p, s.is_input) for x, p in zip(s.values, s.period, strict=True)],
-        "does not change at all for {} samples ({}), which are taken for missing; look for the "
-        "sensor, or the wire, that failed.",
-    )
+    bad = [_frozen(x, p, s.is_input) for x, p in zip(s.values, s.period, strict=True)]
+    return s.left_out("frozen", bad, "does not change at all, as if a sensor or wire had failed")
 
 
 def _frozen(x: Series, period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
     bad = np.zeros(len(x), bool)
     first, length = _runs(x)
-    plateaus = length[length >= _PLATEAU]
+    plateaus = length[length >= 3]
     limit = max(_FROZEN[0] * period, _FROZEN[1])
     if len(plateaus) > _BELONGS * len(x) / period:
         if is_input:  # an input that is held, or rests, now and then
@@ -122,31 +108,19 @@ def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
 
 def clipped(s: Signal) -> Iterator[Finding]:
     """Find plateaus at the largest or least value, and nowhere else; one at 0 is no clipping."""
-    cut = [_clipped(x) for x in s.values]
-    where = [t.name for t, (count, _) in zip(s.trials, cut, strict=True) if count]
-    if where:
-        count, levels = sum(c for c, _ in cut), next(v for c, v in cut if c)
-        more = f" and {len(where) - 1} more trials" if len(where) > 1 else ""
-        yield Finding(
-            "clipped",
-            f"{s.name} is cut off at {' and '.join(f'{v:.4g}' for v in levels)} in trial "
-            f"'{where[0]}'{more}, {count} samples: deviations beyond are not seen; choose a larger "
-            "range.",
-        )
-
-
-def _clipped(x: Series) -> tuple[int, list[float]]:
-    """Return the number of clipped samples, and their values."""
-    first, length = _runs(x)
-    flat = length >= _PLATEAU
-    if not flat.any():
-        return 0, []
-    value, length = x[first[flat]], length[flat]
-    ends = [v for v in (np.nanmin(x), np.nanmax(x)) if v != 0 and (value == v).sum() > 1]
-    at_ends = np.isin(value, ends)
-    count = int(length[at_ends].sum())
-    enough = count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum())
-    return (count, ends) if enough else (0, [])
+    for trial, x in zip(s.trials, s.values, strict=True):
+        first, length = _runs(x)
+        value, length = x[first[length >= 3]], length[length >= 3]
+        if not len(value):
+            continue
+        ends = [v for v in (np.nanmin(x), np.nanmax(x)) if v != 0 and (value == v).sum() > 1]
+        at_ends = np.isin(value, ends)
+        count = length[at_ends].sum()
+        if count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum()):
+            levels = " and ".join(f"{v:.4g}" for v in ends)
+            text = f"{s.name} is cut off at {levels} in trial '{trial.name}'."
+            yield Finding("clipped", text)
+            return
 
 
 def wrapped(s: Signal) -> Iterator[Finding]:
@@ -162,9 +136,8 @@ def wrapped(s: Signal) -> Iterator[Finding]:
         jumps = int((np.abs(np.diff(count)) > 0.5 * whole).sum())
         if off < 1e-3 and whole.bit_count() == 1 and jumps > 1:  # scaled integers, but for rounding
             text = (
-                f"{s.name} jumps by the whole range of its {whole} levels {jumps} times in trial "
-                f"'{trial.name}', as integers that overflow: undo it (`numpy.unwrap` with "
-                f"period={whole * step:.6g}), or choose a larger range."
+                f"{s.name} jumps by its whole range in trial '{trial.name}', as integers that "
+                f"overflow: undo it (`numpy.unwrap` with period={whole * step:.6g})."
             )
             yield Finding("overflow", text, "refused")
             return
@@ -177,10 +150,7 @@ def doubled_signals(recording: Recording, names: list[str]) -> Iterator[Finding]
             x, y = (trial.values[:, recording.column(name)] for name in (a, b))
             both = np.isfinite(x) & np.isfinite(y)
             if both.any() and np.ptp(x[both]) > 0 and (x == y)[both].mean() > _EQUAL:
-                text = (
-                    f"{a} and {b} are the same numbers in trial '{trial.name}': one of them was "
-                    "copied over the other, or leave one out."
-                )
+                text = f"{a} and {b} are the same numbers in trial '{trial.name}': leave one out."
                 yield Finding("a signal twice", text, "refused")
                 break
 
@@ -203,15 +173,12 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
         same = np.zeros(len(y), bool)
         off = np.abs(x[first:last] - y[first - shift : last - shift])
         same[first - shift : last - shift] = (~(off > size)).all(axis=1)
-        if not (same & ~repeated[j]).any():
-            continue
-        cause, start = "overlap", f"{same.sum()} samples ({places([b], [same])}) are"
-        end = f"in trial '{a.name}' too, and count once; cut one of the two."
-        if same.mean() > _EQUAL:
-            cause, start = "a trial twice", f"all samples of trial '{b.name}' are"
-            end, same[:] = f"in trial '{a.name}' already, and count once.", True
-        repeated[j] |= same
-        findings.append(Finding(cause, f"{start} {end}", "left out"))
+        same |= same.mean() > _EQUAL
+        if (same & ~repeated[j]).any():
+            repeated[j] |= same
+            where = places([b], [same])
+            text = f"{same.sum()} samples ({where}) are in trial '{a.name}' too, and count once."
+            findings.append(Finding("a trial twice", text, "left out"))
     return repeated, findings
 
 

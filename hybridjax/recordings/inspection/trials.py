@@ -18,12 +18,10 @@ _ALIKE = 1.2
 # Least offset of another zero: in ranges, and in those of the other trials. Larger: offsets pass.
 # Smaller: scatter between trials is reported.
 _OFFSET, _OFF = 0.1, 10.0
-# Jump of a regular clock in steps; regular are steps that differ by 1 % in 95 % of the samples.
-# Larger: jumps pass. Smaller: single lost samples are reported.
-_JUMP = 5.0
-# Phases at which average cycles are compared, and the least correlation of cycles that are alike.
-# More, larger: noisy cycles differ. Fewer, smaller: other events and swapped signals pass.
-_PHASES, _CORRELATED = 16, 0.8
+# Least correlation of average cycles that are alike. Larger: noisy cycles differ. Smaller: other
+# events and swapped signals pass.
+_CORRELATED = 0.8
+_PHASES = 16
 # Relative difference of periods of trials, and its ratio to the jitter. Larger: other speeds pass.
 # Smaller: jitter is reported.
 _OTHER_PERIOD, _SCATTERS = 0.02, 5.0
@@ -70,20 +68,14 @@ def other_settings(
             # Pushes may be chosen to be ten times as strong.
             units = (1, 2, 3, 6) if name in outputs else (3, 6)
             if abs(power) in units and max(ratio / unit, unit / ratio) < _ALIKE:
-                text = (
-                    f"{name} varies {ratio:.3g} times as much in trial '{trial.name}' as in the "
-                    f"peers: if its unit is another one, divide it by {unit:g}."
-                )
+                text = f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?"
                 yield Finding("another unit", text, "refused" if name in outputs else "warned")
                 continue
             off = abs(middle[s, k] - usual[k])
             scatter = np.abs(middle[peers, k] - usual[k]).max()
             if name in outputs and off > max(_OFFSET * range_[k], _OFF * scatter):
-                yield Finding(
-                    "another zero",
-                    f"{name} lies at {middle[s, k]:.4g} in trial '{trial.name}', at {usual[k]:.4g} "
-                    "in the others: a level that defines the phase means something else there.",
-                )
+                place = f"{middle[s, k]:.4g} in trial '{trial.name}', at {usual[k]:.4g} elsewhere"
+                yield Finding("another zero", f"the median of {name} lies at {place}.")
 
 
 def _levels(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
@@ -101,23 +93,17 @@ def clocks(recording: Recording) -> Iterator[Finding]:
         ratio = steps[s] / float(np.median(peers)) if peers else 1.0
         unit = 1000.0 ** np.round(np.log10(ratio) / 3)
         if unit != 1 and max(ratio / unit, unit / ratio) < _ALIKE:
-            text = (
-                f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart as those of "
-                "the others: if its times have another unit (milliseconds), convert them."
-            )
+            text = f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart: its unit?"
             yield Finding("another unit of time", text, "refused")
         step = np.diff(trial.time) / steps[s]
         if (np.abs(step - 1) < 0.01).mean() > 0.95:
             jumps += [
                 f"trial '{trial.name}', by {steps[s] * step[k]:.3g} at {trial.time[k]:.2f} s"
-                for k in np.flatnonzero(step > _JUMP)
+                for k in np.flatnonzero(step > 5)  # fewer: lost samples
             ]
     if jumps:
-        yield Finding(
-            "jump of the clock",
-            f"the clock jumps ({listed(jumps)}): after a pause this is right; if the clock was "
-            "set, make a trial of each part.",
-        )
+        text = f"{listed(jumps)}: if this was no pause, make a trial of each part."
+        yield Finding("jump of the clock", text)
 
 
 def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
@@ -128,11 +114,8 @@ def other_cycles(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
             continue
         period, usual = np.median(phase.periods[s]), np.median([np.median(p) for p in peers])
         if abs(period / usual - 1) > max(_OTHER_PERIOD, _SCATTERS * phase.jitter):
-            yield Finding(
-                "another period",
-                f"cycles of trial '{trial.name}' last {period:.4g}, those of the others "
-                f"{usual:.4g}: if it ran at another speed it is another system; identify it alone.",
-            )
+            text = f"cycles of trial '{trial.name}' last {period:.4g}, of the others {usual:.4g}."
+            yield Finding("another period", text)
     if not outputs:
         return
     columns = [recording.column(name) for name in outputs]
@@ -178,18 +161,13 @@ def _difference(
     shifted = [correlations(np.roll(mean, m, axis=1)).min() for m in range(_PHASES)]
     best = int(np.argmax(shifted))
     if best and shifted[best] > _CORRELATED:
-        text = (
-            f"cycles of trial '{name}' begin {min(best, _PHASES - best) / _PHASES:.2g} of a cycle "
-            "away from where those of the others do: look at its events, or signs."
-        )
+        away = min(best, _PHASES - best) / _PHASES
+        text = f"cycles of trial '{name}' begin {away:.2g} of a cycle away from the others."
         yield Finding("another event", text, "refused")
         return
     which = ", ".join(outputs[k] for k in np.flatnonzero(alike <= _CORRELATED))
-    yield Finding(
-        "another cycle",
-        f"the average cycle of {which} in trial '{name}' is not that of the others: look at its "
-        "signs, columns and events, or identify it alone.",
-    )
+    text = f"the average cycle of {which} in trial '{name}' is not that of the others."
+    yield Finding("another cycle", text)
 
 
 def slow_changes(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -> Iterator[Finding]:
@@ -206,9 +184,5 @@ def slow_changes(recording: Recording, phase: Phase, outputs: tuple[str, ...]) -
                     slow += float((c[:_SLOW] ** 2).mean())
                     faster += float((c[_SLOW:] ** 2).mean())
         if slow > _RATIO * faster:
-            yield Finding(
-                "drift",
-                f"{name} drifts or slips: slow changes have {slow / faster:.3g} times the power of "
-                "those from cycle to cycle; if that is the sensor, `drift=50` takes it out; if "
-                "not, a multiplier lies near 1.",
-            )
+            text = f"{name} drifts or slips: if that is the sensor, `drift=50` takes it out."
+            yield Finding("drift", text)
