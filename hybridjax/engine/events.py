@@ -35,9 +35,6 @@ SAME_TIME = 1e-11
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
 # lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
 _ZENO_STREAK, _ZENO_REST = 10, 1e-3
-# An interval between events shrinks if it is at most this part of the last one. Nearer to 1: a
-# long transient of a stable bouncing is taken for Zeno. Farther: slow accumulation is missed.
-_ZENO_SHRINKS = 0.999
 # A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno, too.
 # Higher: it is called grazing instead. Lower: a grazing is called Zeno.
 _ZENO_SLOW = 3
@@ -222,10 +219,10 @@ def keep_pace(
     xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
     ratio = xp.where(gap > 0, since / xp.where(gap > 0, gap, 1.0), 0.0)
-    shrinks = ratio < _ZENO_SHRINKS
+    shrinks = ratio < 1
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
-    to_come = since * ratio / (1 - xp.minimum(ratio, _ZENO_SHRINKS))
+    to_come = xp.where(shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf)
     zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap, since = xp.where(event, since, gap), xp.where(event, 0.0, since)

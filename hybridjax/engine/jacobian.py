@@ -63,8 +63,8 @@ def tape_jacobian(
     across: Float[Array, "A d"] | None = None,
 ) -> tuple[Jacobians, Float[Array, "n L"]]:
     """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
-    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they are not
-    `wanted`. `across`: see `chain`; traced, it makes no difference."""
+    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they
+    are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
     columns, end = _push(s, lanes, target, tape, of_states, wanted)

@@ -175,7 +175,8 @@ def simulate(
     u, span = constant[:, None], np.array([duration], float)
     end = np.asarray(start.time) + span
     lanes, h = _start(s, np.array([start.time]), a, start.state, u, span, settings)
-    rows = [(lanes.t, lanes.q.T, lanes.q.T, lanes.chart, np.full(1, -1))]
+    q = np.asarray(lanes.q).T
+    rows = [(lanes.t, q, q, lanes.chart, np.full(1, -1))]
     steps = 0
     while True:
         moved, tape = _piece(s, lanes, u, end, settings, h)

@@ -75,8 +75,10 @@ class ChartFlow(NamedTuple):
 
     @property
     def has_level(self) -> bool:
-        levels = self.target.levels
-        return levels is not None and shared(levels).present(self.s, self.a)
+        s, a, levels = self.s, self.a, self.target.levels
+        if levels is None:
+            return False
+        return s.once(("level", a), (levels,), lambda: shared(levels).present(s, a))
 
     @property
     def rows(self) -> list[int]:

@@ -195,7 +195,7 @@ def _in_own_sizes(map: ReturnMap, solution: Solution, given: Sizes) -> tuple[Ret
         expected=map.expected if map.base is None else period,
     )
     if all(rough[name] <= _OFF * size for name, size in sizes.items()):  # more accurate than asked
-        distance = real(np.max(np.abs(solution.turn.residual) / np.asarray(fine.sizes)))
+        distance = real(np.max(np.abs(solution.turn.residual) / to_host(fine).sizes))
         return fine, solution._replace(turn=solution.turn._replace(distance=distance))
     say("Newton's method, in the sizes of the cycle")
     again = solve(fine)

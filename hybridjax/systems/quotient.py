@@ -19,11 +19,6 @@ from .system import Derived, Guess, HybridSystem
 from .transition import Scheduled, Transition
 
 
-# Functions are equal up to this part of the largest of their numbers. Higher: a weak asymmetry is
-# missed. Lower: rounding errors count.
-_EQUAL = 1e-9
-
-
 @checked
 class Quotient(Derived):
     """`system` modulo a symmetry, which is declared here once and written into no reset.
@@ -284,5 +279,5 @@ class _Reduced(Chart):
 
 
 def _equal(x, y):
-    size = np.nanmax(np.abs(x), initial=0.0)
-    return x.shape == y.shape and np.allclose(x, y, rtol=0, atol=_EQUAL * size, equal_nan=True)
+    size = np.nanmax(np.abs(x), initial=0.0) or 1.0
+    return x.shape == y.shape and np.allclose(x / size, y / size, rtol=0, equal_nan=True)

@@ -100,34 +100,22 @@ def as_method(solver: Any) -> Method:
         return _radau(solver.stages)
     import diffrax
 
-    if not isinstance(solver, diffrax.AbstractSolver):
-        raise _no_solver(solver)
     name = type(solver).__name__
-    if solver.term_structure not in (diffrax.AbstractTerm, diffrax.ODETerm):
-        raise DefinitionError(
-            f"{name} wants a field in several terms; a chart has one field. Take a Runge-Kutta "
-            "method such as `diffrax.Kvaerno5()` or `hj.Radau()`."
-        )
     if isinstance(solver, diffrax.ImplicitEuler):
         return Method(name, ((0.0, 0.0), (0.0, 1.0)), (0.0, 1.0), (0.0, 1.0), (-0.5, 0.5), 2.0)
-    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise DefinitionError(
-            f"{name} has no error estimate, by which steps are made as long as the accuracy "
-            "allows: take one that has, such as `diffrax.Tsit5()` or `hj.Radau()`."
-        )
     tableau = getattr(solver, "tableau", None)
-    if not isinstance(tableau, diffrax.ButcherTableau):
-        raise DefinitionError(
-            f"{name} is no Runge-Kutta method with a tableau: take one that is, such as "
-            "`diffrax.Tsit5()` or `hj.Radau()`."
-        )
+    single = getattr(solver, "term_structure", None) in (diffrax.AbstractTerm, diffrax.ODETerm)
+    adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
+    if not (single and adaptive and isinstance(tableau, diffrax.ButcherTableau)):
+        raise _no_solver(solver)
     return _from_tableau(name, tableau, float(solver.order(None)))  # pyright: ignore
 
 
 def _no_solver(given: Any) -> DefinitionError:
     return DefinitionError(
-        "a solver must be one of diffrax, such as `diffrax.Kvaerno5()`, or `hj.Radau()`, not "
-        f"{show(given)}."
+        "a solver must be `hj.Radau()` or a Runge-Kutta method of diffrax with an error estimate, "
+        "an explicit first stage and one vector field, such as `diffrax.Kvaerno5()` (stiff) or "
+        f"`diffrax.Tsit5()`, not {show(given)}."
     )
 
 
@@ -138,10 +126,7 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
     if tableau.a_diagonal is not None:
         a += np.diag(tableau.a_diagonal)
     if a[0, 0] != 0 or tableau.c1 != 0:
-        raise DefinitionError(
-            f"the first stage of {name} is implicit: take a method of which it is explicit, such "
-            "as `diffrax.Kvaerno5()`, or `hj.Radau()`."
-        )
+        raise _no_solver(name)
     c = (0.0, *tableau.c)
     return _method(name, a, tableau.b_sol, np.array(c), tableau.b_error, order)
 

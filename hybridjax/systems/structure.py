@@ -6,6 +6,7 @@ zero at their event.
 
 import dataclasses
 import functools as ft
+import operator
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any
 
@@ -63,7 +64,7 @@ class Structure:
 
     def __init__(self, source: "HybridSystem | PerLane"):
         self.source = source
-        self._made: dict[Hashable, tuple[Callable, tuple]] = {}
+        self._made: dict[Hashable, tuple[Any, tuple]] = {}
 
     def tree_flatten(self):
         return (self.source,), None
@@ -123,7 +124,7 @@ class Structure:
                 return by_lane(of_source, self.source, *trees)
             return by_lane(lambda *x: function(self, *x), *trees)
 
-        return make() if name is None else self._once(name, trees, make)
+        return make() if name is None else self.once(name, trees, make)
 
     def kernel(
         self, function: Callable, form: Callable, *static: Hashable, trees: tuple = (), lanes=1
@@ -132,15 +133,14 @@ class Structure:
         compiled (see `_core/compilation/kernel.py`)."""
         name = function, form, static, lanes
         every = self, *trees
-        return self._once(name, trees, lambda: kernel(function, form, static, every, lanes))
+        return self.once(name, trees, lambda: kernel(function, form, static, every, lanes))
 
-    def _once(self, name: Hashable, trees: tuple, make: Callable[[], Callable]) -> Callable:
-        """The function made under this name for these trees, made anew only for other trees."""
-        function, earlier = self._made.get(name, (None, ()))
-        if function is None or any(x is not y for x, y in zip(earlier, trees, strict=True)):
-            function = make()
-            self._made[name] = function, trees
-        return function
+    def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
+        """Return what was made under this name for these trees, made anew only for other trees."""
+        if name in self._made and all(map(operator.is_, self._made[name][1], trees)):
+            return self._made[name][0]
+        self._made[name] = made, _ = make(), trees
+        return made
 
     def chart_index(self, name: str) -> int:
         if name not in self.names:

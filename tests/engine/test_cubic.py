@@ -33,7 +33,7 @@ def truth(v0, v1, d0, d1, armed):
     return (falls[0] if falls else np.inf), extrema[np.abs(extrema.imag) < 1e-9].real, c
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(v0=number, v1=number, d0=number, d1=number)
 def test_first_crossing_is_a_root(v0, v1, d0, d1):
     armed = v0 > 0

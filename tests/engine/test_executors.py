@@ -15,7 +15,7 @@ from hybridjax.engine.tape import IDLE
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
 
-from ..conftest import KINEMATIC, OUTPUTS, no_compilation, unchecked_host
+from ..conftest import KINEMATIC, OUTPUTS, unchecked_host
 from ..fuzz.drawing import STRUCTURES, draw
 from ..fuzz.structures import Random
 from ..toys import Field
@@ -110,30 +110,9 @@ def test_both_find_the_same_cycle(hopper_cycle, compiled):
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, atol=1e-11)
 
 
-class Decay(hj.HybridSystem):
-    """x' = -rate x + u, reset to 1 where x falls to `level`: its period is -log(level) / rate."""
-
-    rate: hj.Parameter = hj.parameter(1.0)
-    level: hj.Parameter = hj.parameter(0.5)
-
-    def charts(self):
-        return {"x": Field(("x",), lambda t, q, u: (-self.rate * q[0] + u[0],))}
-
-    def transitions(self):
-        guard = lambda t, q, u: q[0] - self.level  # noqa: E731
-        return (hj.Transition("kick", "x", "x", guard, reset=lambda t, q, u: (q[0] / q[0],)),)
-
-
 def first_kick(system):
     found = hj.simulate(system, "x", [0.9], 1.5)
     return found.events[0].time
-
-
-def test_another_value_compiles_nothing_and_is_another_answer():
-    np.testing.assert_allclose(first_kick(Decay()), np.log(0.9 / 0.5), rtol=1e-9)
-    with no_compilation():
-        other = first_kick(Decay(rate=2.0, level=0.6))
-    np.testing.assert_allclose(other, np.log(0.9 / 0.6) / 2, rtol=1e-9)
 
 
 def test_a_class_of_the_same_name_is_another_system():

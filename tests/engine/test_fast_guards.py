@@ -24,7 +24,7 @@ class Sine(hj.HybridSystem):
         return [hj.Transition("fall", "line", "line", lambda t, q, u: jnp.sin(self.rate * q[0]))]
 
 
-@pytest.mark.parametrize("rate", [10.0, 23.0, 37.0, 61.0])
+@pytest.mark.parametrize("rate", [10.0, 61.0])
 def test_every_turn_of_a_fast_guard_is_seen(rate):
     run = hj.simulate(Sine(rate=rate), "line", (0.1,), 9.9)
     k = np.arange(1000)

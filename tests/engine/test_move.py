@@ -55,30 +55,11 @@ def ball_exact(x):
 X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
 
 
-def with_value(derivative):
-    """The derivative of `ball` together with its value."""
-    return derivative(lambda x: (ball(x),) * 2, has_aux=True)
-
-
-def test_forward_mode_has_a_closed_form():
-    found, value = compiled(with_value(jax.jacfwd))(X)
-    np.testing.assert_allclose(value, ball_exact(X), rtol=1e-13)
-    np.testing.assert_allclose(found, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
-
-
 def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     found, first = compiled(jax.jacfwd(lambda x: (jax.jacrev(ball)(x),) * 2, has_aux=True))(X)
     np.testing.assert_allclose(first, jax.jacfwd(ball_exact)(X), rtol=1e-11, atol=1e-12)
     exact = jax.hessian(ball_exact)(X)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
-
-
-def test_mapped_over_parameters_and_differentiated():
-    many = X + jnp.linspace(0.0, 0.1, 4)[:, None] * jnp.array([1.0, 1, 0, 1, 0, 1])
-    found, value = compiled(jax.vmap(with_value(jax.jacrev)))(many)
-    np.testing.assert_allclose(value, jax.vmap(ball_exact)(many), rtol=1e-12)
-    exact = jax.vmap(jax.jacrev(ball_exact))(many)
-    np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-12)
 
 
 def hopper(x):

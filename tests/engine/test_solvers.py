@@ -58,28 +58,14 @@ def test_radau_is_a_collocation_method(stages):
 
 
 @pytest.mark.parametrize(
-    "solver, reason",
-    [
-        (diffrax.Euler(), "Euler has no error estimate"),
-        (diffrax.SemiImplicitEuler(), "wants a field in several terms"),
-        (diffrax.KenCarp4(), "wants a field in several terms"),
-        (diffrax.ReversibleHeun(), "no Runge-Kutta method with a tableau"),
-    ],
+    "solver",
+    [diffrax.Euler(), diffrax.SemiImplicitEuler(), diffrax.KenCarp4(), diffrax.ReversibleHeun()],
 )
-def test_solvers_that_do_not_fit(solver, reason):
-    with pytest.raises(hj.DefinitionError, match=reason):
-        hj.find_limit_cycle(Damped(), settings=hj.Settings(solver=solver))
-
-
-def test_wrong_solvers_are_refused_where_they_are_given():
-    with pytest.raises(hj.DefinitionError, match="solver"):
-        hj.Settings(solver="Radau")
-    with pytest.raises(hj.DefinitionError, match="stages"):
-        hj.Radau(4)
-    with pytest.raises(hj.DefinitionError, match="there is no chart 'b'"):
-        hj.find_limit_cycle(Damped(), settings=hj.Settings(solver={"b": hj.Radau()}))
-    with pytest.raises(hj.DefinitionError, match="a solver must be"):
-        as_method(3)
+def test_solvers_that_do_not_fit(solver):
+    with pytest.raises(
+        hj.DefinitionError, match=f"error estimate.* not an? {type(solver).__name__}"
+    ):
+        as_method(solver)
 
 
 @pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])

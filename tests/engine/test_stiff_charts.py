@@ -78,6 +78,7 @@ def cycle():
     return hj.find_limit_cycle(Thermostat(), guess, section=hj.AtEvent("on"))
 
 
+@pytest.mark.slow
 def test_the_cycle(cycle):
     period, x = exact()
     np.testing.assert_allclose(cycle.period, period, rtol=1e-11)

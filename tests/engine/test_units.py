@@ -11,7 +11,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import move, record
+from hybridjax.engine.move import record
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -67,30 +67,6 @@ def test_the_same_steps_in_all_units(tangents):
         other = flow(length, time, SIZES * sizes(length, time), tangents)
         for x, y in zip((h, code, q), other, strict=False):
             np.testing.assert_array_equal(x, y)
-
-
-@pytest.mark.slow
-def test_sizes_of_each_of_many_flows_and_derivatives():
-    """Mapped over sizes: finer ones are more accurate. Derivatives in both modes agree."""
-    system = hopper()
-    lanes = begin(system, 1.0, 1.0)
-
-    def end(u, scale, rtol=1e-13, atol=1.0):
-        target = until(jnp.full(2, 1.5))
-        settings = Settings(rtol, atol, 256, scale)
-        return move(Structure(system), lanes, jnp.full((1, 2), u), target, settings).lanes.q
-
-    scales = SIZES * np.array([1e-13, 1e-12, 1e-4, 1.0])[:, None, None]
-    truth, *found = jax.jit(jax.vmap(lambda scale: end(0.1, scale)))(scales)
-    errors = [np.max(np.abs(q - truth)) for q in found]
-    assert errors[0] < 1e-12 and 1e-8 < errors[1] < 1e-5 < errors[2] < 1e-2
-
-    along = lambda scale: lambda u: end(u, scale, 1e-12, 1e-12)  # noqa: E731
-    forward = lambda scale: jax.jvp(along(scale), (0.1,), (1.0,))[1]  # noqa: E731
-    rates = jax.jit(jax.vmap(forward))(SIZES * np.array([1.0, 10.0])[:, None, None])
-    np.testing.assert_allclose(rates[0], rates[1], rtol=1e-9, atol=1e-9)
-    reverse = jax.jit(jax.grad(lambda u: jnp.sum(along(SIZES)(u))))(0.1)
-    np.testing.assert_allclose(reverse, jnp.sum(rates[0]), rtol=1e-9)
 
 
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.compilation import quick_jit
 from hybridjax.engine.lanes import start_lanes
-from hybridjax.engine.move import move, record
+from hybridjax.engine.move import move
 from hybridjax.engine.settings import Settings
 from hybridjax.engine.target import until
 from hybridjax.systems.structure import Structure
@@ -46,27 +45,6 @@ class Rounded(hj.HybridSystem):
             return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - self.level
 
         return (hj.Transition("fall", "line", "line", guard),)
-
-
-class Layer(hj.HybridSystem):
-    """A point on the unit circle; an event where it enters the layer |x - level| < width, and
-    perhaps one where x falls through `other`. Neither changes anything."""
-
-    level: hj.Parameter = hj.parameter()
-    width: hj.Parameter = hj.parameter()
-    other: hj.Parameter = hj.parameter()
-
-    def charts(self):
-        return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}
-
-    def transitions(self):
-        def layer(t, q, u):
-            return (q[0] - self.level) ** 2 - self.width**2
-
-        return (
-            hj.Transition("layer", "turn", "turn", layer),
-            hj.Transition("other", "turn", "turn", lambda t, q, u: q[0] - self.other),
-        )
 
 
 def test_a_guard_that_the_input_makes_negative_is_not_armed():
@@ -112,33 +90,5 @@ def across(x, time, duration):
     return moved.result[0], moved.lanes.events[0]
 
 
-@pytest.fixture(scope="module")
-def layers():
-    """Levels and widths of 1200 layers."""
-    grid = jnp.meshgrid(jnp.linspace(-0.6, 0.6, 300), jnp.array([2e-3, 3e-3, 1e-2, 3e-2]))
-    return [x.ravel() for x in grid]
-
-
-def test_a_thin_layer_is_not_jumped_over_on_the_way_to_another_guard(layers):
-    result, _, times = around(*layers, layers[0] - 0.04)
-    np.testing.assert_array_equal(result, hj.Result.OK)
-    np.testing.assert_allclose(times, jnp.arccos(sum(layers)), atol=1e-9)
-
-
 def test_an_event_is_where_its_guard_falls():
     assert not check("dips", [28], seed=5, accuracy=1e-10).failures
-
-
-@quick_jit
-def around(level, width, other):
-    """Results, numbers of events, and times of the first, on half a turn at the usual accuracy."""
-
-    def one(*numbers):
-        s, t, q = Structure(Layer(*numbers)), jnp.zeros(1), jnp.array([[1.0], [0.0]])
-        span = jnp.asarray(2.9)
-        lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
-        moved, tape = record(s, lanes, jnp.zeros((1, 1)), until(t + span), SETTINGS)
-        first = jnp.argmax(tape.code[:, 0] >= 0)
-        return moved.result[0], moved.lanes.events[0], tape.t[first, 0]
-
-    return jax.vmap(one)(level, width, other)

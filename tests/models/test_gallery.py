@@ -122,40 +122,6 @@ def test_cycle_and_multipliers(name):
     )
 
 
-def test_closed_forms():
-    w, multiplier = m.RimlessWheel().exact()
-    np.testing.assert_allclose([w, multiplier], [0.349754367432510, 0.5], rtol=1e-14)
-    t, y, v, multipliers = m.PaddleJuggler().exact()
-    np.testing.assert_allclose(
-        [t, y, v], [0.0647337849670541, 0.0593418341169377, 4.905], rtol=1e-14
-    )
-    expected = pair(0.399920196836063 + 0.574511824214789j)
-    np.testing.assert_allclose(multipliers, expected, rtol=1e-14)
-
-
-# What `find_limit_cycle` says of the models that have no cycle that it could find by itself.
-SAYS_WHAT_TO_GIVE = {"BouncingBall": "pass `guess=Guess", "SLIPRunner": "conserved={'energy': 17"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(
-            name, marks=() if name in ("RimlessWheel", "BouncingBall") else pytest.mark.slow
-        )
-        for name in m.__all__
-    ],
-)
-def test_a_model_alone_is_enough(name):
-    model = getattr(m, name)()
-    if name in SAYS_WHAT_TO_GIVE:
-        with pytest.raises(hj.HybridJaxError) as error:
-            hj.find_limit_cycle(model)
-        assert SAYS_WHAT_TO_GIVE[name] in str(error.value)
-    else:
-        assert hj.find_limit_cycle(model).stable
-
-
 def test_where_no_section_is_met_again_one_is_asked_for():
     wheel = m.RimlessWheel()
     after_impact = hj.Guess("swing", (float(wheel.slope - wheel.alpha), 0.45))

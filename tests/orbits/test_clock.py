@@ -58,6 +58,7 @@ def test_guards(system, message):
         hj.find_limit_cycle(system, hj.Guess("air", (0.1, 4.7), 0.1))
 
 
+@pytest.mark.slow
 def test_time_that_makes_no_difference():
     """Its period is that of the oscillator alone, from an integration in 34 digits."""
     cycle = find(Oscillator(lambda t, x: 0.0 * t + jnp.sin(t) ** 2 + jnp.cos(t) ** 2 - 1))

@@ -192,6 +192,7 @@ def _duffing_turn(q, rate):
     return out.y[:2, -1], out.y[2:, -1].reshape(2, 2)
 
 
+@pytest.mark.slow
 def test_resonance_of_the_duffing_oscillator():
     cycle = hj.find_limit_cycle(m.Duffing())
     branch = hj.continuation(cycle, "rate", (0.5, 1.2, 2.0))

@@ -62,6 +62,7 @@ def test_the_lossy_hopper(lossy_cycle):
     np.testing.assert_allclose(events, [0.522453086774101, 0.332748511553392], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_two_legged_bar(bar_cycle):
     state = [0.400516754055274, -0.764126541534894, -0.00728487463290610, 0.399159213578728]
     np.testing.assert_allclose(bar_cycle.anchor.q[:, 0], state, atol=1e-9)

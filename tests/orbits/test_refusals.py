@@ -40,6 +40,7 @@ def test_a_schedule_that_does_not_fit_the_clock():
         hj.find_limit_cycle(Kicked(beat=2.0, schedule=3.0), hj.Guess("a", (0.3,)))
 
 
+@pytest.mark.slow
 def test_events_before_the_search_do_not_count(hopper_cycle):
     settled = hj.find_limit_cycle(
         hj.models.VerticalHopper(), hj.Guess("stance", (2.0, 1.9), 0.5), settle=20.0

@@ -13,7 +13,7 @@ from hybridjax.systems.check import check_system
 from hybridjax.systems.structure import Structure
 from hybridjax.systems.system import own_fields
 
-from ..toys import Field, Switched
+from ..toys import Field
 
 
 ROOM = {
@@ -122,12 +122,6 @@ def replaced(**changes):
 def test_what_is_wrong_is_said(system, message):
     with pytest.raises(hj.DefinitionError, match=message):
         check_system(system)
-
-
-def test_a_guard_falls_at_its_event():
-    rising = Structure(replaced(direction="rising"))
-    assert rising.guard(0, 0.0, jnp.array([2.0, 0.0]), jnp.zeros(1)) == -2.0
-    assert Structure(Switched()).schedules(0) == [1] and Structure(Switched()).guards(0) == []
 
 
 def test_outputs_by_name_by_function_and_by_chart():

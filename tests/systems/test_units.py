@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.signal import Signal, ratio, unit_of
+from hybridjax._core.signal import Signal, unit_of
 
 
 def test_a_signal_is_its_name_and_knows_its_unit():
@@ -15,20 +15,6 @@ def test_a_signal_is_its_name_and_knows_its_unit():
     assert y == Signal("y", "m") != Signal("y", "mm") and y != Signal("v", "m")
     assert unit_of(pickle.loads(pickle.dumps(y))) == "m" and unit_of("y") == ""
     assert repr(y) == "'y' (m)" and f"{y}" == "y"
-
-
-@pytest.mark.parametrize(
-    "output, input, unit",
-    [
-        ("m", "N", "m/N"),
-        ("m/s", "N", "(m/s)/N"),
-        ("m", "N s", "m/(N s)"),
-        ("m", "", ""),
-        ("", "N", ""),
-    ],
-)
-def test_units_of_responses(output, input, unit):
-    assert ratio(Signal("y", output), Signal("u", input)) == unit
 
 
 def units(names):

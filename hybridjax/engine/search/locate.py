@@ -6,6 +6,7 @@ from ..._core.executor import namespace
 from ..._core.lanes import pick
 from ..arrays import Mask, States, Times
 from ..cubic import root_near_end
+from ..events import INSTANT
 from ..runge_kutta import Step
 from ..watch import ChartFlow, Watch
 from .state import Aim
@@ -15,11 +16,11 @@ from .state import Aim
 # measured from its expected time. Higher: a method of order 4 goes further, and more landings are
 # rejected as too inaccurate. Lower: more steps until a lane lands.
 _LANDING_REACH = 0.25
-# A landing is accurate to this part of the step: its last correction is at most as large (or as
-# large as that part of the time allowed), and it lies no farther beyond the step in which the
-# crossing was met. Corrections square their error. Higher: a crossing is off by more than a replay
-# corrects to rounding. Lower: landings are repeated.
-LANDING, _LANDING_OF_SPAN = 1e-6, 1e-14
+# A landing is accurate to this part of the step: its last correction is at most as large (or lasts
+# no longer than an instant), and it lies no farther beyond the step in which the crossing was met.
+# Corrections square their error. Higher: a crossing is off by more than a replay corrects to
+# rounding. Lower: landings are repeated.
+LANDING = 1e-6
 # Attempts to land on a crossing before the step in which it was met is halved. Higher: they cost
 # time where the cubic interpolant is no guide to the crossing. Lower: steps are halved too early.
 LANDING_TRIES = 8
@@ -56,8 +57,7 @@ def land(
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
     error = xp.max(end.error / allowed * xp.where(share > 0, share, 0.0) ** 2, axis=0)
-    rounding = _LANDING_OF_SPAN * span
-    fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + rounding
+    fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
     return Landing(
         xp.where(lands, end.q, step.q),
