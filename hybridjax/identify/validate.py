@@ -166,9 +166,8 @@ def validate(
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
     cycles, or all records are too short to be compared or for so many lags.
     """
-    free_start, tested = start == "free", model
-    if isinstance(model, LDTPFit):
-        tested = model.predictor or model.model
+    free_start = start == "free"
+    tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
     records = uninterrupted_records(data)
     require_same("model and data", model, records[0])
     compared = [r for r in records if can_be_compared(tested, r, free_start)]
