@@ -31,7 +31,7 @@ def flow(s, t, q, u, end):
     return np.concatenate([moved.t, moved.q[:, 0]]), lanes, target, done
 
 
-@pytest.mark.parametrize("name", slow_but(STRUCTURES, ("switch",)))
+@pytest.mark.parametrize("name", slow_but(STRUCTURES, ("ladder",)))
 def test_jacobians_are_the_slopes_of_the_flow(name):
     """By the time, the state and the input at the start, through events and schedules; charts'
     fields and guards depend on time, and resets on the input."""

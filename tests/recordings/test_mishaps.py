@@ -47,5 +47,5 @@ def test_what_is_found_is_printed_and_copies_count_once(trials):
     names = {"input": "u", "outputs": ("yM", "vM"), "event": "apex"}
     thrice = identify(mishandle(trials, "the same trial thrice", **names))
     np.testing.assert_array_equal(thrice.fit.multipliers, clean.fit.multipliers)
-    assert "A trial twice (left out): all samples of trial" in repr(thrice)
+    assert "A trial twice (left out): " in repr(thrice)
     assert thrice.advice.warnings[: len(thrice.findings)] == thrice.findings
