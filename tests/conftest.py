@@ -28,6 +28,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core import compilation
+from hybridjax._core.execution import libraries
 
 
 # Files whose fast tests cover each capability once, for `-m core`.
@@ -56,6 +57,9 @@ def pytest_xdist_auto_num_workers(config):
     return None
 
 
+# (A plugin of pytest may have loaded NumPy before this file.)
+for library in libraries():
+    library.set(1)
 hj.enable_x64()
 hj.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
 hypothesis.settings.register_profile("untimed", hypothesis.settings.default, deadline=None)
