@@ -144,11 +144,13 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
         return _STATES[name]
     hint: Any = kind
     for part in name.split("."):
-        module = next(x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
+        module: Any = next(
+            x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__")
+        )
         hint = module.__dataclass_fields__[part].type
     shaped = next(x for x in _options(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []
-    for axis in shaped.dim_str.split():
+    for axis in str(shaped.dim_str).split():
         axis = _AXES.get(axis, axis)
         axes.append(f"{axis}_{axes.count(axis) + 1}" if axis in axes else axis)
     return tuple(axes)
@@ -236,7 +238,11 @@ def _to_section_data(dataset: Any, header: Mapping[str, Any]) -> SectionData:
     names = [Signal(name, _unit(dataset, name)) for name in signals]
     values = np.stack([dataset[name].values for name in signals], axis=1)
     nu, N = len(header["inputs"]), int(dataset.attrs["n_sections"])
-    about = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
+    about: dict[str, Any] = {
+        "n_sections": N,
+        "inputs": tuple(names[:nu]),
+        "outputs": tuple(names[nu:]),
+    }
     for k in np.unique(dataset["record"].values):
         samples = dataset["record"].values == k
         about["first_section"] = int(dataset["section"].values[samples][0])

@@ -206,4 +206,4 @@ def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
 
 
 def _real(x: Complex[np.ndarray, "a b"]) -> Float[np.ndarray, "a b2"]:
-    return np.concatenate([x.real, x.imag], axis=1)
+    return np.concatenate([np.real(x), np.imag(x)], axis=1)
