@@ -129,7 +129,10 @@ def unit_circle(
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [
         Curve(np.real(circle), np.imag(circle), color=COLORS[-1]),
-        *(Curve(*np.clip([np.real(z), np.imag(z)], -3, 3), color=COLORS[0]) for z in regions),
+        *(
+            Curve(np.clip(np.real(z), -3, 3), np.clip(np.imag(z), -3, 3), color=COLORS[0])
+            for z in regions
+        ),
         Curve(np.real(values), np.imag(values), color=COLORS[1], points=True),
     ]
     return picture(curves, "real part", "imaginary part", square=True)

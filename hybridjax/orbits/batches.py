@@ -194,8 +194,8 @@ class Tiles(NamedTuple):
                 rows = rows[KDTree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
                 anchor, period, jacobian = neighbors(rows, out)
-                begin = self._first_step(rows, anchor, period, jacobian)
-                part = self._newton(rows, *begin, steps=USUAL_STEPS)
+                anchor, period = self._first_step(rows, anchor, period, jacobian)
+                part = self._newton(rows, anchor, period, USUAL_STEPS)
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None
