@@ -129,10 +129,7 @@ def unit_circle(
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [
         Curve(np.real(circle), np.imag(circle), color=COLORS[-1]),
-        *(
-            Curve(np.clip(np.real(z), -3, 3), np.clip(np.imag(z), -3, 3), color=COLORS[0])
-            for z in regions
-        ),
+        *(Curve(np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3), color=COLORS[0]) for z in regions),
         Curve(np.real(values), np.imag(values), color=COLORS[1], points=True),
     ]
     return picture(curves, "real part", "imaginary part", square=True)
@@ -154,13 +151,9 @@ def picture(
     import matplotlib  # heavy, and needed by notebooks only
     from matplotlib.figure import Figure
 
-    look: dict[Any, Any] = {
-        "svg.fonttype": "none",
-        "font.sans-serif": ["DejaVu Sans"],
-        "font.size": 7,
-    }
     colors = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
-    look |= {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
+    look: dict[Any, Any] = {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
+    look |= {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"], "font.size": 7}
     with matplotlib.rc_context(look):
         figure = Figure(figsize=(3.2, 2.2), layout="constrained")
         axes = figure.add_subplot(

@@ -271,8 +271,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
         dims = np.array([len(c.states) for c in cycle.system.charts().values()])[chart]
         states = np.asarray(placed.lanes.q).T
         states = np.where(np.arange(states.shape[1]) < dims[:, None], states, np.nan)
-        assert ldtp.coordinates is not None
-        coordinates[name] = [list(c) for c in ldtp.coordinates]
+        coordinates[name] = [list(c) for c in cast(tuple, ldtp.coordinates)]
         arrays |= {
             f"H_exact_{name}": np.asarray(family.exact.H),
             f"H_estimate_{name}": _on_grid(family.estimate, family.exact.f),

@@ -144,10 +144,8 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
         return _STATES[name]
     hint: Any = kind
     for part in name.split("."):
-        module: Any = next(
-            x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__")
-        )
-        hint = module.__dataclass_fields__[part].type
+        module = next(x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
+        hint = module.__dataclass_fields__[part].type  # type: ignore[attr-defined]
     shaped = next(x for x in _options(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []
     for axis in str(shaped.dim_str).split():
@@ -238,11 +236,7 @@ def _to_section_data(dataset: Any, header: Mapping[str, Any]) -> SectionData:
     names = [Signal(name, _unit(dataset, name)) for name in signals]
     values = np.stack([dataset[name].values for name in signals], axis=1)
     nu, N = len(header["inputs"]), int(dataset.attrs["n_sections"])
-    about: dict[str, Any] = {
-        "n_sections": N,
-        "inputs": tuple(names[:nu]),
-        "outputs": tuple(names[nu:]),
-    }
+    about: Any = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
     for k in np.unique(dataset["record"].values):
         samples = dataset["record"].values == k
         about["first_section"] = int(dataset["section"].values[samples][0])

@@ -46,30 +46,28 @@ def field(s: Structure, a: int, t: Times, q: States, u: Inputs, some: Some = Non
 
 def step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None) -> Step:
     """A step in chart a, without derivatives."""
-    form: Any = _ByMethod(_step, s.method(a))
-    return Step(*s.kernel(_field, form, a)(t, q, u, h, some=some))
+    return Step(*s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some))
 
 
 def step_along(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, along: States
 ) -> tuple[Step, States, States]:
     """A step in chart a, and the derivatives of its end and of its error along a direction."""
-    form: Any = _ByMethod(_step_along, s.method(a))
-    rows = s.kernel(_field, form, a)(t, q, u, h, along)
+    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(t, q, u, h, along)
     return Step(*rows[:4]), rows[4], rows[5]
 
 
 def linear_step(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
-    form: Any = _ByMethod(_linear_step, s.method(a))
+    form = _ByMethod(_linear_step, s.method(a))
     return s.kernel(_field, form, a, lanes=_POINTS)(t, q, u, h)
 
 
 def divergence(s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times) -> Times:
     """The divergence of the field of chart a, integrated over steps."""
     method = s.method(a)
-    form: Any = _ByMethod(_divergence, method if method.implicit else as_method(Radau()))
+    form = _ByMethod(_divergence, method if method.implicit else as_method(Radau()))
     return s.kernel(_field, form, a, lanes=_MANY_POINTS)(t, q, u, h)
 
 

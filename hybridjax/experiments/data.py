@@ -155,11 +155,7 @@ class ExperimentData(eqx.Module):
     @property
     def records(self) -> tuple[Record, ...]:
         """The experiments that ran to their end, each with all of its cycles."""
-        about: dict[str, Any] = {
-            "n_sections": self.n_sections,
-            "inputs": self.inputs,
-            "outputs": self.outputs,
-        }
+        about: Any = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
         return tuple(Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok))
 
     @property

@@ -1,11 +1,10 @@
 """A limit cycle in phase space (paper Fig. 1)."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from .._core.boundary.checked import checked
@@ -170,7 +169,7 @@ def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
 
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> None:
-    figure = cast(Figure, ax.get_figure(root=True))
+    figure: Any = ax.get_figure(root=True)
     width, height = ax.get_position().size * figure.get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
@@ -182,8 +181,7 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> N
             room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
             if room.max() > _BAR:
                 at = beside[np.argmax(room)]
-                x, y = unit * at
-                ax.text(x, y, str(i), **_NUMBER)
+                ax.text(unit[0] * at[0], unit[1] * at[1], str(i), **_NUMBER)
                 taken = np.concatenate([taken, at[None]])
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)
