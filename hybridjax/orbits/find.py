@@ -104,9 +104,7 @@ def find_limit_cycle(
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        again: dict[str, Any] = dict(
-            section=section, multiplicity=multiplicity, conserved=conserved
-        )
+        again: Any = dict(section=section, multiplicity=multiplicity, conserved=conserved)
         again |= dict(settings=dataclasses.replace(settings, solver=None), scale=scale, throw=throw)
         first = dict(settle=settle, max_period=max_period)
         return _find_with_auto(system, guess, first, again)

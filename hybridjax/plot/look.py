@@ -67,7 +67,7 @@ _STYLE: dict[Any, Any] = {
     "figure.dpi": 150,
 }
 # Text stays text: it can be searched and edited.
-_FONTS_IN_FILES: dict[Any, Any] = {"pdf.fonttype": 42, "svg.fonttype": "none"}
+_FONTS_IN_FILES: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}
 # Figures that have no layout engine are given none.
 _IN_FILES = _FONTS_IN_FILES | {"figure.autolayout": False, "figure.constrained_layout.use": False}
 
