@@ -76,6 +76,17 @@ def test_a_users_script_has_no_errors_in_pyright(tmp_path, script):
     assert found.returncode == 0, found.stdout + found.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "checker", [("mypy",), ("basedpyright", "--pythonpath", sys.executable)], ids=lambda c: c[0]
+)
+def test_the_package_has_no_type_errors(checker):
+    """With the settings in pyproject.toml."""
+    command = [sys.executable, "-m", *checker]
+    report = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert report.returncode == 0, report.stdout + report.stderr
+
+
 # Arguments that may be anything, each for a reason.
 ANYTHING = {
     "charts of a system take whatever their subclass declares": {"Chart.field"},

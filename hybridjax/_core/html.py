@@ -128,9 +128,9 @@ def unit_circle(
     """A picture of multipliers, with the borders of their confidence regions."""
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [
-        Curve(circle.real, circle.imag, color=COLORS[-1]),
-        *(Curve(np.clip(z.real, -3, 3), np.clip(z.imag, -3, 3), color=COLORS[0]) for z in regions),
-        Curve(values.real, values.imag, color=COLORS[1], points=True),
+        Curve(np.real(circle), np.imag(circle), color=COLORS[-1]),
+        *(Curve(np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3), color=COLORS[0]) for z in regions),
+        Curve(np.real(values), np.imag(values), color=COLORS[1], points=True),
     ]
     return picture(curves, "real part", "imaginary part", square=True)
 
@@ -151,9 +151,9 @@ def picture(
     import matplotlib  # heavy, and needed by notebooks only
     from matplotlib.figure import Figure
 
-    look = {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"], "font.size": 7}
     colors = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
-    look |= {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
+    look: dict[Any, Any] = {"text.parse_math": False, **dict.fromkeys(colors, _INK)}
+    look |= {"svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"], "font.size": 7}
     with matplotlib.rc_context(look):
         figure = Figure(figsize=(3.2, 2.2), layout="constrained")
         axes = figure.add_subplot(
@@ -169,7 +169,7 @@ def picture(
         for c, visible in zip(curves, shown, strict=True):
             k = thinned(len(visible))
             values = np.where(visible, c.y, np.nan)[k]
-            line = {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
+            line: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}
             color = _INK if c.color == "currentColor" else c.color
             axes.plot(np.asarray(c.x)[k], values, color=color, label=c.name or None, **line)
         if any(c.name for c in curves):

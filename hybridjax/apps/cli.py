@@ -5,7 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 from .. import __version__
 from .._core import limits
@@ -100,7 +100,7 @@ def _crossing(text: str) -> tuple[str, Literal["rising", "falling"], float]:
     try:
         if len(more) > 2 or direction not in ("rising", "falling") or not signal.strip():
             raise ValueError
-        return signal.strip(), direction, _finite(value)
+        return signal.strip(), cast(Literal["rising", "falling"], direction), _finite(value)
     except (ValueError, argparse.ArgumentTypeError):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a signal, a direction and a value, as in x:falling:0.2"

@@ -17,7 +17,7 @@ OUTPUTS = ("yM", "vM")
 def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> dict:
     """Return every number of the table, ready for JSON."""
     true = cycle.multipliers
-    summary = {
+    summary: dict[str, Any] = {
         "version": __version__,
         "protocol": dataclasses.asdict(protocol),
         "limit_cycle": {

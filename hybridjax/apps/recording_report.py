@@ -234,9 +234,9 @@ def _multipliers(found: Identification) -> list[str]:
     for i, z in _upper(found):
         border = found.fit.ellipse(i)
         pair = " and its conjugate" if z.imag else ""
-        reach = f"±\u00a0{np.ptp(border.real) / 2:.2g}"
+        reach = f"±\u00a0{np.ptp(np.real(border)) / 2:.2g}"
         if z.imag:
-            reach = f"real part {reach}, imaginary part ±\u00a0{np.ptp(border.imag) / 2:.2g}"
+            reach = f"real part {reach}, imaginary part ±\u00a0{np.ptp(np.imag(border)) / 2:.2g}"
         moduli = np.abs(border)
         lines.append(
             f'<p class="main"><strong>{_show(z)}{pair}</strong> <span>95 % region: {reach}; '

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -160,7 +160,7 @@ def _hopper(parameters: Mapping[str, float]) -> VerticalHopper:
             raise DefinitionError(
                 f"the hopper has no parameter '{name}'; parameters are {', '.join(names)}."
             )
-    return VerticalHopper(**parameters)
+    return VerticalHopper(**cast(dict[str, Any], parameters))
 
 
 def _design(protocol: Protocol) -> Design:
@@ -271,7 +271,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
         dims = np.array([len(c.states) for c in cycle.system.charts().values()])[chart]
         states = np.asarray(placed.lanes.q).T
         states = np.where(np.arange(states.shape[1]) < dims[:, None], states, np.nan)
-        coordinates[name] = [list(c) for c in ldtp.coordinates]
+        coordinates[name] = [list(c) for c in cast(tuple, ldtp.coordinates)]
         arrays |= {
             f"H_exact_{name}": np.asarray(family.exact.H),
             f"H_estimate_{name}": _on_grid(family.estimate, family.exact.f),

@@ -4,7 +4,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -32,13 +32,14 @@ def run(
         if name not in get_args(Want):
             kinds = ", ".join(get_args(Want))
             raise DefinitionError(f"`{name}` is nothing that a sweep keeps: {kinds}.")
+    quantities = cast(Sequence[Want], want)
     names = [name for name, *_ in axes]
     if len(set(names)) < len(names):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
     over = {name: np.linspace(low, high, count) for name, low, high, count in axes}
     system = _load(*model)
     if scheduler is None:
-        maps = sweep(system, over, want, store=out, force=force)
+        maps = sweep(system, over, quantities, store=out, force=force)
     else:
         distributed = package("distributed")
         package("cloudpickle").register_pickle_by_value(sys.modules[Path(model[0]).stem])
@@ -47,8 +48,8 @@ def run(
         except (OSError, ValueError) as error:
             raise DefinitionError(f"no Dask scheduler answers at '{scheduler}'.") from error
         with client:
-            maps = sweep(system, over, want, store=out, client=client, force=force)
-    pictures = []
+            maps = sweep(system, over, quantities, store=out, client=client, force=force)
+    pictures: list[str] = []
     for name in want:
         if maps[name].dims == tuple(names) and len(names) <= 2:
             picture = f"{Path(out).with_suffix('')}-{name}"

@@ -145,10 +145,10 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
     hint: Any = kind
     for part in name.split("."):
         module = next(x for x in _options(hint) if isinstance(x, type) and hasattr(x, "__mro__"))
-        hint = module.__dataclass_fields__[part].type
+        hint = module.__dataclass_fields__[part].type  # type: ignore[attr-defined]
     shaped = next(x for x in _options(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []
-    for axis in shaped.dim_str.split():
+    for axis in str(shaped.dim_str).split():
         axis = _AXES.get(axis, axis)
         axes.append(f"{axis}_{axes.count(axis) + 1}" if axis in axes else axis)
     return tuple(axes)
@@ -236,7 +236,7 @@ def _to_section_data(dataset: Any, header: Mapping[str, Any]) -> SectionData:
     names = [Signal(name, _unit(dataset, name)) for name in signals]
     values = np.stack([dataset[name].values for name in signals], axis=1)
     nu, N = len(header["inputs"]), int(dataset.attrs["n_sections"])
-    about = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
+    about: Any = {"n_sections": N, "inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
     for k in np.unique(dataset["record"].values):
         samples = dataset["record"].values == k
         about["first_section"] = int(dataset["section"].values[samples][0])

@@ -164,8 +164,10 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
                 f"`noise` has {noise.n_sections} sections and the outputs {listed(noise.outputs)}, "
                 f"the model {N} and {listed(outputs)}."
             )
-        fitted = isinstance(noise, LDTPFit)
-        spectrum = noise.noise_spectrum if fitted else functools.partial(noise_spectrum, noise)
+        if isinstance(noise, LDTPFit):
+            spectrum = noise.noise_spectrum
+        else:
+            spectrum = functools.partial(noise_spectrum, noise)
         return Noise(np.array([outputs.index(name) for name in noise.outputs]), spectrum)
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}

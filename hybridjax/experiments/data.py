@@ -1,6 +1,6 @@
 """Data of experiments on a hybrid system, on a linear model or in a laboratory."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
@@ -155,7 +155,7 @@ class ExperimentData(eqx.Module):
     @property
     def records(self) -> tuple[Record, ...]:
         """The experiments that ran to their end, each with all of its cycles."""
-        about = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
+        about: Any = {"n_sections": self.n_sections, "inputs": self.inputs, "outputs": self.outputs}
         return tuple(Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok))
 
     @property

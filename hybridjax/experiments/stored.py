@@ -202,7 +202,8 @@ class ExperimentJob:
             jax.numpy.asarray(new) if isinstance(old, jax.Array) else new
             for old, new in zip(leaves, arrays, strict=True)
         ]
-        placed, stepping, model = eqx.combine(structure.unflatten(leaves), static)
+        mine = jax.tree_util.tree_unflatten(structure, leaves)
+        placed, stepping, model = eqx.combine(mine, static)
         campaign = dataclasses.replace(self.campaign, placed=placed, stepping=stepping, model=model)
         return dataclasses.replace(self, campaign=campaign)
 

@@ -3,7 +3,7 @@
 import dataclasses
 import operator
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -203,7 +203,7 @@ def _residuals_jvp(primals, tangents):
 
 @quick_jit
 def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
-    solution = optx.least_squares(
+    solution: optx.Solution[Any, Any] = optx.least_squares(
         lambda x, args: _residuals(x, *args),
         optx.LevenbergMarquardt(_TOLERANCE, _TOLERANCE, linear_solver=lx.SVD(rcond=_RCOND)),
         x,
@@ -212,7 +212,7 @@ def _iterate(problem: FitProblem, x, guess, free) -> Evaluation:
         max_steps=MAX_STEPS,
         throw=False,
     )
-    done = solution.result == optx.RESULTS.successful
+    done = cast(Array, solution.result == optx.RESULTS.successful)
     residuals, jacobian = solution.aux
     return Evaluation(solution.value, residuals, jacobian, solution.stats["num_steps"], done)
 

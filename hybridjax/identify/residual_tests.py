@@ -43,7 +43,9 @@ class Samples(NamedTuple):
         late = self.before >= lags
         return [np.flatnonzero(late & (self.section == n)) for n in range(self.n_sections)]
 
-    def count(self, present: Bool[np.ndarray, "n ny"], lags: int) -> Int[np.ndarray, "N ny"]:
+    def count(  # type: ignore[override]  # (of tuples)
+        self, present: Bool[np.ndarray, "n ny"], lags: int
+    ) -> Int[np.ndarray, "N ny"]:
         """Return how often each section was sampled with so many samples before it."""
         return np.stack([present[rows].sum(axis=0) for rows in self.at(lags)])
 

@@ -5,7 +5,7 @@ same memory for any number of experiments, and those of two sets of experiments 
 """
 
 from collections.abc import Iterable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -58,7 +58,7 @@ class SpectralSums(NamedTuple):
     """Sums of conj(X) X^T over all experiments, also those that failed."""
     gram: Complex[np.ndarray, "K 2*nu 2*nu"]
     """Sums of conj(X) X^T."""
-    count: Int[np.ndarray, " K"]
+    count: Int[np.ndarray, " K"]  # type: ignore[assignment]  # (not the method of tuples)
     """The number of experiments."""
     along: Complex[np.ndarray, "K 2*nu M ny"]
     """Sums of conj(X) Y[k + l P], Y the mean over the repeated windows."""
@@ -259,7 +259,7 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
         return out
 
     common = ("setup", "harmonics", "line", "repeats")
-    both = {}
+    both: dict[str, Any] = {}
     for name in set(SpectralSums._fields).difference(common):
         x, y = getattr(a, name), getattr(b, name)
         both[name] = (x[0] + y[0], x[1] + y[1]) if isinstance(x, tuple) else add(x, y)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,7 +48,7 @@ class VerticalHopper(HybridSystem):
     systems, CDC-ECC 2011, and HSCC 2013, whose parameters these are.
     """
 
-    input_units = ("N",)
+    input_units: ClassVar[tuple[str, ...]] = ("N",)
     time_unit = "s"
 
     m: Parameter = parameter(1.0, unit="kg", doc="mass of the foot")
@@ -140,15 +141,15 @@ class PairStanding(Chart):
     down: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def absent(self) -> dict[str, float]:
+    def absent(self) -> dict[str, float]:  # type: ignore[override]
         return {name: 0.0 for i in self.down for name in _FEET[i]}
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> tuple[str, ...]:  # type: ignore[override]
         return tuple(name for name in _STATES if name not in self.absent)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
         return ("m", "m/s") * (len(self.states) // 2)
 
     def whole(self, q: Array) -> list[Array]:

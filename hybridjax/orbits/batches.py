@@ -100,7 +100,7 @@ class Programs(NamedTuple):
 
 
 # For few systems, and for many.
-QUICK = Programs(*map(quick_jit, (_turn, _verdict, _settled)))
+QUICK = Programs(quick_jit(_turn), quick_jit(_verdict), quick_jit(_settled))
 FULL = Programs(eqx.filter_jit(_turn), eqx.filter_jit(_verdict), eqx.filter_jit(_settled))
 
 
@@ -194,8 +194,8 @@ class Tiles(NamedTuple):
                 rows = rows[KDTree(parameters[rows]).indices]  # systems of one call are neighbors
                 order[more] = rows
                 anchor, period, jacobian = neighbors(rows, out)
-                begin = self._first_step(rows, anchor, period, jacobian)
-                part = self._newton(rows, *begin, USUAL_STEPS)
+                anchor, period = self._first_step(rows, anchor, period, jacobian)
+                part = self._newton(rows, anchor, period, USUAL_STEPS)
                 part = part._replace(steps=part.steps + 1)
                 out = part if out is None else _join(out, part)
         assert out is not None

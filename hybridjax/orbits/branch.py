@@ -28,7 +28,7 @@ class BranchPoint(NamedTuple):
     kind: str
     """"fold" (a multiplier +1: the branch turns back), "branch point" (+1: another branch crosses),
     "flip" (-1: a cycle of twice the period begins) or "Neimark-Sacker" (a complex pair)."""
-    index: int
+    index: int  # type: ignore[assignment]  # (not the method of tuples)
     """Its row in the branch."""
     value: float
     """The value of the parameter."""

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -48,7 +49,8 @@ def check_clock(s: Structure) -> None:
     for a, chart in enumerate(s.names):
         times: dict[str, np.ndarray] = {}
         for x in (s.transitions[g] for g in s.schedules(a)):
-            every, offset = float(x.guard.period), float(x.guard.offset)
+            guard = cast(Scheduled, x.guard)
+            every, offset = float(guard.period), float(guard.offset)
             times[x.name] = (offset + every * np.arange(round(period / every))) % period
         for (name, first), (other, second) in itertools.combinations(times.items(), 2):
             apart = np.abs(first[:, None] - second + period / 2) % period - period / 2

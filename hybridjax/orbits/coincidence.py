@@ -9,7 +9,7 @@ for events that are independent of each other, it is differentiable.
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -149,7 +149,7 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
 
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     """True if scheduled event g happens at t."""
-    schedule = s.transitions[g].guard
+    schedule = cast(Scheduled, s.transitions[g].guard)
     turns = (t - float(schedule.offset)) / float(schedule.period)
     return abs(turns - round(turns)) * float(schedule.period) <= within
 

@@ -144,7 +144,8 @@ class _Trace(NamedTuple):
 
     def run(self, start: Point) -> tuple[list[Point], list[tuple[int, str]], BranchEnd]:
         """The points along a tangent, the marks (row, kind) among them, and the end."""
-        points, marks, length, moved = [start], [], _FIRST * self.step, None
+        marks: list[tuple[int, str]] = []
+        points, length, moved = [start], _FIRST * self.step, None
         low, high = self.values[0], self.values[-1]
         upward = start.tangent[-1]
         if (start.value >= high and upward > 0) or (start.value <= low and upward < 0):

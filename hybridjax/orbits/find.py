@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -103,8 +104,8 @@ def find_limit_cycle(
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        again = dict(section=section, multiplicity=multiplicity, conserved=conserved, scale=scale)
-        again |= dict(settings=dataclasses.replace(settings, solver=None), throw=throw)
+        again: Any = dict(section=section, multiplicity=multiplicity, conserved=conserved)
+        again |= dict(settings=dataclasses.replace(settings, solver=None), scale=scale, throw=throw)
         first = dict(settle=settle, max_period=max_period)
         return _find_with_auto(system, guess, first, again)
     system = settings.system(system)

@@ -178,7 +178,10 @@ class ReturnMap(eqx.Module):
     def turn(self, q: Float[Array, " d"]) -> Return:
         """One turn from a state on the section."""
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
-        flow = lambda *x: (move(s, x[0], u, x[1], self.settings, *x[2:], new_input=False), None)  # noqa: E731
+
+        def flow(lanes, target, h, result):
+            return move(s, lanes, u, target, self.settings, h, result, new_input=False), None
+
         return self.travel(q, flow)[0]
 
     def turn_with_jacobian(

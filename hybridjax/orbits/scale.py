@@ -8,7 +8,7 @@ as they do a state that a symmetry keeps at zero, the size is large enough to to
 """
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -201,7 +201,7 @@ def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
         rows = np.flatnonzero(chart == a)
         parts = _fields_of_chart(s, int(a), t[rows], q[: s.dims[a], rows])
         for whole, part in zip(out, parts, strict=True):
-            whole[(*map(slice, part.shape[:-1]), rows)] = part
+            whole[cast(Any, (*map(slice, part.shape[:-1]), rows))] = part
     return out
 
 

@@ -33,7 +33,7 @@ def validation(
     N, ny = found.n_sections, len(found.outputs)
     shown = slice(max(len(found.measured) - cycles * N, 0), None)
     time = (found.first_section + np.arange(len(found.measured)))[shown] / N
-    limit = stats.norm.isf(0.005)
+    limit = float(stats.norm.isf(0.005))
     with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
         for i, name in enumerate(found.outputs):
             signal, auto, cross = axes[i]

@@ -1,6 +1,7 @@
 """Harmonic transfer functions against frequency (paper Figs. 3 and 4)."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -207,7 +208,7 @@ def bodes(
     return Plot(axes)
 
 
-_FIT_NAMES = {RationalFit: "rational fit", StructuredFit: "structured fit"}
+_FIT_NAMES: dict[type, str] = {RationalFit: "rational fit", StructuredFit: "structured fit"}
 
 
 def _columns(families) -> list[tuple[str, tuple[HTF, ...]]]:
@@ -283,7 +284,7 @@ def _band(ax: Axes, f, middle, radius, line: dict, floor: float = -np.inf) -> No
     ax.fill_between(f, low, high, color=line["color"], alpha=0.25, lw=0, zorder=2)
 
 
-def _curve(upper: Axes, lower: Axes, f, values, reference, known=slice(None), **line):
+def _curve(upper: Axes, lower: Axes, f, values, reference, known: Any = slice(None), **line):
     """Draw magnitude and phase, where it is known; whole turns of phase are chosen as in the curve
     before."""
     phase = np.degrees(np.unwrap(np.angle(values[known])))
@@ -320,5 +321,5 @@ def _legend(ax: Axes, htfs: Sequence[HTF]) -> None:
 def _tidy(ax: Axes, axes) -> None:
     """In a grid: labels at its edges and one legend only."""
     ax.label_outer()
-    if ax is not axes[0, -1]:
-        ax.get_legend().remove() if ax.get_legend() else None
+    if ax is not axes[0, -1] and (legend := ax.get_legend()):
+        legend.remove()

@@ -6,13 +6,14 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, cast, get_args
 
 import matplotlib
 import numpy as np
 from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Whole
@@ -40,7 +41,7 @@ COLORS = {
 
 CYCLE = [COLORS[name] for name in ("blue", "red", "green", "purple", "orange", "sky")]
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8,
     "mathtext.fontset": "dejavusans",
@@ -50,7 +51,7 @@ _STYLE = {
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.prop_cycle": matplotlib.cycler(color=CYCLE),
+    "axes.prop_cycle": cycler(color=CYCLE),
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
     "xtick.major.width": 0.6,
@@ -66,7 +67,7 @@ _STYLE = {
     "figure.dpi": 150,
 }
 # Text stays text: it can be searched and edited.
-_FONTS_IN_FILES = {"pdf.fonttype": 42, "svg.fonttype": "none"}
+_FONTS_IN_FILES: Any = {"pdf.fonttype": 42, "svg.fonttype": "none"}
 # Figures that have no layout engine are given none.
 _IN_FILES = _FONTS_IN_FILES | {"figure.autolayout": False, "figure.constrained_layout.use": False}
 
@@ -184,7 +185,7 @@ def save(
 
     **Raises:** `DefinitionError` if they cannot be written.
     """
-    figure = plot.get_figure(root=True) if isinstance(plot, Axes) else plot
+    figure = cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix[1:] in get_args(Format):

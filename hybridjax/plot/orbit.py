@@ -1,6 +1,7 @@
 """A limit cycle in phase space (paper Fig. 1)."""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ from .look import COLORS, AxesLike, Plot, axis_of, panels
 _CHARTS = [COLORS[name] for name in ("blue", "orange", "green", "purple", "sky", "black")]
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
-_NUMBER = {
+_NUMBER: dict[str, Any] = {
     "fontsize": "x-small", "color": "0.35", "ha": "center", "va": "center", "zorder": 6,
     "path_effects": [withStroke(linewidth=2, foreground="white")],
 }  # fmt: skip
@@ -55,7 +56,7 @@ def cycle(
     """
     s = cycle.structure
     x, y = _plane(s, x, y)
-    others = {"sections": sections and sections.cycle, "perturbed": perturbed}
+    others: dict[str, Any] = {"sections": sections and sections.cycle, "perturbed": perturbed}
     for name, other in others.items():
         if other is not None and other.structure.names != s.names:
             raise DefinitionError(f"`{name}` and the cycle belong to different systems.")
@@ -168,7 +169,8 @@ def _text(ax: Axes, text: str, point, center, distance: int, **options) -> None:
 
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> None:
-    width, height = ax.get_position().size * ax.get_figure(root=True).get_size_inches()
+    figure: Any = ax.get_figure(root=True)
+    width, height = ax.get_position().size * figure.get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
     taken = orbit[np.isfinite(orbit).all(axis=1)] / unit  # where no number may stand
     bars, step = [], max(1, round(placed.n_sections / 8))
@@ -179,7 +181,7 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, orbit) -> N
             room = np.linalg.norm(beside[:, None] - taken, axis=2).min(axis=1)
             if room.max() > _BAR:
                 at = beside[np.argmax(room)]
-                ax.text(*(unit * at), str(i), **_NUMBER)
+                ax.text(unit[0] * at[0], unit[1] * at[1], str(i), **_NUMBER)
                 taken = np.concatenate([taken, at[None]])
     bars = np.stack(bars)
     gaps = np.full((len(bars), 1), np.nan)

@@ -74,16 +74,17 @@ def multipliers(
                 true.real, true.imag, "+", ms=9, mew=1.2, color="black", label=reference, ls=""
             )
             for border in borders.get(reference, ()):
-                box.plot(border.real, border.imag, lw=0.7, color="black")
+                box.plot(np.real(border), np.imag(border), lw=0.7, color="black")
             for k, (label, z) in enumerate(series.items()):
                 error = compare_multipliers(z, true).max_error
                 box.plot(
-                    z.real, z.imag, _MARKERS[k % len(_MARKERS)], mfc="none", ms=5, mew=1.0, ls="",
-                    color=CYCLE[k % len(CYCLE)],
+                    np.real(z), np.imag(z), _MARKERS[k % len(_MARKERS)], mfc="none", ms=5, mew=1.0,
+                    ls="", color=CYCLE[k % len(CYCLE)],
                     label=rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
                 )  # fmt: skip
                 for border in borders.get(label, ()):
-                    box.plot(border.real, border.imag, lw=0.7, color=CYCLE[k % len(CYCLE)])
+                    color = CYCLE[k % len(CYCLE)]
+                    box.plot(np.real(border), np.imag(border), lw=0.7, color=color)
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
             shown = panel.get_legend_handles_labels()
@@ -145,10 +146,10 @@ def poles_zeros(
 
 def _near(poles: np.ndarray, zeros: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the real and imaginary parts of the poles and of the zeros close to them."""
-    center = poles.real.mean()
+    center = np.real(poles).mean()
     reach = np.abs(poles - center).max()
     points = np.concatenate([poles, poles.conj(), zeros[np.abs(zeros - center) <= 2 * reach]])
-    return points.real, points.imag
+    return np.real(points), np.imag(points)
 
 
 def _values(source: Any) -> np.ndarray:
@@ -179,7 +180,7 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
 
 def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders) -> Axes:
     """An inset around the leading true multiplier, at a place that is free of markers."""
-    leading = true[np.lexsort((-true.imag, -np.abs(true)))[0]]
+    leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
     nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
     far = [np.abs(z - leading) for z in nearest]
     for one in borders.values():  # of the region next to the leading multiplier, all of it
@@ -204,7 +205,7 @@ def _zoom(ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders)
 
 
 def _largest_part(z: np.ndarray) -> np.ndarray:
-    return np.maximum(np.abs(z.real), np.abs(z.imag))
+    return np.maximum(np.abs(np.real(z)), np.abs(np.imag(z)))
 
 
 def _unit_circle(ax: Axes) -> None:

@@ -53,7 +53,7 @@ def from_events(recording: Recording, event: AtEvent) -> Phase:
         period, doubled, longest = common, _DOUBLED, _MISSED
         if (np.diff(t) > common / 4).sum() >= _ENOUGH:
             period, doubled, longest = _rhythm(np.diff(t))
-        kept = []
+        kept: list[float] = []
         for x in t:
             if not kept or x - kept[-1] >= doubled * period:
                 kept.append(x)

@@ -91,7 +91,7 @@ class Draws:
     def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
         variables = self.first()
-        number = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
+        number: dict[str, Any] = {"draw": (("draw",), np.arange(self.blocks.shape[0]), {})}
         layout = Layout(("draw",), self.blocks, variables, number, ("draw",), self.description)
         return dataclasses.replace(self, variables=variables), layout
 

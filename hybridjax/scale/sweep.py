@@ -142,7 +142,7 @@ class Begun(NamedTuple):
     the coarse pass, and their cycles (without the systems)."""
 
     map: ReturnMap
-    index: tuple[np.ndarray, ...]
+    index: tuple[np.ndarray, ...]  # type: ignore[assignment]  # (not the method of tuples)
     coarse: Known
 
     def parts(self) -> Any:

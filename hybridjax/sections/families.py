@@ -233,12 +233,12 @@ class SectionList(AbstractSections):
                 "a list of sections needs at least one Crossing or AtEvent, but `items` is empty."
             )
 
-    @property
-    def n_sections(self) -> int:
+    @property  # type: ignore[misc]
+    def n_sections(self) -> int:  # type: ignore[override]
         return len(self.items)
 
-    @property
-    def anchor(self) -> None:
+    @property  # type: ignore[misc]
+    def anchor(self) -> None:  # type: ignore[override]
         return None
 
     def check(self, s: Structure) -> None:

@@ -244,23 +244,23 @@ class _Reduced(Chart):
         return np.array([k for k, x in enumerate(self.chart.states) if x not in self.translation])
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> tuple[str, ...]:  # type: ignore[override]
         return tuple(self.chart.states[k] for k in self.kept)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
         return tuple(self.chart.units[k] for k in self.kept) if self.chart.units else ()
 
     @property
-    def inputs(self) -> tuple[str, ...] | None:
+    def inputs(self) -> tuple[str, ...] | None:  # type: ignore[override]
         return self.chart.inputs
 
     @property
-    def solver(self) -> Any:
+    def solver(self) -> Any:  # type: ignore[override]
         return self.chart.solver
 
     @property
-    def absent(self) -> Mapping[str, float]:
+    def absent(self) -> Mapping[str, float]:  # type: ignore[override]
         return self.chart.absent
 
     def full(self, q, shift=0.0):

@@ -99,19 +99,19 @@ class _Slides(Chart):
     surface: Callable[[Any, Any], Any]
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.above.states
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.above.units
 
     @property
-    def inputs(self) -> tuple[str, ...] | None:
+    def inputs(self) -> tuple[str, ...] | None:  # type: ignore[override]
         return self.above.inputs
 
     @property
-    def absent(self) -> Mapping[str, float]:
+    def absent(self) -> Mapping[str, float]:  # type: ignore[override]
         return self.above.absent
 
     def fields(self, t, q, u):

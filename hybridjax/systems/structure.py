@@ -127,7 +127,7 @@ class Structure:
         return make() if name is None else self.once(name, trees, make)
 
     def kernel(
-        self, function: Callable, form: Callable, *static: Hashable, trees: tuple = (), lanes=1
+        self, function: Callable, form: Any, *static: Hashable, trees: tuple = (), lanes=1
     ) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation/kernel.py`)."""

@@ -161,15 +161,15 @@ class Derived(HybridSystem):
     system: HybridSystem
 
     @property
-    def inputs(self) -> tuple[str, ...]:
+    def inputs(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.system.inputs
 
     @property
-    def input_units(self) -> tuple[str, ...]:
+    def input_units(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.system.input_units
 
     @property
-    def time_unit(self) -> str:
+    def time_unit(self) -> str:  # type: ignore[override]
         return self.system.time_unit
 
     def charts(self):

@@ -1,7 +1,7 @@
 """Recordings whose truth is known, to try a method before an animal is measured."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -218,12 +218,13 @@ def simulate_beats(
         low = np.minimum(place.astype(int), n - 1)
         return table[low] + (place - low) * (table[low + 1] - table[low])
 
-    phase, events = rng.uniform(size=S), [[] for _ in range(S)]
+    phase: Any = rng.uniform(size=S)
+    events: list[list[float]] = [[] for _ in range(S)]
     for i in range((m - 1) * steps):
         k, part = i // steps, (i % steps + 0.5) / steps
         u = (1 - part) * force[:, k] + part * force[:, k + 1]
         z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
-        move = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):
             events[trial].append((i + (1 - phase[trial]) / move[trial]) * h)

@@ -172,7 +172,7 @@ class ZarrStore:
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
         pieces = set(range(len(self.layout.blocks)))
-        return sorted(pieces - set.intersection(*map(self._present, self._arrays.values())))
+        return sorted(pieces - pieces.intersection(*map(self._present, self._arrays.values())))
 
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
@@ -289,7 +289,7 @@ class Design(eqx.Module):
         """Return the cosines repeated, with other phases, in other experiments."""
         phase, experiment = phase.ravel(), experiment.ravel()
         order = np.lexsort((np.tile(self.line, count), experiment))
-        each = {
+        each: dict[str, Any] = {
             n: np.tile(getattr(self, n), count)[order] for n in ("line", "channel", "amplitude")
         }
         return dataclasses.replace(

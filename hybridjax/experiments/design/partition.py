@@ -11,7 +11,7 @@ of the largest class is the exact minimum of experiments, and every greater numb
 Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from jaxtyping import Bool, Complex, Int
@@ -102,7 +102,7 @@ def avoid_second_order(
     members = [np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)]
     held = [[classes[i] for i in m] for m in members]
     hits = [_hits(c, products) for c in held]
-    draws = iter(())
+    draws: Iterator[list[float]] = iter(())
     for k in range(rounds):
         if k % 4096 == 0:
             bad = [e for e, n in enumerate(hits) if n]

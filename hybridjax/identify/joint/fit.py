@@ -1,6 +1,6 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import equinox as eqx
 import numpy as np
@@ -307,7 +307,7 @@ def _fit_to_series(
         raise DefinitionError("the predictions of the guess grow beyond all numbers.")
     point, converged = minimize(problem.reweighted(model), model, direct, max_steps)
     model = point.coordinates.model
-    sources = noise_model(model, point.problem.S, scale, records.outputs)
+    sources = noise_model(model, cast(SeriesProblem, point.problem).S, scale, records.outputs)
     fitted = model.to_ldtp(scale, records.inputs, records.outputs)
     harmonics = all_harmonics(N)
     return _finished(point, converged, fitted, scale, harmonics, freedom, False, sources)

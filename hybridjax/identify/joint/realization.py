@@ -192,7 +192,7 @@ def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
         for _ in range(2):  # the second time removes rounding errors
             Y = Y - (Y @ Q.T) @ Q
         # The triangular factor has the same range and singular values, and fewer columns.
-        matrices.append(np.linalg.qr(Y.T, mode="r").T)
+        matrices.append(np.asarray(np.linalg.qr(Y.T, mode="r")).T)
     A, C = _shifted(_bases(matrices, given_dims(dims, N), order, edge, ny), ny)
     D = [np.zeros((ny, nu))] * N
     B, K = ([np.zeros((len(a), columns)) for a in A] for columns in (nu, 0))
@@ -207,4 +207,4 @@ def _from_htf(htf: HTF, dims: Any, order: int, horizon: int | None) -> LDTP:
 
 
 def _real(x: Complex[np.ndarray, "a b"]) -> Float[np.ndarray, "a b2"]:
-    return np.concatenate([x.real, x.imag], axis=1)
+    return np.concatenate([np.real(x), np.imag(x)], axis=1)

@@ -111,7 +111,7 @@ def _signals(
         return np.concatenate(out)
 
     u, y, sampled, lost = map(flat, ("u", "y", "sampled", "lost"))
-    inside = (sampled | lost).any(axis=2)
+    inside = np.asarray((sampled | lost).any(axis=2))
     return np.concatenate([u, y], axis=2), np.where(sampled, y, np.nan), inside
 
 

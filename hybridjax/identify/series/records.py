@@ -144,7 +144,8 @@ def divide_by_chi(
     c: Float[np.ndarray, " d"], x: Float[np.ndarray, "S T *columns"], delay: int = 0
 ) -> Float[np.ndarray, "S T *columns"]:
     """Filter x by 1 / chi from cycle to cycle, and delay it by a number of cycles."""
-    return delay_cycles(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1), delay)
+    filtered = np.asarray(lfilter([1.0], np.concatenate([[1.0], c]), x, axis=1))
+    return delay_cycles(filtered, delay)
 
 
 def start_responses(

@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -99,7 +99,7 @@ def _check_packed(path: Path) -> None:
     size = path.stat().st_size
     room = limits.unpacked(size)
     with open(path, "rb") as file:
-        order = "little" if file.read(128)[-2:] == b"IM" else "big"
+        order: Literal["little", "big"] = "little" if file.read(128)[-2:] == b"IM" else "big"
         while len(tag := file.read(8)) == 8:
             kind, length = (int.from_bytes(x, order) for x in (tag[:4], tag[4:]))
             if kind != 15:

@@ -180,7 +180,7 @@ def _parts(data: SectionData, r: int, sections: int) -> list[_Part]:
     first = -record.first_section % N
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
-    edges = np.linspace(0, cycles, number + 1).astype(int) if number else []
+    edges = np.linspace(0, cycles, number + 1).astype(int) if number else np.zeros(0, int)
     size_u, size_y = data.rms()
     robust = 1.4826 * np.nanmedian(np.abs(np.concatenate([x.y for x in data.records])), axis=0)
     size_y = np.maximum(robust, 0.1 * size_y)  # (more than half of the samples may be zero)
