@@ -66,7 +66,7 @@ inside = np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
 print(f"{100 * np.mean(inside):.1f} % of the true values lie inside their 95 % regions")
 
 # %% [markdown]
-# ## How many multipliers do the data carry?
+# ## The number of multipliers that the data support.
 
 # %%
 print(hj.select_order(estimate))

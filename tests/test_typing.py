@@ -55,6 +55,7 @@ def script():
     return "\n\n".join(BLOCK.findall((ROOT / "README.md").read_text())) + MORE
 
 
+@pytest.mark.slow
 def test_a_users_script_has_no_errors_in_mypy(tmp_path, script):
     (tmp_path / "session.py").write_text(script)
     command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--cache-dir=cache"]

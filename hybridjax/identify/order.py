@@ -1,4 +1,4 @@
-"""How many multipliers do the data carry?"""
+"""The number of multipliers that the data support."""
 
 import functools
 
@@ -222,7 +222,7 @@ def refuse_invented(values: Float[np.ndarray, " d1"], spread: float) -> None:
     carried = sum(deviations[k] > _largest_of_noise(k + 1) for k in range(1, order + 1))
     if carried < order:
         raise DefinitionError(
-            f"the data carry {carried} multipliers, not {order}: the weakest is "
+            f"the data support {carried} multipliers, not {order}: the weakest is "
             f"{np.sqrt(max(values[1], 0.0)):.3g} times the noise, which may be noise alone. Lower "
             "`order` (`select_order` compares orders), measure longer, or pass check=False."
         )

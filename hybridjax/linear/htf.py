@@ -32,7 +32,7 @@ class Scatter(eqx.Module):
 
     - `freedom` (F,): complex degrees of freedom of the variance.
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
-      the realizations, relative to its mean for normal errors: 0 where all lie on a line. None,
+      the realizations, relative to its mean for Gaussian errors: 0 where all lie on a line. None,
       and ones, are scatter that says nothing but its size.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or roundness beyond 0 to 3.
@@ -60,7 +60,7 @@ class Scatter(eqx.Module):
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
         $\nu (\alpha^{-1/\nu} - 1)$, Fisher's $F_{2, 2\nu}$, of $\alpha = (1 - p)(1 + p^2 (w - 1))$
-        for the level p and the roundness w. Of normal errors the shape of the scatter says nothing
+        for the level p and the roundness w. The scatter of Gaussian errors has no shape
         about their mean (Basu, Sankhya 1955), so that discs hold as often as they say for any w
         whose mean is one. Errors of equal moduli and random phases lie on a circle around zero:
         where few of them have a large mean, they lie on an arc, nearly in line.
@@ -240,7 +240,7 @@ class HTF(eqx.Module):
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
         $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. Where it was estimated from
-        few experiments, discs are larger (`Scatter.quantile`). They are right for complex normal
+        few experiments, discs are larger (`Scatter.quantile`). They are right for complex Gaussian
         errors, and nearly so where one product of two cosines makes errors of equal moduli, from
         four realizations on. The true value is the best linear approximation for inputs of the
         kind that was applied, not the response to infinitely small ones.

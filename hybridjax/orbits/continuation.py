@@ -149,7 +149,7 @@ class _Trace(NamedTuple):
         low, high = self.values[0], self.values[-1]
         upward = start.tangent[-1]
         if (start.value >= high and upward > 0) or (start.value <= low and upward < 0):
-            return points, marks, BranchEnd(start.value, Result.OK, "the values end")
+            return points, marks, BranchEnd(start.value, Result.OK, "end of the parameter range")
         while len(points) < self.max_points:
             last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
@@ -176,7 +176,7 @@ class _Trace(NamedTuple):
                 points.append(event.point)
             points.append(point)
             if over:
-                return points, marks, BranchEnd(point.value, Result.OK, "the values end")
+                return points, marks, BranchEnd(point.value, Result.OK, "end of the parameter range")
             length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
         message = f"{self.max_points} cycles; `max_points` raises it"
         return points, marks, BranchEnd(points[-1].value, Result.STEP_LIMIT, message)

@@ -116,6 +116,7 @@ def even_part(cycle, sections, u, outputs):
     return (y[: len(u)] + y[len(u) :]) / 2
 
 
+@pytest.mark.slow
 def test_the_even_part_of_the_hopper(hopper_cycle):
     """The error is of fourth order."""
     sections = KINEMATIC

@@ -60,6 +60,7 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     np.testing.assert_array_equal(again.design.phase, studies[1].design.phase)
 
 
+@pytest.mark.slow
 def test_blocks_of_one_design_are_as_good_as_one_block(model, first):
     """The same experiments in one block and in two: but for the noise of each, the same problem."""
     data = measured(model, first.realizations(2))

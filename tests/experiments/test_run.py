@@ -158,6 +158,7 @@ def test_second_order_products_can_be_kept_off_the_lines(seed, experiments):
                     assert min(product, 32 - product) not in own
 
 
+@pytest.mark.slow
 def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     """No few equal steps will do: they are adapted, and the estimate still bounds the error."""
     placed = hj.place_sections(vanderpol_cycle, [hj.Crossing("x", "falling")])

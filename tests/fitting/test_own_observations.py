@@ -28,6 +28,7 @@ def juggling():
     return hj.find_limit_cycle(TRUTH)
 
 
+@pytest.mark.slow
 def test_a_parameter_comes_back_from_multipliers(juggling):
     exact = TRUTH.exact()[-1]
     data = MultipliersBetweenSections(jnp.poly(exact)[1:].real, jnp.asarray(False))

@@ -230,6 +230,9 @@ def designs_data(t):
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
     yield hj.designs.ImpulseResponse, dict(lags=4)
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
+    limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
+    yield limits.require_inputs, dict(inputs=("u0",))
+    yield limits.experiments, dict(design=t.design, cosines=4)
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
     yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
     yield t.study.add, dict(data=t.block)
@@ -246,6 +249,7 @@ def recordings(t):
     yield hj.Recording, dict(time=x, signals={"x": x})
     frame = {"time": x, "x": x}
     yield hj.Recording.from_frame, dict(frame=frame)
+    yield t.recording.with_trials, dict(trials=t.recording.trials)
     yield hj.Recording.join, dict(recordings=[t.recording])
     yield hj.Recording.beside, dict(recordings=[t.recording])
     rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
@@ -268,7 +272,7 @@ def recordings(t):
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.add_command, table
-    yield hj.recordings.write_design, dict(path="d.csv", design=t.one_input)
+    yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
     yield positional(hj.read_recording), dict(values="nope.csv")
 
 

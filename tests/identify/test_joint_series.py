@@ -153,6 +153,7 @@ def test_noise_that_drives_the_system_is_found(small):
     assert not hj.validate(fit.model, other, level=1e-3).white
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_said(small):
     """The distances of 24 fits, in units of their covariance, and the coverage, at 0.1 %."""
     noise, runs = driven(small, 0.3), 24

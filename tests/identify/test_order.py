@@ -36,7 +36,7 @@ def test_the_level_of_the_rank_test(small, variance):
         try:
             hj.fit_multipliers(data, 3, max_steps=5)
         except hj.DefinitionError as error:
-            refused += "the data carry 2 multipliers, not 3" in str(error)
+            refused += "the data support 2 multipliers, not 3" in str(error)
     assert hj.select_order(data, 3, max_steps=3).by_rank == 2
     assert covered(refused, runs, 0.98)
     hj.fit_multipliers(data, 3, check=False)
@@ -60,5 +60,5 @@ def test_variances_from_few_realizations(small, variance):
 
 def test_what_noise_hides_is_not_reported(small, variance):
     _, htf = small
-    with pytest.raises(hj.DefinitionError, match="the data carry [01] multipliers, not 2"):
+    with pytest.raises(hj.DefinitionError, match="the data support [01] multipliers, not 2"):
         hj.fit_multipliers(noisy(htf, 1e6 * variance, np.random.default_rng(0)), 2)

@@ -66,7 +66,7 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     error = constant * np.exp(2j * np.pi * rng.random((R, runs)))
     error += noise * rng.normal(size=(R, runs, 2)) @ [np.sqrt(0.5), 1j * np.sqrt(0.5)]
     shares = np.full((R, 1), 1 / R)
-    if constant == 0:  # Of experiments of different strengths; normal errors know nothing of it.
+    if constant == 0:  # Of experiments of different strengths; Gaussian errors know nothing of it.
         shares = rng.dirichlet(np.full(R, 3.0))[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)

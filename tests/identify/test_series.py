@@ -207,7 +207,7 @@ def test_spurious_multipliers_raise_an_error(small):
         try:
             hj.fit_series(record(small, 400, seed, 0.3), 3, max_steps=5)
         except hj.DefinitionError as error:
-            assert "the data carry 2 multipliers, not 3" in str(error)
+            assert "the data support 2 multipliers, not 3" in str(error)
             refused += 1
     assert covered(refused, runs, 0.98)
     data = record(small, 400, 0, 0.3)

@@ -16,6 +16,7 @@ def placed():
     return hj.place_sections(cycle, hj.ClockPhase(16, anchor=0.5))
 
 
+@pytest.mark.slow
 def test_small_multipliers_are_not_dropped(placed):
     cycle = placed.cycle
     np.testing.assert_allclose(cycle.multipliers[4:].real, SMALL, rtol=1e-6)

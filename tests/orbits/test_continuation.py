@@ -40,7 +40,7 @@ def test_fold_and_flip_of_the_juggler(juggling):
     np.testing.assert_allclose(branch.points[0].multipliers, [1, a**2], atol=2e-6)
     np.testing.assert_allclose(branch.points[1].multipliers, [-1, -(a**2)], rtol=1e-9)
     # From the fold on, two cycles, one of them unstable: the branch begins with this one.
-    assert 0.2 in branch.values and [x.message for x in branch.ends] == ["the values end"] * 2
+    assert 0.2 in branch.values and [x.message for x in branch.ends] == ["end of the parameter range"] * 2
     at = np.flatnonzero(branch.values == 0.2)
     assert len(at) == 2 and list(branch.stable[at]) == [False, True]
     for k in at:
@@ -197,7 +197,7 @@ def test_resonance_of_the_duffing_oscillator():
     cycle = hj.find_limit_cycle(m.Duffing())
     branch = hj.continuation(cycle, "rate", (0.5, 1.2, 2.0))
     assert [x.kind for x in branch.points] == ["fold", "fold"]
-    assert [x.message for x in branch.ends] == ["the values end"] * 2
+    assert [x.message for x in branch.ends] == ["end of the parameter range"] * 2
 
     def fold(z):
         end, monodromy = _duffing_turn(z[:2], z[2])
@@ -265,7 +265,7 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     r = 2 * (2 * np.pi) ** 2
     np.testing.assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
-    assert branch.ends[1].message == "the values end" and not branch.points
+    assert branch.ends[1].message == "end of the parameter range" and not branch.points
     assert branch.values[-1] == 30.0 and float(branch[-1].anchor.t[0]) != 0.5
     again = hj.find_limit_cycle(branch[-1].system, branch[-1])
     np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)

@@ -1,6 +1,7 @@
 """Other numbers, same programs."""
 
 import numpy as np
+import pytest
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -14,6 +15,7 @@ def analyze(cycle):
         _ = hj.linearize(cycle, placed, OUTPUTS).multipliers
 
 
+@pytest.mark.slow
 def test_another_hopper_compiles_nothing(monkeypatch):
     """On the host, where no program takes over, whatever other tests have done."""
     monkeypatch.setattr(compilation, "_WORTH_COMPILING", np.inf)

@@ -63,7 +63,7 @@ class SectionSums(NamedTuple):
         outputs: list[int],
         c: Coefficients,
         regressions: list[SectionRegression],
-        columns: list[Float[np.ndarray, "S T m C"]],
+        columns: list[Float[np.ndarray, "_ _ m C"]],
     ) -> "SectionSums":
         """Fit the columns of all grids.
 

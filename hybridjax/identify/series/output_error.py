@@ -107,7 +107,7 @@ class OutputErrorProblem(NamedTuple):
     """The parts of the problem that do not depend on c."""
 
     records: PreparedRecords
-    weights: list[Float[np.ndarray, "S T N ny"]] | None
+    weights: list[Float[np.ndarray, "_ _ N ny"]] | None
     """Weights of the samples of each grid; None: those of the records."""
     lags: int
     """R: numerators have the lags -lead, ..., R - 1 - lead."""

@@ -13,7 +13,7 @@ from .records import CycleGrid
 
 
 Loss = Literal["squares", "huber"]
-Samples = list[Float[np.ndarray, "S T N ny"]]
+Samples = list[Float[np.ndarray, "_ _ N ny"]]
 """A number for each sample of each grid."""
 
 # Where Huber's loss becomes linear, in standard deviations: 95 % as efficient as squares for
