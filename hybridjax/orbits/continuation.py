@@ -176,7 +176,8 @@ class _Trace(NamedTuple):
                 points.append(event.point)
             points.append(point)
             if over:
-                return points, marks, BranchEnd(point.value, Result.OK, "end of the parameter range")
+                end = "end of the parameter range"
+                return points, marks, BranchEnd(point.value, Result.OK, end)
             length = min(self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0))
         message = f"{self.max_points} cycles; `max_points` raises it"
         return points, marks, BranchEnd(points[-1].value, Result.STEP_LIMIT, message)

@@ -40,7 +40,7 @@ LEGS = 16
 # section to the next. Smaller: a fast jump, as of van der Pol's oscillator at mu = 1000, or many
 # events reach it. Larger: vain searches last longer.
 PATIENCE = 1024
-# The part of the last period up to which an autonomous system is integrated without a section, then to it.
+# The part of the last period after which an autonomous system is integrated to its section.
 # Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
 _FREE = 0.75
 # Smallest singular value of J - I, in sizes of the states, at which it is singular. Smaller: cycles

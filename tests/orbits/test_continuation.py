@@ -40,7 +40,8 @@ def test_fold_and_flip_of_the_juggler(juggling):
     np.testing.assert_allclose(branch.points[0].multipliers, [1, a**2], atol=2e-6)
     np.testing.assert_allclose(branch.points[1].multipliers, [-1, -(a**2)], rtol=1e-9)
     # From the fold on, two cycles, one of them unstable: the branch begins with this one.
-    assert 0.2 in branch.values and [x.message for x in branch.ends] == ["end of the parameter range"] * 2
+    assert 0.2 in branch.values
+    assert [x.message for x in branch.ends] == ["end of the parameter range"] * 2
     at = np.flatnonzero(branch.values == 0.2)
     assert len(at) == 2 and list(branch.stable[at]) == [False, True]
     for k in at:
