@@ -99,8 +99,7 @@ def one_case(case: str, draws: int) -> None:
             "htf_plain": hj.fit_multipliers(plain, 2, check=False),
         }
         fits |= {
-            name: hj.fit_series(x, 2, start="cycle", check=False)
-            for name, x in series.items()
+            name: hj.fit_series(x, 2, start="cycle", check=False) for name, x in series.items()
         }
         return {
             f"{name}.{k}": x for name, fit in fits.items() for k, x in found(fit, truth).items()
