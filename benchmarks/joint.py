@@ -1,8 +1,8 @@
 """What the structure of a linear periodic model is worth, and whether its fit reaches the bound.
 
-The hopper's LDTP between the sections of both families, HTFs of all 32 harmonics at the lines of
-20 experiments of 84 cycles (odd lines, rms of u 0.02), with independent Gaussian errors: those of white
-noise at `--snr` dB of each output. Printed, as `name value` lines, beginning with the family:
+The hopper's LDTP between the sections of both families, HTFs of all 32 harmonics at the lines of 20
+experiments of 84 cycles (odd lines, rms of u 0.02), with independent Gaussian errors: those of
+white noise at `--snr` dB of each output. Printed, as `name value` lines, beginning with the family:
 
 - `bound.numerators`, `bound.ldtp`: Cramer-Rao bounds of the first multiplier, all numerators free
   and the LDTP's matrices unknown; `strides`: the square of their ratio.

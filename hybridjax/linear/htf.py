@@ -60,10 +60,10 @@ class Scatter(eqx.Module):
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
 
         $\nu (\alpha^{-1/\nu} - 1)$, Fisher's $F_{2, 2\nu}$, of $\alpha = (1 - p)(1 + p^2 (w - 1))$
-        for the level p and the roundness w. The shape of the scatter of Gaussian errors is independent
-        of their mean (Basu, Sankhya 1955), so that discs hold as often as they say for any w whose mean
-        is one. Errors of equal moduli and random phases lie on a circle around zero: where few of them
-        have a large mean, they lie on an arc, nearly in line.
+        for the level p and the roundness w. The shape of the scatter of Gaussian errors is
+        independent of their mean (Basu, Sankhya 1955), so that discs hold as often as they say for
+        any w whose mean is one. Errors of equal moduli and random phases lie on a circle around
+        zero: where few of them have a large mean, they lie on an arc, nearly in line.
         """
         miss = 1 - level
         if self.roundness is not None:
