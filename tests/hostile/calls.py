@@ -284,7 +284,7 @@ def testing(t):
 
 
 def files(t):
-    yield hj.save, dict(path="thing.npz", thing=t.model)
+    yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
     yield hj.write_report, dict(folder="report", found=t.found)
 
@@ -316,7 +316,7 @@ def plots(t):
     yield plot.phase, dict(found=t.phase)
     yield plot.section_data, dict(data=t.section_data)
     yield plot.validation, dict(found=t.validation)
-    yield plot.save, dict(path="figure", plot=t.plot)
+    yield plot.save, dict(path="missing/figure", plot=t.plot)
 
 
 def rhythms(t):
