@@ -65,7 +65,7 @@ def test_every_session_and_command_runs(tmp_path, monkeypatch, trials):
             assert main(shlex.split(text)[1:]) in (None, 0)
     pyplot.close("all")
     made = session.module
-    found = made.found.fit.compare(made.cycle.multipliers)
+    found = made.result.fit.compare(made.cycle.multipliers)
     assert found.max_error < 1e-2 and (tmp_path / "report" / "report.html").exists()
     for name in ("M", "k", "b"):  # up to the distortion that the experiments hold
         value, true = (float(getattr(x, name)) for x in (made.fit.system, made.hopper))
