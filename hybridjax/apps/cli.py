@@ -21,7 +21,7 @@ _SIZES = {
 }
 
 
-def _between(convert: Callable[[str], Any], low: float, high: float = math.inf) -> Callable:
+def _between(convert: Callable[[str], Any], low: Any, high: Any = math.inf) -> Callable:
     """A function that converts a text to a number between two bounds."""
 
     def number(text: str) -> Any:
