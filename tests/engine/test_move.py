@@ -110,9 +110,11 @@ def test_lanes_fail_one_by_one():
 def test_new_numbers_compile_nothing():
     """Parameters, states, times and tolerances are data; only shapes and types are compiled."""
 
-    hj.simulate(hj.models.BouncingBall(g=9.0), "fall", (1.0, 0.0), 1.0)
-    with no_compilation():
-        hj.simulate(hj.models.BouncingBall(g=8.0), "fall", (1.1, 0.1), 1.3, time=0.2)
+    def run(g, *state, until, time):
+        hj.simulate(hj.models.BouncingBall(g=g), "fall", state, until, time=time)
+
+    with no_compilation(after=lambda: run(9.0, 1.0, 0.0, until=1.0, time=0.0)):
+        run(8.0, 1.1, 0.1, until=1.3, time=0.2)
 
 
 class Roots(hj.HybridSystem):

@@ -228,7 +228,6 @@ def designs_data(t):
     yield hj.designs.Multipliers, {}
     yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
-    yield hj.designs.ImpulseResponse, dict(lags=4)
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
     limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
     yield limits.require_inputs, dict(inputs=("u0",))
