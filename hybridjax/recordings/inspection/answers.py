@@ -16,12 +16,6 @@ _SECTIONS, _ENOUGH = (8, 4, 2), 3
 # Cycles of a part, at least, and parts of a record, at most. More: short faults are diluted, or
 # long records take longer. Fewer: the gain of a part is noise.
 _SHORTEST, _PARTS = 16, 4
-# Gain relative to the median that is usual. Larger: other gains are reported. Smaller: partly wrong
-# inputs pass.
-_USUAL = 0.8
-# Unexplained power of a part relative to the median that makes a disturbance. Larger: stumbles
-# pass. Smaller: noisy parts are reported.
-_DISTURBED = 9.0
 
 
 class _Part(NamedTuple):
@@ -87,8 +81,8 @@ def _odd(name: str, answers: list[_Answer], names: Sequence[str]) -> Iterator[Fi
     }
     odd = {
         "another sign": gain < -np.maximum(usual / 2, CLEAR * error),
-        "foreign input": (gain < usual / 2) & (gain + CLEAR * error < _USUAL * usual),
-        "disturbed": [a.left > max(_DISTURBED * left, a.explained / 4) for a in answers],
+        "foreign input": (gain < usual / 2) & (gain + CLEAR * error < usual),
+        "disturbed": [a.left > max(CLEAR**2 * left, a.explained / 4) for a in answers],
     }
     for k, (cause, parts) in enumerate(odd.items()):
         parts = np.asarray(parts) & ~np.any([*odd.values()][:k], axis=0)
@@ -144,7 +138,7 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
         y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
         y = np.clip(y, -8, 8)  # outliers
         means = [x.mean(axis=1) for x in np.array_split(u, sections, axis=1)]
-        u = np.moveaxis(means, 0, 1)
+        u = np.stack(means, axis=1)
         rows = np.arange(1, b - a - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
         known = np.isfinite(inputs).all(axis=(1, 2, 3))

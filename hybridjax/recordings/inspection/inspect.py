@@ -103,11 +103,11 @@ def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> lis
 
 def _masked(recording: Recording, names: list[str], bad: list[Bool[np.ndarray, " _"]]) -> Recording:
     """Return the recording with NaN for some samples of some signals."""
-    columns = [recording.column(name) for name in names]
+    columns = np.array([recording.column(name) for name in names], int)
     trials = []
     for trial, rows in zip(recording.trials, bad, strict=True):
         values = trial.values.copy()
-        values[np.ix_(rows, columns)] = np.nan
+        values[np.ix_(np.flatnonzero(rows), columns)] = np.nan
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)
 

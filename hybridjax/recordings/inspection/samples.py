@@ -8,12 +8,9 @@ from jaxtyping import Bool, Float, Int
 
 from ..findings import Finding, places
 from ..recording import Recording
-from ..smoothing import Series
+from ..smoothing import RANGES, Series
 
 
-# Least distance of a placeholder from all other samples, in their range. Larger: -999 passes beside
-# signals of the order of 100. Smaller: genuine extremes are left out.
-_FAR = 3.0
 # Plateaus per cycle from which on they belong to the rhythm, as those of a foot on the ground.
 # More: the rests of a limb are left out. Fewer: a sensor that fails now and then is believed.
 _BELONGS = 0.3
@@ -40,7 +37,7 @@ def placeholders(x: Series, period: float, is_input: bool) -> Rows:
     usual = x[np.isfinite(x) & ~marked]
     if not marked.any() or not len(usual) or not np.ptp(usual):
         return np.zeros(len(x), bool)
-    return marked & (np.maximum(usual.min() - x, x - usual.max()) > _FAR * np.ptp(usual))
+    return marked & (np.maximum(usual.min() - x, x - usual.max()) > RANGES * np.ptp(usual))
 
 
 def _is_placeholder(size: float) -> bool:

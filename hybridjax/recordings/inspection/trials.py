@@ -34,7 +34,7 @@ def other_settings(
 ) -> Iterator[Finding]:
     """Find trials in which a signal has another unit or zero, or two outputs changed places."""
     levels = [[_levels(x) for _, x in recording.samples(name)] for name in names]
-    low, middle, high = np.moveaxis(levels, 2, 0)
+    low, middle, high = np.array(levels).transpose(2, 0, 1)
     width = high - low
     for s, trial in enumerate(recording.trials if len(recording.trials) > 1 else ()):
         peers = np.delete(middle, s, axis=1)
