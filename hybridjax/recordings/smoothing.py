@@ -2,10 +2,10 @@
 
 from typing import Annotated
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 
 from .._core.boundary.values import Number
@@ -47,23 +47,7 @@ _SAME_PHASE = 0.01
 _SMOOTH_INPUT = 0.3
 
 
-class Spline(eqx.Module):
-    """A natural cubic spline: its values and second derivatives at the knots."""
-
-    time: Series
-    values: Series
-    curvature: Series
-
-    def __call__(self, t: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
-        h = self.time[k + 1] - self.time[k]
-        before, after = t - self.time[k], self.time[k + 1] - t
-        line = (after * self.values[k] + before * self.values[k + 1]) / h
-        bend = (1 + before / h) * self.curvature[k + 1] + (1 + after / h) * self.curvature[k]
-        return line - before * after * bend / 6
-
-
-def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
+def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
@@ -90,7 +74,7 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> Spline:
     smooth = values.copy()
     for k in range(3):
         smooth[k : len(values) - 2 + k] -= weight * q[k] * curvature
-    return Spline(time, smooth, np.pad(curvature, 1) / step**2)
+    return CubicSpline(time, smooth, bc_type="natural")
 
 
 def bridgeable(time: Series, finite: Bool[np.ndarray, " n"], longest: int | float = 0.0) -> float:
