@@ -14,7 +14,7 @@ from .sessions import blocks, same_output
 
 
 convert = hj.convert
-PAGE = "docs/interop.md"
+PAGE = "docs/how-to/other-libraries.md"
 N = 5
 
 
