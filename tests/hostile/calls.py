@@ -228,7 +228,6 @@ def designs_data(t):
     yield hj.designs.Multipliers, {}
     yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
     yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
-    yield hj.designs.ImpulseResponse, dict(lags=4)
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
     limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
     yield limits.require_inputs, dict(inputs=("u0",))
@@ -254,7 +253,7 @@ def recordings(t):
     yield hj.Recording.beside, dict(recordings=[t.recording])
     rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
     yield t.recording.mark, dict(event="e", crossing=rises)
-    for name in ("column", "unit"):
+    for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
