@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.results import Result, update_result
 from ..engine.lanes import Lanes
-from ..engine.move import glide
+from ..engine.move import Options, move
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..sections.abstract import BoundSections
@@ -107,7 +107,7 @@ def flow_batch(
         target = section_target(course.bound, course.lanes, period, *to)
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
-        moved = glide(s, lanes, u, target, settings, stride, result)
+        moved = move(s, lanes, u, target, settings, stride, result, Options(glide=True)).moved
         # An event may change places with a section, but none may be left out or come in addition.
         due = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - due) > 1

@@ -251,7 +251,7 @@ def recordings(t):
     yield hj.Recording.beside, dict(recordings=[t.recording])
     rises, angle = (hj.Crossing("x", "rising"), hj.KinematicPhase(4, position="x", velocity="v"))
     yield t.recording.mark, dict(event="e", crossing=rises)
-    for name in ("column", "unit"):
+    for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
     take = dict(recording=t.recording, phase=t.phase, inputs="f", outputs=("x", "v"), n_sections=2)
