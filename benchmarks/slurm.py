@@ -1,4 +1,4 @@
-"""The recipe of docs/scale.md on a Slurm that `benchmarks/slurm.sh` has started."""
+"""The recipe of docs/how-to/scale.md on a Slurm that `benchmarks/slurm.sh` has started."""
 
 import os
 import tempfile

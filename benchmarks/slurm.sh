@@ -1,5 +1,5 @@
 #!/bin/bash
-# Slurm on this machine alone, and the recipe of docs/scale.md through dask-jobqueue.
+# Slurm on this machine alone, and the recipe of docs/how-to/scale.md through dask-jobqueue.
 #
 #     sudo benchmarks/slurm.sh     (Debian: installs slurm-wlm and munge; needs dask-jobqueue)
 #

@@ -114,21 +114,27 @@ def forget_programs():
         jax.clear_caches()
 
 
-class no_compilation:
-    """A context in which nothing may be compiled, also not since the host has done it so often."""
+@contextlib.contextmanager
+def no_compilation(after):
+    """A context in which nothing may be compiled, once `after()` has run. Functions of few lanes
+    stay on the host in both: by default the seconds that earlier tests have spent there decide."""
+    count, patience = 0, compilation._WORTH_COMPILING
 
-    def __enter__(self):
-        self.count, self.patience = 0, compilation._WORTH_COMPILING
-        compilation._WORTH_COMPILING = np.inf
-        jax.monitoring.register_event_duration_secs_listener(self.listen)
+    def listen(event, duration, **_):
+        nonlocal count
+        count += "backend_compile" in event
 
-    def listen(self, event, duration, **_):
-        self.count += "backend_compile" in event
-
-    def __exit__(self, *_):
-        jax.monitoring.unregister_event_duration_listener(self.listen)
-        compilation._WORTH_COMPILING = self.patience
-        assert not self.count, f"{self.count} programs were compiled"
+    compilation._WORTH_COMPILING = np.inf
+    try:
+        after()
+        jax.monitoring.register_event_duration_secs_listener(listen)
+        try:
+            yield
+        finally:
+            jax.monitoring.unregister_event_duration_listener(listen)
+    finally:
+        compilation._WORTH_COMPILING = patience
+    assert not count, f"{count} programs were compiled"
 
 
 @pytest.fixture(scope="session")

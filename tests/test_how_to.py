@@ -1,5 +1,4 @@
-"""Pages of the site run as they stand, and print what they show: those on how to do something, on
-experiments, and the examples of the reference."""
+"""The sessions of how-to pages, index.md and experiments.md print the output that the pages show."""
 
 import pytest
 from matplotlib import pyplot
@@ -7,9 +6,8 @@ from matplotlib import pyplot
 from .sessions import ROOT, Session, blocks, same_output
 
 
-FOLDERS = ("docs/how-to", "docs/reference")
 PAGES = ["docs/index.md", "docs/experiments.md"]
-PAGES += [f"{x}/{p.name}" for x in FOLDERS for p in (ROOT / x).glob("*.md")]
+PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
 
 
 @pytest.mark.slow

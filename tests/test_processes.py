@@ -1,4 +1,4 @@
-"""The example of docs/scale.md runs as it stands."""
+"""The example of docs/how-to/scale.md runs as it stands."""
 
 import pathlib
 import re
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 
-PAGE = pathlib.Path(__file__).parents[1] / "docs" / "scale.md"
+PAGE = pathlib.Path(__file__).parents[1] / "docs/how-to/scale.md"
 
 
 @pytest.mark.slow
 def test_the_example_runs_in_processes_of_its_own(tmp_path):
-    (script,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    *_, script = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     (tmp_path / "script.py").write_text(script)
     run = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300

@@ -3,9 +3,10 @@
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, cast, get_args
+from typing import Any, get_args
 
 from .. import __version__
 from .._core import limits
@@ -20,99 +21,67 @@ _SIZES = {
 }
 
 
-def _number(convert: Callable[[str], Any], allowed: Callable[[Any], bool], kind: str):
-    """A function that converts the text of an option to a number, or says which kind it must be."""
+def _between(convert: Callable[[str], Any], low: Any, high: Any = math.inf) -> Callable:
+    """A function that converts a text to a number between two bounds."""
 
     def number(text: str) -> Any:
-        try:
-            value = convert(text)
-        except ValueError:
-            value = None
-        if value is None or not allowed(value):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {kind}")
+        value = convert(text)
+        if not low <= value <= high:  # NaN included
+            raise ValueError
         return value
 
     return number
 
 
-_count = _number(
-    int, lambda n: 1 <= n <= limits.PERIODS, f"a whole number from 1 to {limits.PERIODS}"
-)
-_seed = _number(int, lambda n: n >= 0, "a whole number from 0 on")
-_finite = _number(float, math.isfinite, "a number")
-_positive = _number(float, lambda x: 0 < x < math.inf, "a positive number")
-
-
-def _two(item: Callable[[str], Any]) -> Callable[[str], tuple]:
-    """A function that splits the text of an option into two items."""
-
-    def pair(text: str) -> tuple:
-        parts = text.split(",")
-        if len(parts) != 2:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a pair with a comma in between")
-        return tuple(map(item, parts))
-
-    return pair
-
-
-def _names(text: str) -> tuple[str, ...]:
+def _different(text: str) -> tuple[str, ...]:
     """Different names with commas in between."""
     names = tuple(name.strip() for name in text.split(","))
     if "" in names or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of different names")
+        raise ValueError
     return names
 
 
-def _two_names(text: str) -> tuple[str, ...]:
-    return _names(",".join(_two(str)(text)))
+def _option(kind: str, pattern: str, *convert: Callable[[str], Any]) -> Callable[[str], Any]:
+    """A function that converts the groups of a regular expression in the text of an option, and
+    refuses a text that is no `kind`. The result of a single group is no tuple."""
+
+    def option(text: str) -> Any:
+        match = re.fullmatch(pattern, text)
+        try:
+            groups = () if match is None else match.groups()
+            first, *more = (f(group) for f, group in zip(convert, groups, strict=True))
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {kind}") from None
+        return (first, *more) if more else first
+
+    return option
 
 
-def _formats(text: str) -> tuple[str, ...]:
-    """Formats of figures with commas in between."""
-    known = get_args(Format)
-    for name in _names(text):
-        if name not in known:
-            raise argparse.ArgumentTypeError(f"{name!r} is not one of {', '.join(known)}")
-    return _names(text)
-
-
-def _model(text: str) -> tuple[str, str]:
-    """A file of Python and the name of a model in it."""
-    file, colon, name = text.rpartition(":")
-    if not colon or not file.endswith(".py") or not name.isidentifier():
-        raise argparse.ArgumentTypeError(f"{text!r} is not FILE.py:NAME")
-    return file, name
-
-
-def _axis(text: str) -> tuple[str, float, float, int]:
-    """A parameter, its lowest and highest value, and the number of values."""
-    name, _, values = text.partition("=")
-    parts = values.split(":")
-    if not name or len(parts) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=LOW:HIGH:COUNT")
-    return name, _finite(parts[0]), _finite(parts[1]), _count(parts[2])
-
-
-def _crossing(text: str) -> tuple[str, Literal["rising", "falling"], float]:
-    """The text `signal:direction:value`; default direction: rising; default value: 0."""
-    signal, *more = text.split(":")
-    direction, value = (*more, *("rising", "0")[len(more) :])[:2]
-    try:
-        if len(more) > 2 or direction not in ("rising", "falling") or not signal.strip():
-            raise ValueError
-        return signal.strip(), cast(Literal["rising", "falling"], direction), _finite(value)
-    except (ValueError, argparse.ArgumentTypeError):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a signal, a direction and a value, as in x:falling:0.2"
-        ) from None
-
-
-def _assignment(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name.strip(), float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number") from None
+_COUNT = _between(int, 1, limits.PERIODS)
+_FINITE = _between(float, -sys.float_info.max, sys.float_info.max)
+_POSITIVE = _between(float, math.ulp(0.0), sys.float_info.max)
+_count = _option(f"a whole number from 1 to {limits.PERIODS}", "(.*)", _COUNT)
+_seed = _option("a whole number from 0 on", "(.*)", _between(int, 0))
+_positive = _option("a positive number", "(.*)", _POSITIVE)
+_names = _option("a list of different names", "(.*)", _different)
+_two_names = _option("two names with a comma in between", "([^,]*,[^,]*)", _different)
+_two_numbers = _option("two numbers as in 1.5,0", "([^,]*),([^,]*)", _FINITE, _FINITE)
+_two_positive = _option("two positive numbers as in 1.5,2", "([^,]*),([^,]*)", _POSITIVE, _POSITIVE)
+_model = _option("FILE.py:NAME", r"(.*\.py):([^\W\d]\w*)", str, str)
+_axis = _option(
+    "NAME=LOW:HIGH:COUNT", "([^=]+)=([^:]*):([^:]*):([^:]*)", str, _FINITE, _FINITE, _COUNT
+)
+_crossing = _option(
+    "a signal, a direction and a value, as in x:falling:0.2",
+    r"\s*([^:]*[^:\s])\s*(?::(rising|falling)(?::(.*))?)?",
+    str, lambda direction: direction or "rising", lambda value: _FINITE(value or "0"),
+)  # fmt: skip
+_assignment = _option("NAME=VALUE with a number", "([^=]*)=(.*)", str.strip, float)
+_format = "|".join(get_args(Format))
+_formats = _option(
+    f"one or more of {', '.join(get_args(Format))}", f"((?:{_format})(?:, *(?:{_format}))*)",
+    _different,
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -202,9 +171,9 @@ def _add_identify(commands) -> None:
     phase.add_argument("--crossing", type=_crossing, metavar="X:DIRECTION[:VALUE]",
         help="a cycle begins where signal X crosses a value, rising or falling")  # fmt: skip
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
-    add("--center", type=_two(_finite), metavar="X,V",
+    add("--center", type=_two_numbers, metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
-    add("--scale", type=_two(_positive), metavar="X,V",
+    add("--scale", type=_two_positive, metavar="X,V",
         help="of the angle of --phase; estimated by default")  # fmt: skip
     add("--out", required=True, metavar="DIR", help="folder for the results; made if needed")
     add("--sections", type=_count, default=32, metavar="N",
@@ -260,14 +229,7 @@ def _sweep(options) -> int:
     _begin(cache=True)
     from .sweep_command import run
 
-    maps, pictures = run(
-        options.model, options.over, options.want, options.out, options.scheduler, options.force
-    )
-    print(maps)
-    converged = int((maps.result == 0).sum())
-    print(f"{converged} of {maps.result.size} points have a limit cycle")
-    print("\n".join(pictures))
-    return 0
+    return run(options)
 
 
 def _identify(options) -> int:
@@ -292,8 +254,7 @@ def _identify(options) -> int:
                 center=options.center, scale=options.scale,
             )  # fmt: skip
         elif options.crossing is not None:
-            signal, direction, value = options.crossing
-            sections = Crossing(signal, direction, value=value)
+            sections = Crossing(*options.crossing)
         else:
             sections = AtEvent(options.event)
         result = identify_recording(
@@ -308,8 +269,8 @@ def _identify(options) -> int:
 
 
 def _reproduce(options) -> int:
-    changed = [name for name, _ in options.param]
-    if len(set(changed)) < len(changed):
+    parameters = dict(options.param)
+    if len(parameters) < len(options.param):
         options.parser.error("--param gives a parameter twice")
     from .second_process import second_process
 
@@ -326,7 +287,7 @@ def _reproduce(options) -> int:
             n_sections=options.sections,
             amplitude=options.amplitude,
             seed=options.seed,
-            parameters=dict(options.param),
+            parameters=parameters,
             **sizes,
         )
         summary = reproduce(options.out, protocol, options.formats, process)

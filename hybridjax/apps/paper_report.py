@@ -163,9 +163,7 @@ def table(summary: dict) -> str:
     for item in summary["observations"]:
         rows.append(f"  [{'yes' if item['holds'] else 'no ':3}] {item['claim']}")
         rows.append(f"        {item['measured']}")
-    seconds = summary["seconds"]
-    slow = ", ".join(f"{k} {v:.1f}" for k, v in seconds.items() if k != "total" and v > 0.5)
-    return "\n".join([*rows, "", f"Time: {seconds['total']:.1f} s ({slow})", ""])
+    return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s", ""])
 
 
 def _complex(values) -> list[list[float]]:

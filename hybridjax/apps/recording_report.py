@@ -22,14 +22,12 @@ from ..io import save
 from ..linear.htf import HTF
 from ..plot import look
 from ..recordings.identification import Identification
-from ..recordings.recording import Recording
 
 
 PAGE = "report.html"
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 1rem auto; padding: 0 1rem; }
 body .hybridjax { font-size: 1rem; }
-.main strong { display: block; font-size: 1.2rem; }
 .warn, .fine { border-left: 4px solid #D55E00; padding: .3rem 1rem; }
 .fine { border-color: #009E73; }
 figure { margin: 1rem 0; overflow-x: auto; } img { max-width: 100%; height: auto; }
@@ -143,7 +141,7 @@ def summarize(found: Identification) -> dict[str, Any]:
     return {
         "version": __version__,
         "trials": [t.name for t in found.recording.trials],
-        "sampling_rates": _sampling_rates(found.recording),
+        "sampling_rates": [float(1 / np.median(np.diff(t.time))) for t in found.recording.trials],
         "left_out": _left_out(found),
         "notes": list(found.recording.notes),
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
@@ -152,19 +150,22 @@ def summarize(found: Identification) -> dict[str, Any]:
         "sections": data.n_sections,
         "cycles": round(data.cycles, 2),
         "records": len(data.records),
-        "missing": data.missing,
         "period": data.period,
         "period_jitter": found.phase.jitter,
         "period_drift_per_cycle": found.phase.drift,
-        "multipliers": [[z.real, z.imag] for z in fit.multipliers],
+        "multipliers": _pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
         "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": [[z.real, z.imag] for z in found.advice.plain],
-        "multipliers_of_held_out_fit": [[z.real, z.imag] for z in held.fit.multipliers],
+        "multipliers_of_plain_regression": _pairs(found.advice.plain),
+        "multipliers_of_held_out_fit": _pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
         "input_band": list(found.advice.band),
         "warnings": list(map(repr, found.advice.warnings)),
     }
+
+
+def _pairs(values: np.ndarray) -> list[list[float]]:
+    return [[z.real, z.imag] for z in values]
 
 
 def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
@@ -178,11 +179,7 @@ def _figures(found: Identification, htf: HTF) -> dict[str, look.Plot]:
         }
         for i, suffix in enumerate(_suffixes(htf.inputs)):
             figures[f"bode{suffix}"] = plot.bode(htf, input=i)
-            size = {"width": look.COLUMN, "height": 0.3 + 1.6 * len(htf.outputs)}
-            with look.panels(None, len(htf.outputs), 1, **size) as axes:
-                for k, output in enumerate(htf.outputs):
-                    plot.magnitude(htf, output=output, input=i, decades=3, ax=axes[k, 0])
-            figures[f"harmonics{suffix}"] = look.Plot(axes)
+            figures[f"harmonics{suffix}"] = plot.harmonics({"": htf}, input=i, decades=3)
         figures["phase"] = plot.phase(found.phase)
         figures["sections"] = plot.section_data(found.data)
     return figures
@@ -192,17 +189,26 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data, recording, warnings = found.data, found.recording, found.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
-    remarks = _left_out(found) + [f"{note[0].upper()}{note[1:]}." for note in recording.notes]
+    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(found).items() if amount}
+    notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
+    expected = zip(found.advice.strides, found.advice.expected, strict=True)
     parts = [
         "<h1>Floquet multipliers from a recording</h1>",
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",
-        *_multipliers(found),
+        found.fit._repr_html_(),
         *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in warnings),
         *([] if warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
-        f"<p>Left out, and assumed: {'' if remarks else 'nothing.'}</p>",
-        f"<ul>{''.join(f'<li>{_sentence(x)}</li>' for x in remarks)}</ul>" if remarks else "",
-        html.card("Recording", "", html.facts(_facts(found)), *_accuracy(found)),
+        html.card("Left out", "" if left_out else "nothing", html.facts(left_out)),
+        f"<ul>{notes}</ul>" if notes else "",
+        html.card("Phase", "", html.text(repr(found.phase))),
+        data._repr_html_(),
+        html.card(
+            "Standard errors to be expected from more strides", "", html.table(
+                ("strides", *map(html.complex_number, found.fit.multipliers)),
+                [(str(n), *(f"{e:.1e}" for e in errors)) for n, errors in expected],
+            ),
+        ),
         "<p>A multiplier is the factor by which a deviation from the average cycle changes in one "
         "cycle. A modulus below 1 is stable; the smaller, the faster the return.</p>",
         "<p>For the validation, a model of most strides is simulated on the strides that were held "
@@ -219,7 +225,7 @@ def _page(found: Identification, images: dict[str, str]) -> str:
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
         f"{data.bandwidth:.3g} Hz; output-error fit with {found.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
-    ]
+    ]  # fmt: skip
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>Multipliers of {trials}</title>"
@@ -228,106 +234,19 @@ def _page(found: Identification, images: dict[str, str]) -> str:
     )
 
 
-def _multipliers(found: Identification) -> list[str]:
-    """Return a paragraph for each multiplier: value, 95 % region, modulus."""
-    lines = []
-    for i, z in _upper(found):
-        border = found.fit.ellipse(i)
-        pair = " and its conjugate" if z.imag else ""
-        reach = f"±\u00a0{np.ptp(np.real(border)) / 2:.2g}"
-        if z.imag:
-            reach = f"real part {reach}, imaginary part ±\u00a0{np.ptp(np.imag(border)) / 2:.2g}"
-        moduli = np.abs(border)
-        lines.append(
-            f'<p class="main"><strong>{_show(z)}{pair}</strong> <span>95 % region: {reach}; '
-            f"modulus {abs(z):.4f}, from {moduli.min():.4f} to {moduli.max():.4f}</span></p>"
-        )
-    return lines
-
-
-def _facts(found: Identification) -> dict[str, str]:
-    data, phase, trials = found.data, found.phase, found.recording.trials
-    rates = sorted({f"{rate:.4g}" for rate in _sampling_rates(found.recording)}, key=float)
-    duration = sum(float(t.time[-1] - t.time[0]) for t in trials)
-    deviations = zip(data.signals, np.concatenate(data.rms()), data.units, strict=True)
+def _left_out(found: Identification) -> dict[str, Any]:
+    """Return the amounts of data that were not used, by their causes."""
     return {
-        "strides": f"{data.cycles:.0f} in {len(data.records)} records of {len(trials)} trials",
-        "period": f"{phase.period:.4g} s, ± {_percent(phase.jitter)} from cycle to cycle, drift "
-        f"{_percent(phase.drift)} per cycle",
-        "sampled at": f"{' to '.join(dict.fromkeys((rates[0], rates[-1])))} Hz, for "
-        f"{duration:.4g} s",
-        **{f"rms deviation of {name}": f"{x:.3g} {unit}".rstrip() for name, x, unit in deviations},
+        "doubled events (less than half a period after the one before)": found.phase.dropped,
+        "cycles whose beginning or end is unknown (a missed event, a gap)": found.phase.missed,
+        "fraction of the samples at sections (gaps longer than a section)": found.data.missing,
+        "fraction of the samples whose phase ran backwards (replaced)": found.phase.backwards,
+        "stretches too short for the validation (they count in the fit)": (
+            found.held_out.validation.left_out
+        ),
     }
-
-
-def _accuracy(found: Identification) -> list[str]:
-    """Return tables of standard errors, and of those to be expected from more strides."""
-    fit, advice, pairs = found.fit, found.advice, _upper(found)
-    errors = [
-        (_show(z), f"{fit.standard_errors[i]:.1e}", _show(complex(advice.plain[i])))
-        for i, z in pairs
-    ]
-    expected = [
-        (str(n), *(f"{e[i]:.1e}" if np.isfinite(e[i]) else "too few" for i, _ in pairs))
-        for n, e in zip(advice.strides, advice.expected, strict=True)
-    ]
-    return [
-        html.table(("multiplier", "standard error", "plain regression (ARX)"), errors),
-        html.table(("expected from strides", *(_show(z) for _, z in pairs)), expected),
-    ]
-
-
-def _left_out(found: Identification) -> list[str]:
-    """Return sentences on the data that were not used, and why."""
-    phase, held = found.phase, found.held_out.validation
-    causes = [
-        (
-            phase.dropped,
-            f"{phase.dropped} doubled events: less than half a period after the one before.",
-        ),
-        (
-            phase.missed,
-            f"{phase.missed} cycles whose beginning or end is unknown: an event was missed, a "
-            "crossing lies in a gap, or the instruments paused.",
-        ),
-        (
-            found.data.missing,
-            f"{_percent(found.data.missing)} of the samples at sections: they lie in gaps longer "
-            "than the time between two sections.",
-        ),
-        (
-            phase.backwards,
-            f"The phase ran backwards, in noise, at {_percent(phase.backwards)} of the samples: it "
-            "was replaced by the mean of two monotone envelopes.",
-        ),
-        (
-            held.left_out,
-            f"{held.left_out} stretches from the validation: too short to test more than their "
-            "initial condition. They count in the fit.",
-        ),
-    ]
-    return [sentence for amount, sentence in causes if amount]
-
-
-def _sampling_rates(recording: Recording) -> list[float]:
-    """Return one over the median time between samples for each trial, in Hz."""
-    return [float(1 / np.median(np.diff(t.time))) for t in recording.trials]
-
-
-def _upper(found: Identification) -> list[tuple[int, complex]]:
-    """Return index and value of the multipliers; of conjugate pairs the first."""
-    return [(i, complex(z)) for i, z in enumerate(found.fit.multipliers) if z.imag >= 0]
 
 
 def _sentence(message: str) -> str:
     """Return a message with names of arguments, which stand between backticks, as code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(message))
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.2g}\u00a0%"
-
-
-def _show(z: complex) -> str:
-    imaginary = f" {'-' if z.imag < 0 else '+'} {abs(z.imag):.4f}i" if z.imag else ""
-    return f"{z.real:.4f}{imaginary}"

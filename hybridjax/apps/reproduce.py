@@ -70,19 +70,9 @@ class Family(NamedTuple):
     structured: StructuredFit
 
 
-class _Clock:
-    """A log that prints finished steps with the time since `begin`, which is the same in all
-    processes, and keeps their durations."""
-
-    def __init__(self, begin: float):
-        self.begin, self.last = begin, time.time()
-        self.seconds: dict[str, float] = {}
-
-    def done(self, step: str, text: str) -> None:
-        now = time.time()
-        self.seconds[step] = now - self.last
-        print(f"[{now - self.begin:6.1f} s] {text}", flush=True)
-        self.last = now
+def _log(begin: float, text: str) -> None:
+    """Print a finished step with the seconds since `begin`, which is the same in all processes."""
+    print(f"[{time.time() - begin:6.1f} s] {text}", flush=True)
 
 
 def reproduce(
@@ -117,32 +107,27 @@ def _names(families: Sequence[str], formats: Sequence[Format]) -> list[str]:
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format], process: Executor) -> dict:
     _set_up()
-    clock = _Clock(time.time())
+    begin = time.time()
     hopper = _hopper(protocol.parameters)
     design = _design(protocol)
-    clock.done("design", f"design: {design.experiments} experiments, {len(design.f)} frequencies")
+    _log(begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies")
     cycle = _find(hopper)
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
-    clock.done("cycle", f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
+    _log(begin, f"limit cycle: period {float(cycle.period):.6g}, multipliers {multipliers}")
 
     # The second process identifies the second family, and then draws the figures that take longer.
-    first, *others = protocol.families
-    begun = [
-        process.submit(_identify, name, cycle, design, protocol, clock.begin) for name in others
-    ]
-    families = {}
-    families[first], seconds = _identify(first, cycle, design, protocol, clock.begin)
-    orbit, perturbed = cycle.trajectory(), _perturbed(cycle)
-    for name, task in zip(others, begun, strict=True):
-        families[name], more = task.result()
-        seconds |= more
-    task = process.submit(_draw, "comparisons", (cycle, families), out, formats, clock.begin)
+    first, *second = protocol.families
+    tasks = [process.submit(_identify, name, cycle, design, protocol, begin) for name in second]
+    families = {first: _identify(first, cycle, design, protocol, begin)}
+    perturbed = _perturbed(cycle)
+    families |= {name: task.result() for name, task in zip(second, tasks, strict=True)}
+    drawing = process.submit(_draw, "comparisons", (cycle, families), out, formats, begin)
     placed = {name: family.placed for name, family in families.items()}
-    seconds |= _draw("cycles", (placed, perturbed), out, formats, clock.begin)
+    _draw("cycles", (placed, perturbed), out, formats, begin)
     summary = summarize(protocol, cycle, families)
-    _write_results(out / "results.npz", protocol, cycle, orbit, families)
-    seconds = clock.seconds | seconds | task.result()
-    summary["seconds"] = {**seconds, "total": time.time() - clock.begin}
+    _write_results(out / "results.npz", protocol, cycle, families)
+    drawing.result()
+    summary["seconds"] = time.time() - begin
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(table(summary))
     return summary
@@ -199,89 +184,68 @@ def _sections(name: str, count: int) -> AbstractSections:
 
 def _identify(
     name: str, cycle: LimitCycle, design: Design, protocol: Protocol, begin: float
-) -> tuple[Family, dict[str, float]]:
-    """Return all results with one family of sections, and the durations of the steps."""
+) -> Family:
+    """Return all results with one family of sections."""
     _set_up()
-    clock = _Clock(begin)
     placed = place_sections(cycle, _sections(name, protocol.n_sections))
     ldtp = linearize(cycle, placed, OUTPUTS)
     exact = ldtp.htf(design.frequencies)
-    clock.done(f"exact_{name}", f"{name}: sections, exact A, B, C, D and HTF")
+    _log(begin, f"{name}: sections, exact A, B, C, D and HTF")
     discard = protocol.cycles - protocol.keep
     data = run_experiments(cycle, placed, design, OUTPUTS, discard=discard)
-    clock.done(f"experiments_{name}", f"{name}: experiments, {data.summary()}")
+    experiments = data.summary()
+    _log(begin, f"{name}: experiments, {experiments}")
     if not data.ok.any():
         raise ComputationError(
-            f"no experiment on {name} sections ran to its end: {data.summary()}. Take a smaller "
+            f"no experiment on {name} sections ran to its end: {experiments}. Take a smaller "
             "--amplitude."
         )
     estimate = estimate_htf(data)
     rational, rational_exact = fit_rational(estimate), fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)
-    clock.done(f"fits_{name}", f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
-    experiments = data.summary()
-    return (
-        Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured),
-        clock.seconds,
-    )
+    _log(begin, f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
+    return Family(placed, ldtp, exact, experiments, estimate, rational, rational_exact, structured)
 
 
-def _draw(
-    kind: str, results: tuple, out: Path, formats: Sequence[Format], begin: float
-) -> dict[str, float]:
-    """Write the figures of one kind, and return their durations."""
+def _draw(kind: str, results: tuple, out: Path, formats: Sequence[Format], begin: float) -> None:
+    """Write the figures of one kind."""
     import matplotlib  # here, since it is heavy
 
     matplotlib.use("Agg")  # files only: no window is opened, and none is needed
     from . import paper_figures
 
     _set_up()
-    clock = _Clock(begin)
     for name in paper_figures.save(out, formats, getattr(paper_figures, kind)(*results)):
-        clock.done(name, name)
-    return clock.seconds
+        _log(begin, name)
 
 
 def _perturbed(cycle: LimitCycle) -> Trajectory:
-    start = dict(cycle.state)
-    start["yM"] += 0.05
+    """Return twelve periods from a state that is 5 cm above the cycle."""
+    state = dict(cycle.state)
+    state["yM"] += 0.05
     chart = list(cycle.system.charts())[int(cycle.anchor.chart[0])]
-    period = float(cycle.period)
-    state = np.array(list(start.values()))
-    begin, accuracy = float(cycle.anchor.t[0]), Settings(rtol=1e-6, atol=1e-6)  # to be looked at
     return simulate(
-        cycle.system, chart, state, 12 * period, time=begin, settings=accuracy, throw=False
-    )
+        cycle.system, chart, list(state.values()), 12 * float(cycle.period),
+        time=float(cycle.anchor.t[0]), throw=False,
+        settings=Settings(rtol=1e-6, atol=1e-6),  # a figure shows no more
+    )  # fmt: skip
 
 
-def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family]) -> None:
+def _write_results(
+    path: Path, protocol: Protocol, cycle: LimitCycle, families: Mapping[str, Family]
+) -> None:
     first = next(iter(families.values()))
-    begin, period = float(first.placed.lanes.t[0]), float(cycle.period)
-    times = np.array([event.time for event in orbit.events])
-    arrays = {
-        "f": np.asarray(first.exact.f),
-        "harmonics": np.array(first.estimate.harmonics),
+    arrays: dict[str, Any] = {
+        "f": first.exact.f,
+        "harmonics": first.estimate.harmonics,
         "multipliers": cycle.multipliers,
-        "event_times": np.sort(begin + (times - begin) % period),
     }
-    coordinates = {}
     for name, family in families.items():
-        placed, ldtp = family.placed, family.ldtp
-        chart = np.asarray(placed.lanes.chart)
-        dims = np.array([len(c.states) for c in cycle.system.charts().values()])[chart]
-        states = np.asarray(placed.lanes.q).T
-        states = np.where(np.arange(states.shape[1]) < dims[:, None], states, np.nan)
-        coordinates[name] = [list(c) for c in cast(tuple, ldtp.coordinates)]
+        arrays |= {f"{x}_{name}": getattr(family.ldtp, x) for x in ("A", "B", "C", "D", "dims")}
         arrays |= {
-            f"H_exact_{name}": np.asarray(family.exact.H),
+            f"H_exact_{name}": family.exact.H,
             f"H_estimate_{name}": _on_grid(family.estimate, family.exact.f),
-            f"A_{name}": np.asarray(ldtp.A),
-            f"B_{name}": np.asarray(ldtp.B),
-            f"C_{name}": np.asarray(ldtp.C),
-            f"D_{name}": np.asarray(ldtp.D),
-            f"dims_{name}": np.asarray(ldtp.dims),
-            f"section_times_{name}": np.asarray(placed.lanes.t),
-            f"section_states_{name}": states,
+            f"section_times_{name}": family.placed.lanes.t,
             f"multipliers_fit_2p1z_{name}": family.rational.multipliers,
             f"multipliers_fit_structured_{name}": family.structured.multipliers,
         }
@@ -291,7 +255,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
         "protocol": dataclasses.asdict(protocol),
         "outputs": OUTPUTS,
         "inputs": cycle.system.inputs,
-        "coordinates": coordinates,
+        "coordinates": {name: family.ldtp.coordinates for name, family in families.items()},
         "conventions": {
             "f": "input frequency in cycles per period",
             "H": "axes (harmonic, frequency, output, input); H_m is evaluated at the input "
@@ -300,7 +264,7 @@ def _write_results(path, protocol, cycle, orbit, families: Mapping[str, Family])
             "zeros; the valid block of A[i] is [:dims[i+1], :dims[i]]; the coordinates of x[n] "
             "are deviations from the cycle, named in `coordinates`: t is the time of crossing, "
             "and the state that is missing from a kinematic section's list follows from it",
-            "times": "clock time, from section 0 to one period later",
+            "section_times": "clock time, from section 0 to one period later",
         },
     }
     np.savez(path, header=np.array(json.dumps(header)), **arrays)

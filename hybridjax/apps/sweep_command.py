@@ -2,9 +2,8 @@
 
 import importlib
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any
 
 import numpy as np
 
@@ -13,48 +12,37 @@ from ..errors import DefinitionError
 from ..plot.look import save
 from ..plot.over_parameters import sweep as plot_sweep
 from ..scale.sweep import sweep
-from ..scale.wanted import Want
 
 
-def run(
-    model: tuple[str, str],
-    axes: Sequence[tuple[str, float, float, int]],
-    want: Sequence[str],
-    out: str,
-    scheduler: str | None,
-    force: bool,
-) -> tuple[Any, list[str]]:
-    """Sweep, and draw the maps beside the store. Return the dataset and the pictures' files.
+def run(options: Any) -> int:
+    """Sweep, draw the maps beside the store, and print a summary, from the options of the command.
 
     **Raises:** `DefinitionError` for a file without such a model, and as `sweep`.
     """
-    for name in want:
-        if name not in get_args(Want):
-            kinds = ", ".join(get_args(Want))
-            raise DefinitionError(f"`{name}` is nothing that a sweep keeps: {kinds}.")
-    quantities = cast(Sequence[Want], want)
-    names = [name for name, *_ in axes]
-    if len(set(names)) < len(names):
+    over = {name: np.linspace(low, high, count) for name, low, high, count in options.over}
+    if len(over) < len(options.over):
         raise DefinitionError("a parameter has two axes: give each `--over` another name.")
-    over = {name: np.linspace(low, high, count) for name, low, high, count in axes}
-    system = _load(*model)
-    if scheduler is None:
-        maps = sweep(system, over, quantities, store=out, force=force)
+    file, name = options.model
+    arguments = _load(file, name), over, options.want
+    if options.scheduler is None:
+        maps = sweep(*arguments, store=options.out, force=options.force)
     else:
         distributed = package("distributed")
-        package("cloudpickle").register_pickle_by_value(sys.modules[Path(model[0]).stem])
+        package("cloudpickle").register_pickle_by_value(sys.modules[Path(file).stem])
         try:
-            client = distributed.Client(scheduler)
+            client = distributed.Client(options.scheduler)
         except (OSError, ValueError) as error:
-            raise DefinitionError(f"no Dask scheduler answers at '{scheduler}'.") from error
+            raise DefinitionError(f"no Dask scheduler answers at '{options.scheduler}'.") from error
         with client:
-            maps = sweep(system, over, quantities, store=out, client=client, force=force)
-    pictures: list[str] = []
-    for name in want:
-        if maps[name].dims == tuple(names) and len(names) <= 2:
-            picture = f"{Path(out).with_suffix('')}-{name}"
-            pictures += map(str, save(picture, plot_sweep(maps, name)))
-    return maps, pictures
+            maps = sweep(*arguments, store=options.out, client=client, force=options.force)
+    print(maps)
+    converged = int((maps.result == 0).sum())
+    print(f"{converged} of {maps.result.size} points have a limit cycle")
+    for name in options.want:
+        if maps[name].dims == tuple(over) and len(over) <= 2:
+            picture = f"{Path(options.out).with_suffix('')}-{name}"
+            print(*save(picture, plot_sweep(maps, name)))
+    return 0
 
 
 def _load(file: str, name: str) -> Any:

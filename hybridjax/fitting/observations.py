@@ -48,7 +48,7 @@ class AbstractObservation(eqx.Module):
 
     ```python
     class ObservedMultipliers(hj.AbstractObservation):
-        seen: Array  # numpy.poly(multipliers)[1:]
+        measured: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
 
@@ -68,8 +68,9 @@ class AbstractObservation(eqx.Module):
         parameters of `cycle.system`, `period` and `anchor` have derivatives by the free parameters,
         and so have results of `linearize` and `place_sections`; `cycle.legs` and `cycle.factors`
         are NaN, since they would triple the time of compilation. Functions that need concrete
-        values raise an error, such as `cycle.multipliers`: use `linearize(...).monodromy()`,
-        `characteristic_polynomial()`, or `hj.spectral_radius`.
+        values raise an error, such as `cycle.multipliers`. Linearize the cycle instead:
+        `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()` or
+        `hj.spectral_radius(model)`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.

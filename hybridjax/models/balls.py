@@ -6,18 +6,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._core.boundary.kinds import Count
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
-
-
-class BallFall(Chart):
-    states = ("y", "v")
-    units = ("m", "m/s")
-    ball: "BouncingBall"
-
-    def field(self, t, q, u):
-        return q[1], u[0] - self.ball.g
 
 
 class BouncingBall(HybridSystem):
@@ -34,20 +25,12 @@ class BouncingBall(HybridSystem):
     restitution: Parameter = parameter(0.7, doc="speed kept at a bounce")
 
     def charts(self):
-        return {"fall": BallFall(self)}
+        fall = lambda t, q, u: (q[1], u[0] - self.g)  # noqa: E731
+        return {"fall": FieldChart(fall, ("y", "v"), ("m", "m/s"))}
 
     def transitions(self):
         bounced = lambda t, q, u: (0.0, -self.restitution * q[1])  # noqa: E731
         return (Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),)
-
-
-class JugglerFall(Chart):
-    states = ("y", "v")
-    units = ("m", "m/s")
-    juggler: "PaddleJuggler"
-
-    def field(self, t, q, u):
-        return q[1], -self.juggler.g
 
 
 class PaddleJuggler(HybridSystem):
@@ -89,7 +72,8 @@ class PaddleJuggler(HybridSystem):
         return t, y, v, jnp.stack([trace / 2 + root, trace / 2 - root])
 
     def charts(self):
-        return {"fall": JugglerFall(self)}
+        fall = lambda t, q, u: (q[1], -self.g)  # noqa: E731
+        return {"fall": FieldChart(fall, ("y", "v"), ("m", "m/s"))}
 
     def transitions(self):
         def bounce(t, q, u):
@@ -105,26 +89,6 @@ class PaddleJuggler(HybridSystem):
     def guess(self):
         # From the top of the flight on: half a period after an impact.
         return Guess("fall", (1.3, 0.0), 0.56)
-
-
-class ChainFlight(Chart):
-    chain: "BouncingChain"
-
-    @property
-    def states(self):
-        masses = range(1, self.chain.n + 1)
-        return (*(f"y{i}" for i in masses), *(f"v{i}" for i in masses))
-
-    @property
-    def units(self):
-        return ("m",) * self.chain.n + ("m/s",) * self.chain.n
-
-    def field(self, t, q, u):
-        p = self.chain
-        y, v = q[: p.n], q[p.n :]
-        stretch = p.k * jnp.diff(y) + p.c * jnp.diff(v)
-        force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
-        return jnp.concatenate([v, force / p.m - p.g])
 
 
 class ChainContact(eqx.Module):
@@ -174,7 +138,14 @@ class BouncingChain(HybridSystem):
     T: Parameter = parameter(1.0, unit="s", doc="period of the table")
 
     def charts(self):
-        return {"flight": ChainFlight(self)}
+        states = tuple(f"{x}{i}" for x in "yv" for i in range(1, self.n + 1))
+        return {"flight": FieldChart(self._flight, states, ("m",) * self.n + ("m/s",) * self.n)}
+
+    def _flight(self, t, q, u):
+        y, v = q[: self.n], q[self.n :]
+        stretch = self.k * jnp.diff(y) + self.c * jnp.diff(v)
+        force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
+        return jnp.concatenate([v, force / self.m - self.g])
 
     def transitions(self):
         contacts = [ChainContact(self, i) for i in range(self.n)]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._core.vector_math.factorizations import solve_positive
 from ..mechanics.mechanism import Mechanism
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.output import Output
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
@@ -70,22 +70,6 @@ def held(error: Array, rate: Array, stiffness: Parameter) -> Array:
     return -(stiffness**2) * error - 2 * stiffness * rate
 
 
-class TorsoStep(Chart):
-    states = ("th1", "th2", "th3", "w1", "w2", "w3")
-    units = ("rad", "rad", "rad", "rad/s", "rad/s", "rad/s")
-    walker: "TorsoWalker"
-
-    def field(self, t, state, u):
-        p, mechanism = self.walker, self.walker.mechanism()
-        q, v = state[:3], state[3:]
-        upright = held(q[2] - p.lean, v[2], p.stiffness)
-        mirrored = held(q[0] + q[1], v[0] + v[1], p.stiffness)
-        desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
-        direction, torque = jnp.array([1.0, -1.0, 0.0]), u[0] * jnp.array([0.0, -1.0, 1.0])
-        a = accelerations_under_feedback(mechanism, q, v, desired, direction, torque)
-        return jnp.concatenate([v, a])
-
-
 class TorsoWalker(HybridSystem):
     """Two straight legs and a torso, which leans forward and thereby drives the walker.
 
@@ -126,7 +110,17 @@ class TorsoWalker(HybridSystem):
         return chain(arms, jnp.stack([self.m, self.m, self.mH, self.mT]), 0.0, self.g)
 
     def charts(self):
-        return {"step": TorsoStep(self)}
+        states = ("th1", "th2", "th3", "w1", "w2", "w3")
+        return {"step": FieldChart(self._step, states, ("rad",) * 3 + ("rad/s",) * 3)}
+
+    def _step(self, t, state, u):
+        q, v = state[:3], state[3:]
+        upright = held(q[2] - self.lean, v[2], self.stiffness)
+        mirrored = held(q[0] + q[1], v[0] + v[1], self.stiffness)
+        desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
+        direction, torque = jnp.array([1.0, -1.0, 0.0]), u[0] * jnp.array([0.0, -1.0, 1.0])
+        a = accelerations_under_feedback(self.mechanism(), q, v, desired, direction, torque)
+        return jnp.concatenate([v, a])
 
     def transitions(self):
         angle = lambda t, q, u: q[0] - self.stride  # noqa: E731
@@ -144,35 +138,6 @@ class TorsoWalker(HybridSystem):
     def guess(self):
         start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
         return Guess("step", start, after="touchdown")
-
-
-class BipedStep(Chart):
-    states = (
-        "shin", "thigh", "torso", "swing_thigh", "swing_shin",
-        "shin_rate", "thigh_rate", "torso_rate", "swing_thigh_rate", "swing_shin_rate",
-    )  # fmt: skip
-    units = ("rad",) * 5 + ("rad/s",) * 5
-    biped: "FiveLinkBiped"
-
-    def field(self, t, state, u):
-        p, mechanism = self.biped, self.biped.mechanism()
-        q, v = state[:5], state[5:]
-        leg, leg_rate = (q[0] + q[1]) / 2, (v[0] + v[1]) / 2
-        # The swing knee bends while the stance leg passes from -stride to stride.
-        bend, slope = p.lift * (1 - (leg / p.stride) ** 2), -2 * p.lift * leg / p.stride**2
-        knee = held(q[0] - q[1] - p.knee, v[0] - v[1], p.stiffness)
-        torso = held(q[2] - p.lean, v[2], p.stiffness)
-        mirrored = held((q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, p.stiffness)
-        swing_knee = (
-            held(q[4] - q[3] - p.knee - bend, v[4] - v[3] - slope * leg_rate, p.stiffness)
-            - 2 * p.lift * (leg_rate / p.stride) ** 2
-        )
-        desired = [knee / 2, -knee / 2, torso, mirrored - swing_knee / 2, mirrored + swing_knee / 2]
-        unit = jnp.ones_like(slope)
-        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
-        torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
-        a = accelerations_under_feedback(mechanism, q, v, jnp.stack(desired), direction, torque)
-        return jnp.concatenate([v, a])
 
 
 class FiveLinkBiped(HybridSystem):
@@ -246,7 +211,26 @@ class FiveLinkBiped(HybridSystem):
         return (Output("leg", lambda t, q, u: (q[0] + q[1]) / 2, "rad"),)
 
     def charts(self):
-        return {"step": BipedStep(self)}
+        links = ("shin", "thigh", "torso", "swing_thigh", "swing_shin")
+        states = (*links, *(f"{x}_rate" for x in links))
+        return {"step": FieldChart(self._step, states, ("rad",) * 5 + ("rad/s",) * 5)}
+
+    def _step(self, t, state, u):
+        q, v, stride, lift = state[:5], state[5:], self.stride, self.lift
+        leg, leg_rate = (q[0] + q[1]) / 2, (v[0] + v[1]) / 2
+        # The swing knee bends while the stance leg passes from -stride to stride.
+        bend, slope = lift * (1 - (leg / stride) ** 2), -2 * lift * leg / stride**2
+        knee = held(q[0] - q[1] - self.knee, v[0] - v[1], self.stiffness)
+        torso = held(q[2] - self.lean, v[2], self.stiffness)
+        mirrored = held((q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, self.stiffness)
+        error, rate = q[4] - q[3] - self.knee - bend, v[4] - v[3] - slope * leg_rate
+        swing_knee = held(error, rate, self.stiffness) - 2 * lift * (leg_rate / stride) ** 2
+        desired = [knee / 2, -knee / 2, torso, mirrored - swing_knee / 2, mirrored + swing_knee / 2]
+        unit, goal = jnp.ones_like(slope), jnp.stack(desired)
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
+        a = accelerations_under_feedback(self.mechanism(), q, v, goal, direction, torque)
+        return jnp.concatenate([v, a])
 
     def transitions(self):
         height = lambda t, q, u: self._swing_foot(q)[1]  # noqa: E731

@@ -1,25 +1,11 @@
 """DC-DC converters with a switch that a controller closes and opens."""
 
-import equinox as eqx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Scheduled, Transition
-
-
-class BuckCircuit(Chart):
-    states = ("v", "i", "ramp")
-    units = ("V", "A", "V")
-    buck: "BuckConverter"
-    closed: bool = eqx.field(static=True)
-
-    def field(self, t, q, u):
-        p = self.buck
-        v, i, _ = q
-        supply = p.Vin if self.closed else 0.0
-        return (i - v / p.R) / p.C, (supply - v) / p.L, (p.upper - p.lower) / p.T
 
 
 class BuckConverter(HybridSystem):
@@ -51,7 +37,15 @@ class BuckConverter(HybridSystem):
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]
 
     def charts(self):
-        return {"open": BuckCircuit(self, False), "closed": BuckCircuit(self, True)}
+        return {"open": self._circuit(0.0), "closed": self._circuit(self.Vin)}
+
+    def _circuit(self, supply: Parameter) -> FieldChart:
+        def field(t, q, u):
+            v, i, _ = q
+            ramp = (self.upper - self.lower) / self.T
+            return (i - v / self.R) / self.C, (supply - v) / self.L, ramp
+
+        return FieldChart(field, ("v", "i", "ramp"), ("V", "A", "V"))
 
     def transitions(self):
         tick = Scheduled(self.T)
@@ -68,20 +62,6 @@ class BuckConverter(HybridSystem):
 
     def guess(self):
         return Guess("open", (12.0, 0.6, self.lower))
-
-
-class CukCircuit(Chart):
-    states = ("i1", "v1", "i2", "v2")
-    units = ("A", "V", "A", "V")
-    cuk: "CukConverter"
-    closed: bool = eqx.field(static=True)
-
-    def field(self, t, q, u):
-        p = self.cuk
-        i1, v1, i2, v2 = q
-        # The capacitor between the coils stands in the loop of one or the other.
-        first, charge, second = (0.0, -i2, v1) if self.closed else (v1, i1, 0.0)
-        return (p.E - first) / p.L1, charge / p.C1, (second - v2) / p.L2, (i2 - v2 / p.R) / p.C2
 
 
 class CukConverter(HybridSystem):
@@ -111,7 +91,17 @@ class CukConverter(HybridSystem):
     T: Parameter = parameter(100e-6, unit="s", doc="period of the clock")
 
     def charts(self):
-        return {"open": CukCircuit(self, False), "closed": CukCircuit(self, True)}
+        return {"open": self._circuit(False), "closed": self._circuit(True)}
+
+    def _circuit(self, closed: bool) -> FieldChart:
+        def field(t, q, u):
+            i1, v1, i2, v2 = q
+            # The capacitor between the coils stands in the loop of one or the other.
+            first, charge, second = (0.0, -i2, v1) if closed else (v1, i1, 0.0)
+            rates = (self.E - first) / self.L1, charge / self.C1, (second - v2) / self.L2
+            return *rates, (i2 - v2 / self.R) / self.C2
+
+        return FieldChart(field, ("i1", "v1", "i2", "v2"), ("A", "V", "A", "V"))
 
     def transitions(self):
         tick = Scheduled(self.T)

@@ -8,22 +8,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..systems.chart import Chart
+from ..systems.chart import Chart, FieldChart
 from ..systems.solver import Radau
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
-class HopperFlight(Chart):
-    states = ("yM", "vM", "ym", "vm")
-    units = ("m", "m/s", "m", "m/s")
-    hopper: "VerticalHopper"
-
-    def field(self, t, q, u):
-        p = self.hopper
-        yM, vM, ym, vm = q
-        leg = p.leg(t, yM, ym)
-        return vM, (leg + u[0]) / p.M - p.g, vm, -(leg + p.b * vm) / p.m - p.g
+_MASSES = ("yM", "vM", "ym", "vm"), ("m", "m/s", "m", "m/s")
 
 
 class HopperStance(Chart):
@@ -66,7 +57,22 @@ class VerticalHopper(HybridSystem):
         return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
 
     def charts(self):
-        return {"flight": HopperFlight(self), "stance": HopperStance(self)}
+        return {"flight": self._flight(), "stance": HopperStance(self)}
+
+    def _flight(self) -> FieldChart:
+        drag = lambda ym, vm: -self.b * vm  # noqa: E731
+        return FieldChart(self._moving(drag), *_MASSES)
+
+    def _moving(self, on_foot):
+        """The field of both masses, with a force on the foot by its height and speed."""
+
+        def field(t, q, u):
+            yM, vM, ym, vm = q
+            leg = self.leg(t, yM, ym)
+            body = (leg + u[0]) / self.M - self.g
+            return vM, body, vm, (on_foot(ym, vm) - leg) / self.m - self.g
+
+        return field
 
     def transitions(self):
         height = lambda t, q, u: q[2]  # noqa: E731
@@ -83,19 +89,6 @@ class VerticalHopper(HybridSystem):
 
     def guess(self):
         return Guess("stance", (2.0, 1.9), 0.5)
-
-
-class GroundContact(Chart):
-    states = ("yM", "vM", "ym", "vm")
-    units = ("m", "m/s", "m", "m/s")
-    solver = Radau()
-    hopper: "CompliantHopper"
-
-    def field(self, t, q, u):
-        p = self.hopper
-        yM, vM, ym, vm = q
-        leg = p.leg(t, yM, ym)
-        return vM, (leg + u[0]) / p.M - p.g, vm, (p.ground(ym, vm) - leg) / p.m - p.g
 
 
 class CompliantHopper(VerticalHopper):
@@ -116,7 +109,8 @@ class CompliantHopper(VerticalHopper):
         return -self.kg * ym - self.cg * vm
 
     def charts(self):
-        return {"flight": HopperFlight(self), "contact": GroundContact(self)}
+        contact = FieldChart(self._moving(self.ground), *_MASSES, solver=Radau())
+        return {"flight": self._flight(), "contact": contact}
 
     def transitions(self):
         force = lambda t, q, u: self.ground(q[2], q[3])  # noqa: E731

@@ -1,28 +1,43 @@
 """Neurons that spike."""
 
-import jax.numpy as jnp
+import abc
 
-from ..systems.chart import Chart
+import jax.numpy as jnp
+from equinox import AbstractVar
+
+from ..systems.chart import FieldChart
 from ..systems.solver import Radau
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
 
-class AdExMembrane(Chart):
-    states = ("v", "w")
-    units = ("mV", "pA")
-    neuron: "AdExNeuron"
+class DrivenNeuron(HybridSystem):
+    """A neuron with the potential v and the recovery w, in a periodic current I(t) = current +
+    amplitude cos(2 pi t / T)."""
 
-    def field(self, t, q, u):
-        p = self.neuron
-        v, w = q
-        current = p.current + p.amplitude * jnp.cos(2 * jnp.pi * t / p.T) + u[0]
-        spike = p.slope * jnp.exp((v - p.threshold) / p.slope)
-        leak = p.gL * (p.EL - v + spike)
-        return (leak - w + current) / p.C, (p.a * (v - p.EL) - w) / p.tau
+    time_unit = "ms"
+
+    peak: AbstractVar[Parameter]
+    current: AbstractVar[Parameter]
+    amplitude: AbstractVar[Parameter]
+    T: AbstractVar[Parameter]
+
+    def total_current(self, t, u):
+        return self.current + self.amplitude * jnp.cos(2 * jnp.pi * t / self.T) + u[0]
+
+    @abc.abstractmethod
+    def after_spike(self, t, q, u):
+        """The state after a spike."""
+
+    def transitions(self):
+        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
+        return (Transition("spike", "membrane", "membrane", below, reset=self.after_spike),)
+
+    def period(self):
+        return self.T
 
 
-class AdExNeuron(HybridSystem):
+class AdExNeuron(DrivenNeuron):
     """C v' = gL (EL - v + slope exp((v - threshold) / slope)) - w + I(t) + u and
     tau w' = a (v - EL) - w, reset to v = EL, w + b at v = peak.
 
@@ -53,33 +68,22 @@ class AdExNeuron(HybridSystem):
     T: Parameter = parameter(40.0, unit="ms", doc="period of I(t)")
 
     def charts(self):
-        return {"membrane": AdExMembrane(self)}
+        return {"membrane": FieldChart(self._membrane, ("v", "w"), ("mV", "pA"))}
 
-    def transitions(self):
-        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
-        reset = lambda t, q, u: (self.EL, q[1] + self.b)  # noqa: E731
-        return (Transition("spike", "membrane", "membrane", below, reset=reset),)
+    def _membrane(self, t, q, u):
+        v, w = q
+        spike = self.slope * jnp.exp((v - self.threshold) / self.slope)
+        total = self.gL * (self.EL - v + spike) - w + self.total_current(t, u)
+        return total / self.C, (self.a * (v - self.EL) - w) / self.tau
 
-    def period(self):
-        return self.T
+    def after_spike(self, t, q, u):
+        return self.EL, q[1] + self.b
 
     def guess(self):
         return Guess("membrane", (-53.0, 350.0), 0.5 * self.T)
 
 
-class IzhikevichMembrane(Chart):
-    states = ("v", "w")
-    units = ("mV", "mV/ms")
-    neuron: "IzhikevichNeuron"
-
-    def field(self, t, q, u):
-        p = self.neuron
-        v, w = q
-        current = p.current + p.amplitude * jnp.cos(2 * jnp.pi * t / p.T) + u[0]
-        return 0.04 * v**2 + 5 * v + 140 - w + current, p.a * (p.b * v - w)
-
-
-class IzhikevichNeuron(HybridSystem):
+class IzhikevichNeuron(DrivenNeuron):
     """v' = 0.04 v^2 + 5 v + 140 - w + I(t) + u, w' = a (b v - w), reset to v = c, w + d at v = 30.
 
     States: potential `v` of the membrane, and its recovery `w` (u in the paper). The current I(t) =
@@ -102,29 +106,18 @@ class IzhikevichNeuron(HybridSystem):
     T: Parameter = parameter(40.0, unit="ms", doc="period of I(t)")
 
     def charts(self):
-        return {"membrane": IzhikevichMembrane(self)}
+        return {"membrane": FieldChart(self._membrane, ("v", "w"), ("mV", "mV/ms"))}
 
-    def transitions(self):
-        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
-        reset = lambda t, q, u: (self.c, q[1] + self.d)  # noqa: E731
-        return (Transition("spike", "membrane", "membrane", below, reset=reset),)
+    def _membrane(self, t, q, u):
+        v, w = q
+        rate = 0.04 * v**2 + 5 * v + 140 - w + self.total_current(t, u)
+        return rate, self.a * (self.b * v - w)
 
-    def period(self):
-        return self.T
+    def after_spike(self, t, q, u):
+        return self.c, q[1] + self.d
 
     def guess(self):
         return Guess("membrane", (-74.0, -4.6), 0.5 * self.T)
-
-
-class NerveMembrane(Chart):
-    states = ("v", "w")
-    solver = Radau()
-    nerve: "FitzHughNagumo"
-
-    def field(self, t, q, u):
-        p = self.nerve
-        v, w = q
-        return (v - v**3 / 3 - w + p.current + u[0]) / p.eps, v + p.a - p.b * w
 
 
 class FitzHughNagumo(HybridSystem):
@@ -141,7 +134,12 @@ class FitzHughNagumo(HybridSystem):
     b: Parameter = parameter(0.8)
 
     def charts(self):
-        return {"membrane": NerveMembrane(self)}
+        return {"membrane": FieldChart(self._membrane, ("v", "w"), solver=Radau())}
+
+    def _membrane(self, t, q, u):
+        v, w = q
+        fast = (v - v**3 / 3 - w + self.current + u[0]) / self.eps
+        return fast, v + self.a - self.b * w
 
     def guess(self):
         """A state on the slow branch, before the end of a spike."""

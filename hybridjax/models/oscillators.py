@@ -2,22 +2,10 @@
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.sliding import Sliding, sliding
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
-
-
-class DuffingLine(Chart):
-    states = ("x", "v")
-    units = ("m", "m/s")
-    duffing: "Duffing"
-
-    def field(self, t, q, u):
-        p = self.duffing
-        x, v = q
-        force = p.amplitude * jnp.cos(p.rate * t) + u[0]
-        return v, force - p.damping * v - p.alpha * x - p.beta * x**3
 
 
 class Duffing(HybridSystem):
@@ -40,7 +28,12 @@ class Duffing(HybridSystem):
     rate: Parameter = parameter(0.5, unit="rad/s", doc="omega, of the force")
 
     def charts(self):
-        return {"line": DuffingLine(self)}
+        return {"line": FieldChart(self._line, ("x", "v"), ("m", "m/s"))}
+
+    def _line(self, t, q, u):
+        x, v = q
+        force = self.amplitude * jnp.cos(self.rate * t) + u[0]
+        return v, force - self.damping * v - self.alpha * x - self.beta * x**3
 
     def period(self):
         return 2 * jnp.pi / self.rate
@@ -48,16 +41,6 @@ class Duffing(HybridSystem):
     def guess(self):
         """The response of the linear oscillator, far from resonance."""
         return Guess("line", (self.amplitude / (self.alpha - self.rate**2), 0.0))
-
-
-class MathieuLine(Chart):
-    states = ("x", "v")
-    mathieu: "Mathieu"
-
-    def field(self, t, q, u):
-        p = self.mathieu
-        x, v = q
-        return v, u[0] - 2 * p.damping * v - (p.delta + p.epsilon * jnp.cos(t)) * x
 
 
 class Mathieu(HybridSystem):
@@ -74,26 +57,17 @@ class Mathieu(HybridSystem):
     damping: Parameter = parameter(0.1, doc="c")
 
     def charts(self):
-        return {"line": MathieuLine(self)}
+        return {"line": FieldChart(self._line, ("x", "v"))}
+
+    def _line(self, t, q, u):
+        x, v = q
+        return v, u[0] - 2 * self.damping * v - (self.delta + self.epsilon * jnp.cos(t)) * x
 
     def period(self):
         return jnp.asarray(2 * jnp.pi)
 
     def guess(self):
         return Guess("line", (0.0, 0.0))
-
-
-class RotorBlade(Chart):
-    states = ("b", "vb")
-    units = ("rad", "")
-    rotor: "RotorFlap"
-
-    def field(self, t, q, u):
-        p = self.rotor
-        b, vb = q
-        damping = p.lock / 8 * (1 + 4 / 3 * p.mu * jnp.sin(t))
-        stiffness = p.p**2 + p.lock / 8 * (4 / 3 * p.mu * jnp.cos(t) + p.mu**2 * jnp.sin(2 * t))
-        return vb, u[0] - damping * vb - stiffness * b
 
 
 class RotorFlap(HybridSystem):
@@ -110,24 +84,19 @@ class RotorFlap(HybridSystem):
     mu: Parameter = parameter(0.3, doc="advance ratio")
 
     def charts(self):
-        return {"blade": RotorBlade(self)}
+        return {"blade": FieldChart(self._blade, ("b", "vb"), ("rad", ""))}
+
+    def _blade(self, t, q, u):
+        (b, vb), lock, mu = q, self.lock / 8, self.mu
+        damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))
+        stiffness = self.p**2 + lock * (4 / 3 * mu * jnp.cos(t) + mu**2 * jnp.sin(2 * t))
+        return vb, u[0] - damping * vb - stiffness * b
 
     def period(self):
         return jnp.asarray(2 * jnp.pi)
 
     def guess(self):
         return Guess("blade", (0.0, 0.0))
-
-
-class HopfPlane(Chart):
-    states = ("x", "y")
-    oscillator: "HopfOscillator"
-
-    def field(self, t, q, u):
-        p = self.oscillator
-        x, y = q
-        growth, rate = p.mu - x**2 - y**2, 2 * jnp.pi / p.T
-        return growth * x - rate * y + u[0], rate * x + growth * y
 
 
 class HopfOscillator(HybridSystem):
@@ -145,19 +114,15 @@ class HopfOscillator(HybridSystem):
     T: Parameter = parameter(1.0, unit="s", doc="period")
 
     def charts(self):
-        return {"plane": HopfPlane(self)}
+        return {"plane": FieldChart(self._plane, ("x", "y"))}
+
+    def _plane(self, t, q, u):
+        x, y = q
+        growth, rate = self.mu - x**2 - y**2, 2 * jnp.pi / self.T
+        return growth * x - rate * y + u[0], rate * x + growth * y
 
     def guess(self):
         return Guess("plane", (1.1 * jnp.sqrt(self.mu), 0.0))
-
-
-class VanDerPolPlane(Chart):
-    states = ("x", "v")
-    oscillator: "VanDerPol"
-
-    def field(self, t, q, u):
-        x, v = q
-        return v, self.oscillator.mu * (1 - x**2) * v - x + u[0]
 
 
 class VanDerPol(HybridSystem):
@@ -169,22 +134,14 @@ class VanDerPol(HybridSystem):
     mu: Parameter = parameter(1.0, doc="strength of the nonlinear damping")
 
     def charts(self):
-        return {"oscillation": VanDerPolPlane(self)}
+        return {"oscillation": FieldChart(self._plane, ("x", "v"))}
+
+    def _plane(self, t, q, u):
+        x, v = q
+        return v, self.mu * (1 - x**2) * v - x + u[0]
 
     def guess(self):
         return Guess("oscillation", (2.0, 0.0))
-
-
-class BeltSlips(Chart):
-    states = ("x", "v")
-    units = ("m", "m/s")
-    block: "BeltOscillator"
-    side: float
-
-    def field(self, t, q, u):
-        p = self.block
-        friction = p.friction / (1 + p.decay * self.side * (q[1] - p.belt))
-        return q[1], (u[0] - p.k * q[0] - self.side * friction) / p.m
 
 
 class BeltOscillator(HybridSystem):
@@ -215,25 +172,18 @@ class BeltOscillator(HybridSystem):
         return self._parts().transitions
 
     def _parts(self) -> Sliding:
-        sides = {"ahead": BeltSlips(self, 1.0), "behind": BeltSlips(self, -1.0)}
+        sides = {"ahead": self._slips(1.0), "behind": self._slips(-1.0)}
         return sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+
+    def _slips(self, side: float) -> FieldChart:
+        def field(t, q, u):
+            friction = self.friction / (1 + self.decay * side * (q[1] - self.belt))
+            return q[1], (u[0] - self.k * q[0] - side * friction) / self.m
+
+        return FieldChart(field, ("x", "v"), ("m", "m/s"))
 
     def guess(self):
         return Guess("sticks", jnp.stack([0.5 * self.friction / self.k, self.belt]))
-
-
-class ChuaSlab(Chart):
-    states = ("x", "y", "z")
-    circuit: "ChuaCircuit"
-    side: float
-
-    def field(self, t, q, u):
-        p = self.circuit
-        x, y, z = q
-        resistor = (
-            p.inner * x if self.side == 0 else p.outer * (x - self.side) + p.inner * self.side
-        )
-        return p.alpha * (y - resistor) + u[0], x - y + z, -p.beta * y
 
 
 class ChuaCircuit(HybridSystem):
@@ -254,11 +204,16 @@ class ChuaCircuit(HybridSystem):
     outer: Parameter = parameter(2 / 7, doc="the same for large ones")
 
     def charts(self):
-        return {
-            "left": ChuaSlab(self, -1.0),
-            "middle": ChuaSlab(self, 0.0),
-            "right": ChuaSlab(self, 1.0),
-        }
+        sides = {"left": -1.0, "middle": 0.0, "right": 1.0}
+        return {name: self._slab(side) for name, side in sides.items()}
+
+    def _slab(self, side: float) -> FieldChart:
+        def field(t, q, u):
+            x, y, z = q
+            resistor = self.outer * (x - side) + self.inner * side if side else self.inner * x
+            return self.alpha * (y - resistor) + u[0], x - y + z, -self.beta * y
+
+        return FieldChart(field, ("x", "y", "z"))
 
     def transitions(self):
         right, left = (lambda t, q, u, x=x: q[0] - x for x in (1.0, -1.0))

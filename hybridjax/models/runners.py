@@ -3,13 +3,12 @@
 import math
 from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked_methods
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.output import Output
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
@@ -20,20 +19,6 @@ Legs = tuple[Leg, ...]
 _LEGS: Legs = ("hind", "front")
 # Charts by the legs that stand on the table.
 _CHARTS: dict[Legs, str] = {(): "air", ("hind",): "hind", ("front",): "front", _LEGS: "both"}
-
-
-class BarStanding(Chart):
-    states = ("y", "v", "q", "p")
-    units = ("m", "m/s", "rad", "rad/s")
-    bar: "TwoLeggedBar"
-    legs: Legs = eqx.field(static=True)
-
-    def field(self, t, state, u):
-        bar = self.bar
-        _, v, _, p = state
-        forces: dict[Leg, Array] = {leg: bar.force(leg, t, state) for leg in self.legs}
-        torque = sum((bar.hip(leg) * F for leg, F in forces.items()), start=0.0)
-        return v, (sum(forces.values(), start=0.0) + u[0]) / bar.m - bar.g, p, torque / bar.J
 
 
 @checked_methods
@@ -86,7 +71,21 @@ class TwoLeggedBar(HybridSystem):
         return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
 
     def charts(self):
-        return {name: BarStanding(self, legs) for legs, name in _CHARTS.items()}
+        return {name: self._support(legs) for legs, name in _CHARTS.items()}
+
+    def _support(self, legs: Legs) -> FieldChart:
+        def field(t, state, u):
+            _, v, _, p = state
+            forces: dict[Leg, Array] = {leg: self.force(leg, t, state) for leg in legs}
+            torque = sum((self.hip(leg) * F for leg, F in forces.items()), start=0.0)
+            total = sum(forces.values(), start=self.reflex(legs)) + u[0]
+            return v, total / self.m - self.g, p, torque / self.J
+
+        return FieldChart(field, ("y", "v", "q", "p"), ("m", "m/s", "rad", "rad/s"))
+
+    def reflex(self, legs: Legs) -> Parameter:
+        """A force that is added while these legs stand."""
+        return 0.0
 
     def transitions(self):
         return tuple(self._step(leg, legs) for legs in _CHARTS for leg in _LEGS)
@@ -115,14 +114,6 @@ class TwoLeggedBar(HybridSystem):
         return Guess("both", (0.4, -0.9, 0.0, 0.5))
 
 
-class TrotSupport(BarStanding):
-    bar: "TrottingQuadruped"
-
-    def field(self, t, state, u):
-        both = len(self.legs) == 2
-        return super().field(t, state, u + self.bar.thrust if both else u)
-
-
 class TrottingQuadruped(TwoLeggedBar):
     """A bar on four legs, of which a diagonal pair lands at once, and then the other.
 
@@ -144,33 +135,11 @@ class TrottingQuadruped(TwoLeggedBar):
     rho: Parameter = parameter(1.0, doc="relative speed of a foot kept when it lands")
     thrust: Parameter = parameter(0.0, unit="N", doc="force of the reflex, of both legs")
 
-    def charts(self):
-        return {name: TrotSupport(self, chart.legs) for name, chart in super().charts().items()}
+    def reflex(self, legs: Legs) -> Parameter:
+        return self.thrust if len(legs) == 2 else 0.0
 
     def guess(self):
         return Guess("both", (0.4, -0.9, 0.0, 0.0))
-
-
-class RunnerFlight(Chart):
-    states = ("y", "vx", "vy")
-    units = ("m", "m/s", "m/s")
-    runner: "SLIPRunner"
-
-    def field(self, t, q, u):
-        return q[2], 0.0 * q[1], -self.runner.g
-
-
-class RunnerStance(Chart):
-    states = ("x", "y", "vx", "vy")
-    units = ("m", "m", "m/s", "m/s")
-    runner: "SLIPRunner"
-
-    def field(self, t, q, u):
-        p = self.runner
-        x, y, vx, vy = q
-        r = jnp.hypot(x, y)
-        push = p.k / p.m * (p.l0 - r) / r
-        return vx, vy, push * x, push * y - p.g
 
 
 class SLIPRunner(HybridSystem):
@@ -206,7 +175,17 @@ class SLIPRunner(HybridSystem):
         return (Output("energy", self.energy, "J"),)
 
     def charts(self):
-        return {"flight": RunnerFlight(self), "stance": RunnerStance(self)}
+        flight = lambda t, q, u: (q[2], 0.0 * q[1], -self.g)  # noqa: E731
+        return {
+            "flight": FieldChart(flight, ("y", "vx", "vy"), ("m", "m/s", "m/s")),
+            "stance": FieldChart(self._stance, ("x", "y", "vx", "vy"), ("m", "m", "m/s", "m/s")),
+        }
+
+    def _stance(self, t, q, u):
+        x, y, vx, vy = q
+        r = jnp.hypot(x, y)
+        push = self.k / self.m * (self.l0 - r) / r
+        return vx, vy, push * x, push * y - self.g
 
     def transitions(self):
         height = lambda t, q, u: q[0] - self.l0 * jnp.sin(self.angle + u[0])  # noqa: E731

@@ -4,19 +4,9 @@ import math
 
 import jax.numpy as jnp
 
-from ..systems.chart import Chart
+from ..systems.chart import FieldChart
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
-
-
-class WheelSwing(Chart):
-    states = ("th", "w")
-    units = ("rad", "rad/s")
-    wheel: "RimlessWheel"
-
-    def field(self, t, q, u):
-        th, w = q
-        return w, self.wheel.rate * jnp.sin(th) + u[0]
 
 
 class RimlessWheel(HybridSystem):
@@ -49,7 +39,8 @@ class RimlessWheel(HybridSystem):
         return w, jnp.cos(2 * self.alpha) ** 2
 
     def charts(self):
-        return {"swing": WheelSwing(self)}
+        swing = lambda t, q, u: (q[1], self.rate * jnp.sin(q[0]) + u[0])  # noqa: E731
+        return {"swing": FieldChart(swing, ("th", "w"), ("rad", "rad/s"))}
 
     def transitions(self):
         angle = lambda t, q, u: q[0] - self.slope - self.alpha  # noqa: E731
@@ -58,18 +49,6 @@ class RimlessWheel(HybridSystem):
 
     def guess(self):
         return Guess("swing", (0.0, 0.3 * jnp.sqrt(self.rate)))
-
-
-class SimplestStep(Chart):
-    states = ("th", "phi", "w", "p")
-    units = ("rad", "rad", "", "")
-    walker: "SimplestWalker"
-
-    def field(self, t, q, u):
-        th, phi, w, p = q
-        stance = jnp.sin(th - self.walker.slope)
-        swing = (w**2 - jnp.cos(th - self.walker.slope)) * jnp.sin(phi)
-        return w, p, stance, stance + swing + u[0]
 
 
 class SimplestWalker(HybridSystem):
@@ -87,7 +66,13 @@ class SimplestWalker(HybridSystem):
     slope: Parameter = parameter(0.009, unit="rad", doc="angle of the slope")
 
     def charts(self):
-        return {"step": SimplestStep(self)}
+        return {"step": FieldChart(self._step, ("th", "phi", "w", "p"), ("rad", "rad", "", ""))}
+
+    def _step(self, t, q, u):
+        th, phi, w, p = q
+        stance = jnp.sin(th - self.slope)
+        swing = (w**2 - jnp.cos(th - self.slope)) * jnp.sin(phi)
+        return w, p, stance, stance + swing + u[0]
 
     def transitions(self):
         foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
@@ -111,25 +96,6 @@ def _heelstrike(t, q, u):
 
 def _after_heelstrike(th, w):
     return Guess("step", (th, 2 * th, w, (1 - jnp.cos(2 * th)) * w))
-
-
-class CompassStep(Chart):
-    states = ("n", "s", "vn", "vs")
-    units = ("rad", "rad", "rad/s", "rad/s")
-    walker: "CompassGait"
-
-    def field(self, t, q, u):
-        p = self.walker
-        n, s, vn, vs = q
-        coupling = p.m * p.l * p.b
-        c, d = jnp.cos(s - n), coupling * jnp.sin(s - n)
-        gravity = p.g * (p.mH * p.l + p.m * p.a + p.m * p.l)
-        torque_n = -d * vs**2 - p.m * p.g * p.b * jnp.sin(n) + u[0]
-        torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
-        # The inverse of [[A, B], [B, D]].
-        A, B, D = p.m * p.b**2, -coupling * c, (p.mH + p.m) * p.l**2 + p.m * p.a**2
-        det = A * D - B**2
-        return vn, vs, (D * torque_n - B * torque_s) / det, (A * torque_s - B * torque_n) / det
 
 
 class CompassGait(HybridSystem):
@@ -160,7 +126,21 @@ class CompassGait(HybridSystem):
         return self.a + self.b
 
     def charts(self):
-        return {"step": CompassStep(self)}
+        units = ("rad", "rad", "rad/s", "rad/s")
+        return {"step": FieldChart(self._step, ("n", "s", "vn", "vs"), units)}
+
+    def _step(self, t, q, u):
+        n, s, vn, vs = q
+        m, mH, a, b, length = self.m, self.mH, self.a, self.b, self.l
+        coupling = m * length * b
+        c, d = jnp.cos(s - n), coupling * jnp.sin(s - n)
+        gravity = self.g * (mH * length + m * a + m * length)
+        torque_n = -d * vs**2 - m * self.g * b * jnp.sin(n) + u[0]
+        torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
+        # The inverse of [[A, B], [B, D]].
+        A, B, D = m * b**2, -coupling * c, (mH + m) * length**2 + m * a**2
+        det = A * D - B**2
+        return vn, vs, (D * torque_n - B * torque_s) / det, (A * torque_s - B * torque_n) / det
 
     def transitions(self):
         foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731

@@ -77,11 +77,11 @@ def _settled(systems, map: ReturnMap, anchor: Lanes, period):
         each = _one(map, *system)
         s, anchor, expected = each.structure, each.anchor, each.expected
         u = jnp.zeros((s.nu, 1))
-        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient)
+        moved = move(s, anchor, u, until(anchor.t + _SETTLE * expected), patient).moved
         if each.base is not None:
             target = toward(jnp.full(1, jnp.inf), -1, moved.lanes.t + 3 * expected)
             target = to_section(target, each.base, each.event)
-            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result)
+            moved = move(s, moved.lanes, u, target, patient, moved.h, moved.result).moved
         q = jnp.where(moved.result == Result.OK, moved.lanes.q, jnp.nan)
         return anchor._replace(chart=moved.lanes.chart, q=q), expected
 

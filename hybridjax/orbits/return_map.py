@@ -20,9 +20,8 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import arm
-from ..engine.jacobian import flow_jacobian
 from ..engine.lanes import Lanes, start_lanes
-from ..engine.move import move
+from ..engine.move import Options, flow_jacobian, move
 from ..engine.replay import replay
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until
@@ -178,7 +177,8 @@ class ReturnMap(eqx.Module):
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result):
-            return move(s, lanes, u, target, self.settings, h, result, new_input=False), None
+            options = Options(new_input=False)
+            return move(s, lanes, u, target, self.settings, h, result, options).moved, None
 
         return self.travel(q, flow)[0]
 

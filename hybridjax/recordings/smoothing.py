@@ -26,22 +26,19 @@ _LONGEST = 3
 # Number of neighboring samples with which a spike is compared. More: spikes where a signal is steep
 # are missed. Fewer: their median is a spike itself.
 _NEIGHBORHOOD = 9
-# Least height of a spike in ranges of the closest half of its neighbors, and in standard deviations
-# of the noise (or smallest steps of the signal). Larger: spikes stay in. Smaller: steep parts,
-# noise and rounding are left out.
+# Least height of a spike in ranges of the closest half of its neighbors (for an input also of its
+# middle 98 %), and in standard deviations of the noise (or smallest steps of the signal). Larger:
+# spikes stay in. Smaller: steep parts, noise, rounding and the perturbation itself are left out.
 _RANGES, _NOISES = 3.0, 6.0
 # Spikes are isolated if there are at most `_CROWD` of them within `_NEAR` samples on either side.
 # More: ringing after an impact is taken for spikes. Fewer: independent spikes nearby stay in.
 _NEAR, _CROWD = 10, 6
 # Cubic prediction of a sample from two neighbors on either side.
 _PREDICTION = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
-# Transients within this many cycles and this factor in height are alike, and part of the motion if
-# they occur in half of the cycles. Larger: spikes that are near each other by chance stay in.
-# Smaller: impacts in a jittering rhythm are left out.
-_SAME_PHASE, _SAME_HEIGHT = 0.01, 3.0
-# How far a spike of an input lies beyond the middle 98 % of it, in half their range. Larger: spikes
-# stay in. Smaller: the perturbation itself is cut.
-_BEYOND_INPUT = 3.0
+# Transients within this many cycles, with heights within a factor of `_RANGES`, are alike, and part
+# of the motion if they occur in half of the cycles. Larger: spikes that are near each other by
+# chance stay in. Smaller: impacts in a jittering rhythm are left out.
+_SAME_PHASE = 0.01
 # Fraction of an input's standard deviation that is noise from sample to sample, up to which it
 # counts as smooth. Larger: single samples of white inputs are taken for spikes. Smaller: spikes of
 # noisy inputs stay in.
@@ -188,7 +185,7 @@ def recurring(
     recurs = np.zeros(len(heights), bool)
     for k in range(len(heights)):
         ratio, away = heights / heights[k], phase - phase[k]
-        alike = (ratio > 1 / _SAME_HEIGHT) & (ratio < _SAME_HEIGHT)
+        alike = (ratio > 1 / _RANGES) & (ratio < _RANGES)
         alike &= np.abs((away + 0.5) % 1 - 0.5) < _SAME_PHASE
         recurs[k] = len(np.unique(np.round(away[alike]))) > 0.5 * cycles
     return recurs
@@ -204,5 +201,5 @@ def input_spikes(values: Series) -> Series:
     low, high = np.quantile(usual, [0.01, 0.99])
     if high == low or noise_of(usual) > _SMOOTH_INPUT * usual.std():
         return np.zeros(len(values))
-    beyond = np.abs(values - (low + high) / 2) > _BEYOND_INPUT * (high - low) / 2
+    beyond = np.abs(values - (low + high) / 2) > _RANGES * (high - low) / 2
     return np.where(beyond, heights, 0.0)

@@ -1,7 +1,7 @@
 """A chart: one mode of a hybrid system, with its own states and its own vector field."""
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -67,3 +67,18 @@ class Chart(eqx.Module):
 
     def __repr__(self):
         return f"{type(self).__name__}({listed(signals(self.states, self.units))})"
+
+
+class FieldChart(Chart):
+    """A chart whose field is a function (t, q, u), such as a method of its system."""
+
+    function: Callable[..., Any]
+    states: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
+    units: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
+    solver: Any = eqx.field(static=True)  # type: ignore[misc]
+
+    def __init__(self, function, states, units=(), solver=None):
+        self.function, self.states, self.units, self.solver = function, states, units, solver
+
+    def field(self, t, q, u):
+        return self.function(t, q, u)

@@ -32,8 +32,7 @@ def test_calls_that_are_repeated_compile_nothing(vanderpol_cycle, start):
         return hj.run_experiments(*call, start=start, execution=ALONE)
 
     placed = hj.place_sections(vanderpol_cycle, SECTIONS)
-    run(1)
-    with no_compilation():
+    with no_compilation(after=lambda: run(1)):
         run(2)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.experiments.batches import divide
-from hybridjax.experiments.campaign import Options
+from hybridjax.experiments.run import Options
 
 from ..conftest import OUTPUTS, no_compilation
 
@@ -59,7 +59,7 @@ def test_process_noise_does_not_depend_on_the_chunks(arguments):
 
 
 def test_workers_and_batches_change_nothing(arguments, whole):
-    with no_compilation():
+    with no_compilation(after=lambda: hj.run_experiments(*arguments, **BATCH)):
         for workers in (1, 3):
             execution = hj.Execution(batch=40, workers=workers)
             data = hj.run_experiments(*arguments, execution=execution)

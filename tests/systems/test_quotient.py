@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.models.walkers import SimplestStep as Step, _heelstrike
+from hybridjax.models.walkers import _heelstrike
 
 
 hj.enable_x64()
@@ -21,7 +21,7 @@ class Stands(hj.Chart):
     drag: float = 0.0
 
     def field(self, t, q, u):
-        a, b, w, v, rate = *Step(self.walker).field(t, seen(q, self.leg), u), 0.0
+        a, b, w, v, rate = *self.walker.charts()["step"].field(t, seen(q, self.leg), u), 0.0
         rate = jnp.cos(q[self.leg]) * q[2 + self.leg] - self.drag * q[4]
         return told(self.leg, a, b, w, v, rate)
 

@@ -17,7 +17,7 @@ from distributed.scheduler import KilledWorker
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..compilation import enable_compilation_cache
 from ..progress import counted, say
-from .store import MemoryStore, ZarrStore
+from .store import ZarrStore
 
 
 _PACKAGES = ("hybridjax", "jax", "jaxlib", "numpy")
@@ -30,13 +30,14 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # options of mallopt
 _jobs: dict[str, tuple[Any, ZarrStore | None]] = {}
 
 
-def run_on(client: Any, job: Any, store: MemoryStore | ZarrStore, missing: Sequence[int]) -> None:
+def run_on(client: Any, job: Any, store: ZarrStore, missing: Sequence[int]) -> None:
     """Compute pieces on the workers of a client.
 
     **Raises:** `DefinitionError` for a client whose workers cannot do it; `ComputationError` for a
     piece that ends its workers, and if the cluster is lost.
     """
-    with _job(client, job, store.address) as name:
+    address = store.address if isinstance(store.address, str) else None
+    with _job(client, job, address) as name:
         # Dask gives out the tasks again that a lost worker had.
         tasks = client.map(_piece, [name] * len(missing), missing, pure=False)
         pieces = dict(zip(tasks, missing, strict=True))

@@ -6,16 +6,7 @@ import zipfile
 from pathlib import Path
 
 from ..._core.archive import read_arrays
-from .columns import (
-    EVENT,
-    Columns,
-    Wanted,
-    check_declared,
-    library,
-    reading,
-    split_header,
-    two_columns,
-)
+from .columns import EVENT, Columns, Wanted, check_declared, library, reading, split_header
 from .text import read_plain
 
 
@@ -24,13 +15,12 @@ def read_arrow(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** `FileFormatError` for a damaged file, or one that declares more than it can hold.
     """
-    dataset = library("pyarrow.dataset", "Parquet and Feather files", "tables")
+    dataset = library(path, "pyarrow.dataset", "tables")
     kind = path.suffix.lower().removeprefix(".")
     with reading(path, f"{kind} file"):
         file = dataset.dataset(path, format=kind)
-        rows, names = file.count_rows(), file.schema.names
-        check_declared(path, 8 * rows * len(names), f"{rows} rows")
-        two_columns(path, names)
+        names = file.schema.names
+        check_declared(path, 8 * file.count_rows() * len(names))
         wanted.require(path, [split_header(x)[0] for x in names])
         kept = [x for x in names if wanted.includes(x)]
         table = file.to_table(columns=kept)
@@ -43,20 +33,17 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, and
     a first sheet without a table, with the row.
     """
-    openpyxl = library("openpyxl", "Excel files", "tables")
+    openpyxl = library(path, "openpyxl", "tables")
     with reading(path, "Excel file"):
         with zipfile.ZipFile(path) as archive:
-            size = sum(x.file_size for x in archive.infolist())
-        check_declared(path, size, f"{size} bytes")
+            check_declared(path, sum(x.file_size for x in archive.infolist()))
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         names = book.sheetnames
         lines = [_line(row) for row in book.worksheets[0].iter_rows(values_only=True)]
         book.close()
     table = read_plain(path, lines)
-    if len(names) > 1:
-        note = f"of {len(names)} sheets the first one, '{names[0]}', was read"
-        table = table._replace(notes=(*table.notes, note))
-    return [table]
+    note = f"of {len(names)} sheets the first one, '{names[0]}', was read"
+    return [table._replace(notes=(*table.notes, note)) if len(names) > 1 else table]
 
 
 def _line(row: tuple) -> str:

@@ -1,31 +1,26 @@
 """Look for what is wrong with a recording, before its phase is known and after."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
-from ...errors import DefinitionError
 from ..data import SectionData
-from ..findings import Finding, Inspection
+from ..findings import Finding, Inspection, places
 from ..phase import Phase
 from ..recording import Recording
 from ..smoothing import FEWEST
 from .answers import feedback, unanswered
-from .samples import (
-    Rows,
-    Signal,
-    clipped,
-    doubled_signals,
-    frozen,
-    placeholders,
-    repeated_samples,
-    wrapped,
-)
+from .samples import clipped, doubled_signals, frozen, placeholders, repeated_samples, wrapped
 from .trials import clocks, other_cycles, other_settings, slow_changes
+
+
+_NOT_MEASURED = (
+    ("no value", placeholders, "has samples that stand for no value, such as -9999"),
+    ("frozen", frozen, "does not change at all, as if a sensor or wire had failed"),
+)
 
 
 @checked
@@ -53,23 +48,25 @@ def inspect(
     **Raises:** `DefinitionError` for unknown names.
     """
     inputs, outputs = tuple(inputs), tuple(outputs)
-    names = [name for name in (*inputs, *outputs) if _is_recorded(recording, name)]
+    names = [
+        name
+        for name in (*inputs, *outputs)
+        if any(np.isfinite(x).any() for _, x in recording.samples(name))
+    ]
     findings: list[Finding] = []
     clean = recording
     columns = [recording.column(x) for x in outputs]
     periods = [_samples_per_cycle(t.values[:, columns]) for t in recording.trials]
-
-    def signal(name: str) -> Signal:
-        values = [t.values[:, clean.column(name)] for t in clean.trials]
-        return Signal(name, clean.trials, values, periods, name in inputs)
-
     for name in names:
-        for check in (placeholders, frozen):
-            bad, more = check(signal(name))
-            clean = _masked(clean, [name], bad)
-            findings += more
-        findings += clipped(signal(name))
-        findings += () if name in inputs else wrapped(signal(name))
+        for cause, samples_of, text in _NOT_MEASURED:
+            pairs = zip(clean.samples(name), periods, strict=True)
+            bad = [samples_of(x, period, name in inputs) for (_, x), period in pairs]
+            if any(map(np.any, bad)):
+                text = f"{name} {text} ({places(clean.trials, bad)}): taken for missing."
+                findings.append(Finding(cause, text, "left out"))
+                clean = _masked(clean, [name], bad)
+        findings += clipped(clean, name)
+        findings += () if name in inputs else wrapped(clean, name)
     findings += doubled_signals(clean, names)
     copies, more = repeated_samples(clean, names)
     findings += more
@@ -86,8 +83,7 @@ def inspect(
         text = "no trial has samples of all outputs that can be used."
         findings.append(Finding("an empty recording", text, "refused"))
     clean = clean.with_trials(kept or clean.trials)
-    findings += other_settings(clean, names, outputs)
-    findings += clocks(clean)
+    findings += [*other_settings(clean, names, outputs), *clocks(clean)]
     if phase is not None and data is not None:
         same = len(phase.stretches) == len(recording.trials)
         findings += inspect_cycles(recording if same else clean, phase, data)
@@ -97,34 +93,21 @@ def inspect(
 def inspect_cycles(recording: Recording, phase: Phase, data: SectionData) -> list[Finding]:
     """Return the findings that need the phase and the data at the sections."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
-    trials = tuple(t.name for t in recording.trials)
     return [
         *other_cycles(recording, phase, outputs),
         *slow_changes(recording, phase, outputs),
-        *(unanswered(data, trials) if outputs else ()),
+        *(unanswered(data, [t.name for t in recording.trials]) if outputs else ()),
         *feedback(data),
     ]
 
 
-def refuse(findings: Iterable[Finding]) -> None:
-    """**Raises:** `DefinitionError` with the first finding that makes a recording useless."""
-    for finding in findings:
-        if finding.action == "refused":
-            raise DefinitionError(finding.text)
-
-
-def _is_recorded(recording: Recording, name: str) -> bool:
-    k = recording.column(name)
-    return any(bool(np.isfinite(t.values[:, k]).any()) for t in recording.trials)
-
-
-def _masked(recording: Recording, names: list[str], bad: Rows) -> Recording:
+def _masked(recording: Recording, names: list[str], bad: list[Bool[np.ndarray, " _"]]) -> Recording:
     """Return the recording with NaN for some samples of some signals."""
     columns = [recording.column(name) for name in names]
     trials = []
     for trial, rows in zip(recording.trials, bad, strict=True):
         values = trial.values.copy()
-        values[:, columns] = np.where(rows[:, None], np.nan, values[:, columns])
+        values[np.ix_(rows, columns)] = np.nan
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)
 
@@ -134,16 +117,13 @@ def _samples_per_cycle(values: Float[np.ndarray, "n k"]) -> float:
 
     A swing crosses the middle half of the range between the quantiles 10 and 90 %.
     """
-    counts = []
-    for x in values.T:
-        x = x[np.isfinite(x)]
-        if not len(x):
-            continue
-        low, high = np.quantile(x, [0.1, 0.9])
+    counts = [float(len(values))]
+    for x in (x[np.isfinite(x)] for x in values.T):
+        low, high = np.quantile(x, [0.1, 0.9]) if len(x) else (0.0, 0.0)
         margin = 0.25 * (high - low)
         side = np.where(x > high - margin, 1, np.where(x < low + margin, -1, 0))
         at = np.flatnonzero(side)
         up = at[1:][np.diff(side[at]) > 0]
         if len(up) > 2:
             counts.append(float(np.median(np.diff(up))))
-    return max(counts, default=float(len(values)))
+    return max(counts[1:] or counts)

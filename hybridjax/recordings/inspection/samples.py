@@ -1,14 +1,13 @@
 """Samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..findings import Finding, places
-from ..recording import Recording, Trial
+from ..recording import Recording
 from ..smoothing import Series
 
 
@@ -31,73 +30,39 @@ _EQUAL = 0.99
 # match. Smaller: copies written with fewer digits pass.
 _SAME = 1e-3
 
-Rows = list[Bool[np.ndarray, " _"]]
+Rows = Bool[np.ndarray, " n"]
 
 
-class Signal(NamedTuple):
-    """One signal in each trial. `period`: rough durations of a cycle, in samples."""
-
-    name: str
-    trials: tuple[Trial, ...]
-    values: list[Float[np.ndarray, " _"]]
-    period: list[float]
-    is_input: bool
-
-    def left_out(self, cause: str, bad: Rows, text: str) -> tuple[Rows, list[Finding]]:
-        """Return the rows and a finding, if there are any."""
-        text = f"{self.name} {text} ({places(self.trials, bad)}): taken for missing."
-        return bad, [Finding(cause, text, "left out")] if any(map(np.any, bad)) else []
-
-
-def placeholders(s: Signal) -> tuple[Rows, list[Finding]]:
+def placeholders(x: Series, period: float, is_input: bool) -> Rows:
     """Find numbers such as -9999, far from all other samples."""
-    bad = [_placeholders(x) for x in s.values]
-    return s.left_out("no value", bad, "has samples that stand for no value, such as -9999")
+    whole = np.unique(x[x == np.round(x)])
+    marked = np.isin(x, [value for value in whole if _is_placeholder(abs(float(value)))])
+    usual = x[np.isfinite(x) & ~marked]
+    if not marked.any() or not len(usual) or not np.ptp(usual):
+        return np.zeros(len(x), bool)
+    return marked & (np.maximum(usual.min() - x, x - usual.max()) > _FAR * np.ptp(usual))
 
 
-def _placeholders(x: Series) -> Bool[np.ndarray, " n"]:
-    bad = np.zeros(len(x), bool)
-    for extreme in (np.min, np.max) * 2:  # two of either sign
-        left = x[np.isfinite(x) & ~bad]
-        if not len(left):
-            break
-        value = extreme(left)
-        usual = left[left != value]
-        if len(usual) and np.ptp(usual) > 0 and _is_placeholder(value):
-            outside = max(usual.min() - value, value - usual.max())
-            if outside > _FAR * np.ptp(usual):
-                bad |= x == value
-    return bad
-
-
-def _is_placeholder(value: float) -> bool:
-    """Return whether programs write this number for "no value": 999, -8888, -32768, 1e20, ..."""
-    size = abs(float(value))
+def _is_placeholder(size: float) -> bool:
+    """Return whether programs write this number for "no value": 999, 8888, 32768, 1e20, ..."""
     digits = f"{size:.0f}"
-    if size == round(size) and len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
+    if len(digits) >= 3 and set(digits) in ({"9"}, {"8"}):
         return True
     return size in (2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1) or size >= 1e15
 
 
-def frozen(s: Signal) -> tuple[Rows, list[Finding]]:
-    """Find a sensor that stays at one value for longer than its rhythm allows."""
-    bad = [_frozen(x, p, s.is_input) for x, p in zip(s.values, s.period, strict=True)]
-    return s.left_out("frozen", bad, "does not change at all, as if a sensor or wire had failed")
+def frozen(x: Series, period: float, is_input: bool) -> Rows:
+    """Find a sensor that stays at one value for longer than its rhythm allows.
 
-
-def _frozen(x: Series, period: float, is_input: bool) -> Bool[np.ndarray, " n"]:
-    bad = np.zeros(len(x), bool)
+    `period`: rough duration of a cycle, in samples. Inputs may rest at zero, and inputs that rest
+    in most cycles are held.
+    """
     first, length = _runs(x)
     plateaus = length[length >= 3]
     limit = max(_FROZEN[0] * period, _FROZEN[1])
     if len(plateaus) > _BELONGS * len(x) / period:
-        if is_input:  # an input that is held, or rests, now and then
-            return bad
-        limit = max(limit, _FROZEN[2] * float(np.median(plateaus)))
-    for a, n in zip(first[length > limit], length[length > limit], strict=True):
-        if not (is_input and x[a] == 0):
-            bad[a : a + n] = True
-    return bad
+        limit = np.inf if is_input else max(limit, _FROZEN[2] * float(np.median(plateaus)))
+    return np.repeat((length > limit) & ~(is_input & (x[first] == 0)), length)
 
 
 def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
@@ -106,9 +71,9 @@ def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
     return first, np.diff(np.append(first, len(x)))
 
 
-def clipped(s: Signal) -> Iterator[Finding]:
+def clipped(recording: Recording, name: str) -> Iterator[Finding]:
     """Find plateaus at the largest or least value, and nowhere else; one at 0 is no clipping."""
-    for trial, x in zip(s.trials, s.values, strict=True):
+    for trial, x in recording.samples(name):
         first, length = _runs(x)
         value, length = x[first[length >= 3]], length[length >= 3]
         if not len(value):
@@ -118,14 +83,13 @@ def clipped(s: Signal) -> Iterator[Finding]:
         count = length[at_ends].sum()
         if count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum()):
             levels = " and ".join(f"{v:.4g}" for v in ends)
-            text = f"{s.name} is cut off at {levels} in trial '{trial.name}'."
-            yield Finding("clipped", text)
+            yield Finding("clipped", f"{name} is cut off at {levels} in trial '{trial.name}'.")
             return
 
 
-def wrapped(s: Signal) -> Iterator[Finding]:
+def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
     """Find integers that overflow: jumps by half of their levels, which are a power of two."""
-    for trial, x in zip(s.trials, s.values, strict=True):
+    for trial, x in recording.samples(name):
         levels = np.unique(x[np.isfinite(x)])
         if len(levels) < 2:
             continue
@@ -136,14 +100,14 @@ def wrapped(s: Signal) -> Iterator[Finding]:
         jumps = int((np.abs(np.diff(count)) > 0.5 * whole).sum())
         if off < 1e-3 and whole.bit_count() == 1 and jumps > 1:  # scaled integers, but for rounding
             text = (
-                f"{s.name} jumps by its whole range in trial '{trial.name}', as integers that "
+                f"{name} jumps by its whole range in trial '{trial.name}', as integers that "
                 f"overflow: undo it (`numpy.unwrap` with period={whole * step:.6g})."
             )
             yield Finding("overflow", text, "refused")
             return
 
 
-def doubled_signals(recording: Recording, names: list[str]) -> Iterator[Finding]:
+def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
     """Find two columns with the same numbers."""
     for a, b in combinations(names, 2):
         for trial in recording.trials:
@@ -155,17 +119,20 @@ def doubled_signals(recording: Recording, names: list[str]) -> Iterator[Finding]
                 break
 
 
-def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list[Finding]]:
+def repeated_samples(
+    recording: Recording, names: Sequence[str]
+) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
     A few samples in a row are searched for in the other trial. If they occur there once (and only
     once in their own trial), both trials are compared sample by sample.
     """
     columns, trials = [recording.column(name) for name in names], recording.trials
-    size = _SAME * np.nanstd(np.concatenate([t.values[:, columns] for t in trials]), axis=0)
-    repeated, findings = [np.zeros(len(t.time), bool) for t in trials], []
-    for (_, a), (j, b) in combinations(enumerate(trials), 2):
-        x, y = a.values[:, columns], b.values[:, columns]
+    values = [t.values[:, columns] for t in trials]
+    size = _SAME * np.nanstd(np.concatenate(values), axis=0)
+    repeated, findings = [np.zeros(len(x), bool) for x in values], []
+    for i, j in combinations(range(len(trials)), 2):
+        x, y = values[i], values[j]
         shift = _shift(x, y, size)
         if shift is None:
             continue
@@ -176,9 +143,8 @@ def repeated_samples(recording: Recording, names: list[str]) -> tuple[Rows, list
         same |= same.mean() > _EQUAL
         if (same & ~repeated[j]).any():
             repeated[j] |= same
-            where = places([b], [same])
-            text = f"{same.sum()} samples ({where}) are in trial '{a.name}' too, and count once."
-            findings.append(Finding("a trial twice", text, "left out"))
+            text = f"{places([trials[j]], [same])}: these samples are in trial '{trials[i].name}'"
+            findings.append(Finding("a trial twice", f"{text} too, and count once.", "left out"))
     return repeated, findings
 
 
