@@ -260,7 +260,7 @@ class TwoTiers:
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_traced(arguments) or is_inside_program():
-            return _one_tier(self._function, self.large)(*arguments)
+            return one_tier(self._function, self.large)(*arguments)
         key = self._function, _settings(), kind(arguments)
         arrays, static = eqx.partition(arguments, _is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
@@ -301,7 +301,8 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
 
 
 @ft.lru_cache(_KEPT)
-def _one_tier(function: Callable, large: bool) -> Callable:
+def one_tier(function: Callable, large: bool) -> Callable:
+    """Return `function` compiled: fully optimized if the job is `large`."""
     return eqx.filter_jit(function) if large else quick_jit(function)
 
 
