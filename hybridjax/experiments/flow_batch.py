@@ -13,6 +13,7 @@ from .._core.results import Result, update_result
 from ..engine.lanes import Lanes
 from ..engine.move import Options, move
 from ..engine.settings import Settings
+from ..errors import DefinitionError
 from ..sections.abstract import BoundSections
 from ..sections.placed import PlacedSections, observe, section_target
 from ..systems.output import Output
@@ -63,6 +64,15 @@ def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
     return Course(
         cycle.system, tuple(outputs), placed.bound, placed.lanes, cycle.period, cycle.event_sequence
     )
+
+
+def require_shape(shape: tuple[int, ...], n_sections: int, nu: int) -> None:
+    """**Raises:** `DefinitionError` for inputs that are not (S, n, nu) with n a multiple of N."""
+    if len(shape) != 3 or shape[2] != nu or shape[1] % n_sections or 0 in shape:
+        raise DefinitionError(
+            f"inputs must have the shape (experiments, samples, {nu}) with samples a multiple of "
+            f"the {n_sections} sections; got {shape}."
+        )
 
 
 def flow_batch(
