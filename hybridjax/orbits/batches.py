@@ -164,7 +164,7 @@ class Tiles(NamedTuple):
         with working("cycles", S) as call:
             if self.known is None:
                 call.done, rows = 0, order[: self.size]
-                with uncollected:  # the programs are compiled during this call
+                with uncollected():  # the programs are compiled during this call
                     out = self._settled(
                         rows, self._newton(rows, *self._given(len(rows)), FEW_STEPS)
                     )
