@@ -281,7 +281,8 @@ def test_signals_with_clocks_of_their_own(rhythm):
             hj.Recording(t[1::2], {"v": v[1::2]}),
         ]
     )
-    data = [sample(r, CIRCLE, inputs="force") for r in (rhythm, own)]
+    angle = hj.KinematicPhase(16, position="x", velocity="v", center=(0, 0), scale=(1, 1))
+    data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
     assert data[1].missing == 0 and data[1].cycles == data[0].cycles
     together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
     np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
