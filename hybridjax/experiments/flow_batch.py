@@ -16,9 +16,8 @@ from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..sections.abstract import BoundSections
 from ..sections.placed import PlacedSections, observe, section_target
-from ..systems.output import Output
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, Output
 from .plan import Plan
 
 

@@ -16,8 +16,7 @@ from ..engine.settings import EXPERIMENT
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
-from ..systems.output import Output, OutputNames
-from ..systems.system import HybridSystem
+from ..systems.system import HybridSystem, Output, OutputNames
 from .flow_batch import Response, course, flow_batch, require_shape
 from .plan import Accuracy, Stepping, plan_flow
 

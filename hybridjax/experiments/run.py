@@ -22,8 +22,8 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
-from ..systems.output import Output, OutputNames
 from ..systems.structure import Outputs
+from ..systems.system import Output, OutputNames
 from .batches import divide, in_batches
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design
