@@ -15,8 +15,7 @@ from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed
 from .._core.boundary.values import Reals
-from .._core.fingerprint import IndescribableError, program_digest
-from .._core.pieces.description import digest_of, function_digest
+from .._core.pieces.description import function_digest
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..engine.describe import describe
@@ -168,24 +167,14 @@ class Family:
                 units[name] = ""
         return units
 
-    def describe(self, system: HybridSystem, values: Mapping[str, float]) -> dict[str, Any]:
+    def describe(self, system: HybridSystem) -> dict[str, Any]:
         """Return JSON from which the model can be told from others, given the system at a point."""
         model = describe(system)
         if isinstance(self.model, HybridSystem):
             for name in self.names:
                 del model["numbers"][name]
             return model
-        return model | {"from parameters": self._of_parameters(values)}
-
-    def _of_parameters(self, values: Mapping[str, float]) -> str:
-        def numbers(values):
-            return jax.tree_util.tree_leaves(eqx.filter(self.system(values), eqx.is_array))
-
-        try:
-            given = {name: jnp.asarray(x) for name, x in values.items()}
-            return digest_of(program_digest(numbers, given))
-        except IndescribableError:
-            return function_digest(self.model)
+        return model | {"from parameters": function_digest(self.model)}
 
 
 def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:

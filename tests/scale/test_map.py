@@ -15,7 +15,7 @@ pytest.importorskip("zarr")
 
 # Pieces of four systems: the programs are those of tests/orbits/test_sweep.py.
 OVER = {"slope": np.array([0.075, 0.08, 0.09]), "spokes": np.array([8.0, 8.5, 9.0])}
-WANT = ("period", "spectral_radius", "state", "multipliers", "events", "residual")
+WANT = ("period", "spectral_radius", "state", "multipliers", "residual")
 
 
 @pytest.fixture(scope="module")
