@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -131,9 +132,8 @@ class Family:
         """Return the system at one point."""
         if not isinstance(self.model, HybridSystem):
             return self.model(**values)
-        paths = [name.split(".") for name in self.names]
         return eqx.tree_at(
-            lambda system: [_follow(system, path) for path in paths],
+            lambda system: [reduce(getattr, x.split("."), system) for x in self.names],
             self.model,
             [jnp.asarray(values[name], float) for name in self.names],
         )
@@ -188,9 +188,3 @@ def _parameters(model: Any) -> tuple[list[str] | None, list[str]]:
         return None, []
     usual = [x for x in parameters if x.kind in (x.POSITIONAL_OR_KEYWORD, x.KEYWORD_ONLY)]
     return [x.name for x in usual], [x.name for x in usual if x.default is x.empty]
-
-
-def _follow(system: Any, path: Sequence[str]) -> Any:
-    for name in path:
-        system = getattr(system, name)
-    return system

@@ -128,11 +128,8 @@ def sweep(
 
 def _axes(over: Axes) -> dict[str, np.ndarray]:
     axes = {name: np.asarray(x, float) for name, x in over.items()}
-    if not axes:
-        raise DefinitionError("`over` must name at least one parameter.")
-    for name, x in axes.items():
-        if not len(x):
-            raise DefinitionError(f"the axis `{name}` is empty: give it at least one value.")
+    if not axes or not all(map(len, axes.values())):
+        raise DefinitionError("`over` must name at least one parameter, each with a value or more.")
     return axes
 
 
