@@ -131,7 +131,7 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
-    refused(hj.read_recording, path, "declares 16777216 rows")
+    refused(hj.read_recording, path, "it declares .*, and is not that large|declares 16777216 rows")
 
 
 def test_compressed_recordings_are_read(tmp_path):
